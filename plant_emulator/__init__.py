@@ -1,0 +1,1 @@
+"""Everything that can stand at the plant end of the loop."""

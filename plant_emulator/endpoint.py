@@ -1,0 +1,220 @@
+"""The plant end of the loop, sans-I/O: measure → frame; frame → actuate; claim and watchdog.
+
+It knows no socket and no clock: time is the tick index. Whoever owns it feeds it the newest command frame, once a tick,
+and sends what it returns. A command acts from the start of the period in which it arrived; when none has come in time
+the watchdog ends the session, and the motors have 0 V until a new claim.
+
+        claim          first command
+  idle ───────► granted ───────────► driven
+   ▲               │ release, holder gone  │
+   └───────────────┴───────────────────────┤
+                                           │ no fresh command in time, or one that says "invalid"
+   granted ◄──────────── tripped ◄─────────┘
+              claim
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from math import isfinite
+from typing import NamedTuple
+
+from plant_emulator.plant import Plant
+from protocol.attitude import sent_vector
+from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
+from protocol.frames import COUNTERS, WireSpec
+from protocol.messages import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal
+
+
+class PlantState(StrEnum):
+    """What the plant end is doing."""
+
+    IDLE = "idle"
+    GRANTED = "granted"
+    DRIVEN = "driven"
+    TRIPPED = "tripped"
+
+
+class Notice(NamedTuple):
+    """Something for the `event` topic."""
+
+    kind: EventKind
+    text: str
+    session: str | None
+
+
+class Endpoint:
+    """One plant, one controller at a time.
+
+    Args:
+        plant: What to measure and to actuate.
+        wire: How frames are read and written here.
+        period_ns: Period of a tick [ns].
+        lockstep: Whether each answer is waited for; a claim must say the same.
+        watchdog_s: 0 V after this long without a fresh command [s].
+
+    Attributes:
+        state: What it is doing.
+        session: Name of the session it is in, or None.
+        holder: Controller that holds it, or None.
+        notices: What happened since the owner last emptied this list.
+        refused: Malformed command frames so far.
+        accepted: Commands acted upon so far.
+    """
+
+    def __init__(
+        self, plant: Plant, wire: WireSpec, period_ns: int, *, lockstep: bool = False, watchdog_s: float = WATCHDOG_S
+    ) -> None:
+        self.plant = plant
+        self.wire = wire
+        self.period_ns = period_ns
+        self.lockstep = lockstep
+        self.state = PlantState.IDLE
+        self.session: str | None = None
+        self.holder: str | None = None
+        self.notices: list[Notice] = []
+        self.refused = 0
+        self.accepted = 0
+        self._attitude = [wire.attitude.quantizer() for _ in range(3)]
+        self._rate = [wire.rate.quantizer() for _ in range(3)]
+        self._level = wire.voltage.quantizer().level
+        self._no_measurement = tuple(q.invalid for q in (*self._attitude, *self._rate))
+        self._off = (0.0,) * wire.actuators
+        self._voltages: tuple[float, ...] = self._off
+        self._watchdog = max(1, round(watchdog_s * 1e9 / period_ns))
+        self._first_command = max(1, round(FIRST_COMMAND_S * 1e9 / period_ns))
+        self._tick = -1
+        self._session_tick = 0  # tick of the session's first measurement
+        self._fresh_tick = 0  # tick of the last fresh command, or of the grant
+        self._echo = -1  # what the last fresh command answered
+
+    @property
+    def saturated(self) -> int:
+        """Measured values beyond their quantizer's range so far."""
+        return sum(q.saturated for q in (*self._attitude, *self._rate))
+
+    def claim(self, claim: Claim) -> Grant | Refusal:
+        """Grant a claim, or say which field differs or who holds the plant. The first measurement is the next tick's."""
+        differences = self.wire.differences(claim.wire)
+        if claim.protocol != PROTOCOL_VERSION:
+            differences.append(f"protocol: {PROTOCOL_VERSION}, not {claim.protocol}")
+        if claim.period_ns != self.period_ns:
+            differences.append(f"period_ns: {self.period_ns}, not {claim.period_ns}")
+        if claim.lockstep != self.lockstep:
+            differences.append(f"lockstep: {self.lockstep}, not {claim.lockstep}")
+        if differences:
+            return Refusal(reason=f"the plant has {'; '.join(differences)}", differences=differences)
+        if self.session is not None:
+            return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
+        self.session, self.holder, self.state = claim.session, claim.controller, PlantState.GRANTED
+        self._voltages = self._off
+        self._session_tick = self._fresh_tick = self._tick + 1
+        self._echo = -1
+        self._notice("claimed", f"granted to {claim.controller}")
+        return Grant(session=claim.session)
+
+    def release(self, session: str) -> bool:
+        """End a session at its holder's wish: 0 V. False if it is not the session that runs."""
+        if session != self.session:
+            return False
+        self._end(PlantState.IDLE, "released", f"released by {self.holder}")
+        return True
+
+    def lost(self, controller: str) -> None:
+        """A controller's liveliness token went; if it held the plant, its session ends: 0 V."""
+        if controller == self.holder:
+            self._end(PlantState.TRIPPED, "tripped", f"{controller} is gone: 0 V")
+
+    def expire(self, reason: str) -> None:
+        """End a session for a reason that only its owner can see, such as no answer in lockstep: 0 V."""
+        if self.session is not None:
+            self._end(PlantState.TRIPPED, "tripped", f"{reason}: 0 V")
+
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """Let the time since the last tick pass under the newest command, and measure.
+
+        Args:
+            frame: The newest command frame that came since the last tick, or None.
+            k: Tick index, rising; where it skips, the plant's time passes all the same. The very first only measures.
+
+        Returns:
+            The measurement frame, or None while no session runs.
+        """
+        if self._tick >= 0:
+            if frame is not None:
+                self._command(frame)
+            for tick in range(self._tick + 1, k + 1):
+                self._watch(tick)
+                self.plant.actuate(self._voltages)
+                self.plant.advance()
+        self._tick = k
+        if self.session is None:
+            return None
+        return self.wire.measurement.pack(self.counter, self._measure())
+
+    @property
+    def counter(self) -> int:
+        """Counter of the last measurement."""
+        return (self._tick - self._session_tick) % COUNTERS
+
+    def _measure(self) -> tuple[float, ...]:
+        attitude, rate = self.plant.measure()
+        if not isfinite(sum(attitude) + sum(rate)):
+            return self._no_measurement
+        return (
+            *(q.encode(x) for q, x in zip(self._attitude, sent_vector(attitude), strict=True)),
+            *(q.encode(x) for q, x in zip(self._rate, rate, strict=True)),
+        )
+
+    def _command(self, frame: bytes) -> None:
+        """Act on a command frame if it is well-formed, newer than the last, and valid."""
+        if self.session is None:
+            return
+        read = self.wire.command.unpack(frame)
+        if read is None:
+            self.refused += 1
+            return
+        echo, codes = read
+        if not self._is_fresh(echo):
+            return
+        voltages = tuple(self._level(code) for code in codes)
+        if not isfinite(sum(voltages)):
+            self._end(PlantState.TRIPPED, "tripped", f"{self.holder} commands 'no valid value': 0 V")
+            return
+        self._voltages = voltages
+        self._echo = echo
+        self._fresh_tick = self._tick
+        self.state = PlantState.DRIVEN
+        self.accepted += 1
+
+    def _is_fresh(self, echo: int) -> bool:
+        """A command that answers the same measurement as the last one did, or an older one, is not fresh.
+
+        The counter goes round in 16 ticks, so "older" can be told only while the last command is less than half a
+        round old; after that any other echo counts as newer.
+        """
+        if self._echo < 0:
+            return True
+        ahead = (echo - self._echo) % COUNTERS
+        return ahead != 0 and (ahead < COUNTERS // 2 or self._tick - self._fresh_tick >= COUNTERS // 2)
+
+    def _watch(self, tick: int) -> None:
+        """End the session when no fresh command came in time."""
+        if self.session is None:
+            return
+        waited = tick - 1 - self._fresh_tick
+        if self.state is PlantState.DRIVEN and waited >= self._watchdog:
+            text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms: 0 V"
+        elif self.state is PlantState.GRANTED and waited >= self._first_command:
+            text = f"no first command within {FIRST_COMMAND_S:g} s: 0 V"
+        else:
+            return
+        self._end(PlantState.TRIPPED, "tripped", text)
+
+    def _end(self, state: PlantState, kind: EventKind, text: str) -> None:
+        self._notice(kind, text)
+        self.state, self.session, self.holder = state, None, None
+        self._voltages = self._off
+
+    def _notice(self, kind: EventKind, text: str) -> None:
+        self.notices.append(Notice(kind, text, self.session))

@@ -1,0 +1,187 @@
+"""Frames: level indices ↔ bytes, and the spec from which every scale and width derives.
+
+Sans-I/O. A frame is a 4-bit counter and R-bit codes, most significant bit first, with zero bits up to the byte:
+
+    measurement  counter:4 · ε₁ ε₂ ε₃ : R_ε each · ω₁ ω₂ ω₃ : R_ω each
+    command      echo:4    · u … : R_u each             (echo: the counter of the measurement it answers)
+
+A signal without quantization travels as big-endian doubles; in a frame that holds any, four zero bits follow the
+counter, so that doubles start on a byte. What arrives malformed is refused whole, with None and never an exception;
+what a caller passes wrongly raises ValueError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from math import isinf
+from typing import Annotated, Final, Literal, TypeAlias
+
+from bitstruct.c import compile as compile_bits
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from protocol.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
+
+COUNTER_BITS: Final = 4
+COUNTERS: Final = 1 << COUNTER_BITS
+"""The counter runs 0…15 and round again."""
+
+
+def bits_or_continuous(value: object) -> object:
+    """"cont" stands for no quantization wherever a person writes bits (TOML has no null)."""
+    return None if value == "cont" else value
+
+
+Bits: TypeAlias = Annotated[
+    Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)] | None,
+    BeforeValidator(bits_or_continuous),
+]
+
+
+class SignalSpec(BaseModel):
+    """How one signal is quantized. `range` runs from −limit to +limit, in the signal's unit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
+    limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
+    deadzone: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="y0 of (C.14) [signal's unit]; half a step if left out"
+    )
+
+    @model_validator(mode="after")
+    def _deadzone_within_limit(self) -> SignalSpec:
+        if self.deadzone is not None and self.deadzone >= self.limit:
+            raise ValueError(f"the dead zone {self.deadzone} must be smaller than the limit {self.limit}")
+        return self
+
+    def quantizer(self) -> Quantizer:
+        """A quantizer of this signal, with its own count of saturations."""
+        if self.bits is None:
+            return Continuous(self.limit)
+        return UniformQuantizer(self.bits, self.limit, self.deadzone)
+
+
+class WireSpec(BaseModel):
+    """Everything the two ends must agree on to read each other's frames. The default is the paper's 8/6-bit Aero."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    attitude: SignalSpec = Field(default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]")
+    rate: SignalSpec = Field(default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]")
+    voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
+    actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
+
+    @cached_property
+    def measurement(self) -> FrameFormat:
+        """Format of a measurement frame: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃."""
+        return FrameFormat([self.attitude.bits] * 3 + [self.rate.bits] * 3)
+
+    @cached_property
+    def command(self) -> FrameFormat:
+        """Format of a command frame: u₂ u₃, or u₁ u₂ u₃."""
+        return FrameFormat([self.voltage.bits] * self.actuators)
+
+    def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
+        """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont."."""
+        return WireSpec(
+            attitude=SignalSpec(bits=out, limit=self.attitude.limit),
+            rate=SignalSpec(bits=out, limit=self.rate.limit),
+            voltage=SignalSpec(bits=inp, limit=self.voltage.limit),
+            actuators=self.actuators,
+        )
+
+    def differences(self, other: WireSpec) -> list[str]:
+        """Where two specs differ, one line a field: `rate.bits: 8, not 10`. Empty if they are the same wire."""
+        mine, theirs = _flat(self.model_dump()), _flat(other.model_dump())
+        return [f"{name}: {mine[name]}, not {theirs[name]}" for name in mine if mine[name] != theirs[name]]
+
+
+def _flat(tree: dict[str, object], prefix: str = "") -> dict[str, object]:
+    leaves: dict[str, object] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            leaves |= _flat(value, f"{prefix}{name}.")
+        else:
+            leaves[prefix + name] = value
+    return leaves
+
+
+class FrameFormat:
+    """One kind of frame: a counter and `widths` codes; a width of None is a float64.
+
+    Attributes:
+        bits: Bits that carry something: counter and codes.
+        size: Bytes of a frame, padding included.
+    """
+
+    def __init__(self, widths: Sequence[int | None]) -> None:
+        floats = any(width is None for width in widths)
+        gap = 4 if floats else 0
+        self.bits = COUNTER_BITS + sum(64 if width is None else width for width in widths)
+        self.size = -(-(self.bits + gap) // 8)
+        tail = 8 * self.size - self.bits - gap
+        fields = ["f64" if width is None else f"s{width}" for width in widths]
+        self._format = compile_bits(
+            "".join([f"u{COUNTER_BITS}", *([f"u{gap}"] if gap else []), *fields, *([f"u{tail}"] if tail else [])])
+        )
+        self._gap = (0,) if gap else ()
+        self._tail = (0,) if tail else ()
+        self._first = 2 if gap else 1
+        self._last = self._first + len(widths)
+        self._floats = [i for i, width in enumerate(widths) if width is None]
+        self.widths = tuple(widths)
+
+    def pack(self, counter: int, codes: Sequence[float]) -> bytes:
+        """Bytes of a frame.
+
+        Args:
+            counter: 0…15.
+            codes: One a signal: ints within R-bit two's complement, or floats where the signal is not quantized.
+
+        Raises:
+            ValueError: A counter or code that does not fit, a wrong number of codes, an infinite float.
+        """
+        if len(codes) != len(self.widths):
+            raise ValueError(f"this frame holds {len(self.widths)} codes, not {len(codes)}")
+        for i in self._floats:
+            if isinf(codes[i]):
+                raise ValueError("an infinite value does not travel; clip it, or send NaN for 'no valid value'")
+        try:
+            frame: bytes = self._format.pack(counter, *self._gap, *codes, *self._tail)
+        except (OverflowError, TypeError) as error:
+            raise ValueError(f"counter {counter!r} with codes {tuple(codes)!r} does not fit: {error}") from None
+        return frame
+
+    def unpack(self, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
+        """Counter and codes of a frame, or None if it is malformed: wrong length, non-zero padding, infinite float."""
+        if len(frame) != self.size:
+            return None
+        values = self._format.unpack(frame)
+        if (self._gap and values[1]) or (self._tail and values[-1]):
+            return None
+        codes = values[self._first : self._last]
+        for i in self._floats:
+            if isinf(codes[i]):
+                return None
+        return values[0], codes
+
+
+def pack_measurement(spec: WireSpec, counter: int, codes: Sequence[float]) -> bytes:
+    """A measurement frame of codes (ε₁ ε₂ ε₃ ω₁ ω₂ ω₃). Raises ValueError for what does not fit."""
+    return spec.measurement.pack(counter, codes)
+
+
+def unpack_measurement(spec: WireSpec, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
+    """(counter, codes) of a measurement frame, or None if it is malformed."""
+    return spec.measurement.unpack(frame)
+
+
+def pack_command(spec: WireSpec, counter: int, codes: Sequence[float]) -> bytes:
+    """A command frame of codes u that answers measurement `counter`. Raises ValueError for what does not fit."""
+    return spec.command.pack(counter, codes)
+
+
+def unpack_command(spec: WireSpec, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
+    """(echo, codes) of a command frame, or None if it is malformed."""
+    return spec.command.unpack(frame)

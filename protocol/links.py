@@ -1,0 +1,112 @@
+"""A Link carries frames between the two ends, newest first and nothing queued.
+
+Both ends see the same four calls, whatever is underneath. A frame that arrives replaces one that was not yet taken: a
+loop wants the newest sample, and a queue would only make it old.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from threading import Condition
+from typing import NamedTuple
+
+import zenoh
+
+
+class Arrival(NamedTuple):
+    """A frame and when it arrived, on `time.monotonic_ns()`."""
+
+    frame: bytes
+    at_ns: int
+
+
+class Link(ABC):
+    """Frames out, frames in."""
+
+    @abstractmethod
+    def send(self, frame: bytes) -> None:
+        """Send a frame. Never blocks for longer than it takes to hand it over, and never raises for a lost peer."""
+
+    @abstractmethod
+    def take(self) -> Arrival | None:
+        """The newest frame that was not yet taken, or None."""
+
+    @abstractmethod
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """As `take`, but wait up to `timeout_s` for a frame to come."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop receiving. Closing twice does no harm."""
+
+
+class Mailbox:
+    """A slot for one frame, written by a receiving thread and read by the loop. The newest wins."""
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._arrival: Arrival | None = None
+
+    def put(self, frame: bytes) -> None:
+        """Put a frame in the slot, in place of one that may be there."""
+        arrival = Arrival(frame, time.monotonic_ns())
+        with self._changed:
+            self._arrival = arrival
+            self._changed.notify()
+
+    def take(self) -> Arrival | None:
+        """Empty the slot."""
+        with self._changed:
+            arrival, self._arrival = self._arrival, None
+        return arrival
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """Empty the slot once something is in it, or return None after `timeout_s`."""
+        with self._changed:
+            if self._arrival is None:
+                self._changed.wait(timeout_s)
+            return self.take()
+
+
+class ZenohLink(Link):
+    """Frames over Zenoh: express, at real-time priority.
+
+    Args:
+        session: An open session; it outlives the link.
+        send_key: Where frames go.
+        receive_key: Where frames come from.
+        lossless: Block when a peer does not keep up, instead of dropping. For lockstep, where each frame is waited for.
+    """
+
+    def __init__(self, session: zenoh.Session, send_key: str, receive_key: str, *, lossless: bool = False) -> None:
+        self._mailbox = Mailbox()
+        self._subscriber = session.declare_subscriber(
+            receive_key, lambda sample: self._mailbox.put(sample.payload.to_bytes())
+        )
+        self._publisher = session.declare_publisher(
+            send_key,
+            priority=zenoh.Priority.REAL_TIME,
+            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+            express=True,
+        )
+        self._open = True
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame."""
+        self._publisher.put(frame)
+
+    def take(self) -> Arrival | None:
+        """The newest frame that was not yet taken, or None."""
+        return self._mailbox.take()
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """As `take`, but wait up to `timeout_s` for a frame to come."""
+        return self._mailbox.wait(timeout_s)
+
+    def close(self) -> None:
+        """Stop receiving."""
+        if self._open:
+            self._open = False
+            self._subscriber.undeclare()
+            self._publisher.undeclare()

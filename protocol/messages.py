@@ -1,0 +1,143 @@
+"""What crosses the network and is not a frame: JSON, by pydantic.
+
+Every field has its unit in its description, so that the JSON schema in a log explains the log.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol.clock import Histogram
+from protocol.frames import WireSpec
+
+PROTOCOL_VERSION: Final = 1
+
+EventKind = Literal["claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"]
+
+
+class Message(BaseModel):
+    """A message; unknown fields are refused, so that two versions that differ do not half understand each other."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def encode(self) -> bytes:
+        """The message as JSON."""
+        return self.model_dump_json().encode()
+
+
+class Claim(Message):
+    """A controller's question to a plant: may I have this vehicle?"""
+
+    protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md the controller speaks")
+    controller: str = Field(description="who asks; the name of its liveliness token")
+    session: str = Field(description="the key its frames would travel under; new for every claim")
+    period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
+    lockstep: bool = Field(description="the plant waits for each answer before it steps")
+    wire: WireSpec
+
+
+class Grant(Message):
+    """The plant's answer to a claim: yes. The first measurement follows at once."""
+
+    granted: Literal[True] = True
+    session: str
+
+
+class Refusal(Message):
+    """The plant's answer to a claim: no, and why."""
+
+    granted: Literal[False] = False
+    reason: str = Field(description="for a person")
+    holder: str | None = Field(default=None, description="who has the vehicle, if somebody has")
+    differences: list[str] = Field(default_factory=list, description="fields of the claim that do not fit the plant")
+
+
+class Release(Message):
+    """A controller gives its session back; the plant goes to 0 V."""
+
+    session: str
+
+
+class Contract(Message):
+    """Who a role is and how it was configured: all that a reader of the log needs to read it."""
+
+    role: str
+    vehicle: str
+    host: str
+    versions: dict[str, str]
+    config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
+
+
+class Percentiles(Message):
+    """Percentiles of a duration in µs, from a histogram with bins 4.4 % wide."""
+
+    count: int
+    p50: float
+    p99: float
+    max: float
+
+
+def summary(durations: Histogram) -> Percentiles | None:
+    """Percentiles of what a histogram has counted; None if nothing."""
+    if not durations.count:
+        return None
+    return Percentiles(
+        count=durations.count,
+        p50=round(durations.percentile(50), 1),
+        p99=round(durations.percentile(99), 1),
+        max=round(durations.max_us, 1),
+    )
+
+
+class Status(Message):
+    """How a role is doing; the last one before it ends is final."""
+
+    role: str
+    state: str
+    session: str | None = None
+    uptime_s: float
+    ticks: int = Field(description="ticks since start")
+    rate_hz: float = Field(description="ticks a second since the last status")
+    skipped: int = Field(description="grid ticks of the session that were missed, never made up for")
+    received: int = Field(default=0, description="frames (recorder: messages) taken in since start")
+    sent: int = Field(default=0, description="frames sent since start")
+    refused: int = Field(default=0, description="malformed frames since start")
+    saturated: int = Field(default=0, description="values beyond a quantizer's range since start")
+    latency_us: Percentiles | None = Field(
+        default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
+    )
+    notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
+
+
+class Telemetry(Message):
+    """What the controller computed at one tick."""
+
+    session: str
+    tick: int = Field(description="tick k of the law; its time is k·period")
+    counter: int = Field(description="counter of the measurement it used")
+    attitude_error: tuple[float, float, float] = Field(description="ε̃ of the quantized attitude [1]")
+    rate_error: tuple[float, float, float] = Field(description="ω_e of the quantized rates, body frame [rad/s]")
+    desired: tuple[float, float, float, float] = Field(description="q_d [1]")
+    damping_estimate: tuple[float, float, float] = Field(description="θ̂ [N·m·s/rad]")
+    voltages: tuple[float, ...] = Field(description="u before quantization [V]")
+    sign: int = Field(description="the equilibrium approached, z₁₊ or z₁₋")
+
+
+class Truth(Message):
+    """The emulator's unquantized state. Never fed to the controller."""
+
+    tick: int = Field(description="plant tick since start; its time is tick·period")
+    attitude: tuple[float, float, float, float] = Field(description="q, body relative to inertial [1]")
+    rate: tuple[float, float, float] = Field(description="ω, body frame [rad/s]")
+    voltages: tuple[float, ...] = Field(description="voltages at the motors [V]")
+
+
+class Event(Message):
+    """Something that happened once."""
+
+    role: str
+    kind: EventKind
+    text: str = Field(description="one line for a person: what, why, and since when if that is known")
+    session: str | None = None

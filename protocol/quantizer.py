@@ -1,0 +1,175 @@
+"""The quantizer, (C.13)–(C.15): value ↔ code ↔ level.
+
+A value is quantized to a level (C.14); the level's index is the code, an R-bit two's-complement integer, and the only
+thing that travels. R bits index 2^R − 1 levels, symmetric about zero; the one code to spare, −2^(R−1), says "no valid
+value" and decodes to NaN.
+
+    code   −2^(R−1)   −(2^(R−1) − 1)  …  −1   0   1  …  2^(R−1) − 1
+    level  NaN        −y_max          …  −y₁  0   y₁ …  y_max
+
+With the paper's dead zone y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). For any other y₀ the step is chosen
+so that, there too, the outermost interval ends exactly at the limit: l = (limit − y₀) / (2^(R−1) − 1).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from math import ceil, copysign, nan
+
+MIN_BITS, MAX_BITS = 2, 16
+
+_TIE = 1 - 2.0**-50
+"""A value within a few units in the last place of an interval's edge lies on the edge: dividing by l rounds."""
+
+
+class Quantizer(ABC):
+    """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) asks.
+
+    Attributes:
+        limit: Edge of the range, in the signal's unit.
+        bound: δ_y of (C.13), in the signal's unit.
+        saturated: How often a value lay beyond the range and was given the outermost level.
+    """
+
+    limit: float
+    bound: float
+    saturated: int
+
+    @abstractmethod
+    def encode(self, y: float) -> float:
+        """The code of a value. Beyond the range: the outermost level's, and `saturated` goes up.
+
+        Raises:
+            ValueError: y is NaN. A sensor that failed is told with `invalid`, by whoever knows that it failed.
+        """
+
+    @abstractmethod
+    def decode(self, code: float) -> float:
+        """The level of a code; NaN for `invalid`.
+
+        Raises:
+            ValueError: Not a code of this quantizer.
+        """
+
+    @property
+    @abstractmethod
+    def invalid(self) -> float:
+        """The code that says "no valid value"."""
+
+    @property
+    @abstractmethod
+    def level(self) -> Callable[[float], float]:
+        """`decode` without its check, for codes that came out of a frame and so cannot be wrong."""
+
+    def quantize(self, y: float) -> float:
+        """y^Q, the level nearest to y by the quantizer's definition; (C.15) applies it to each element of a vector."""
+        return self.decode(self.encode(y))
+
+
+class UniformQuantizer(Quantizer):
+    """The uniform quantizer of (C.14). A tie goes towards zero: intervals are (y_i − l/2, y_i + l/2].
+
+    Args:
+        bits: R, 2…16.
+        limit: Edge of the range [signal's unit], > 0.
+        deadzone: y₀, the largest magnitude that is quantized to 0 [signal's unit]; l/2 if None, as in the paper.
+
+    Attributes:
+        step: l, the length of an interval [signal's unit].
+        deadzone: y₀ as used.
+        levels: Level by code. Python's negative index is two's complement, so `levels[code]` is the whole decoder.
+
+    Raises:
+        ValueError: A value out of bounds.
+    """
+
+    def __init__(self, bits: int, limit: float, deadzone: float | None = None) -> None:
+        if not MIN_BITS <= bits <= MAX_BITS:
+            raise ValueError(f"a quantizer has {MIN_BITS} to {MAX_BITS} bits, not {bits}")
+        if not 0 < limit < float("inf"):
+            raise ValueError(f"a quantizer's limit is positive and finite, not {limit}")
+        self.bits = bits
+        self.limit = limit
+        self.top = 2 ** (bits - 1) - 1
+        if deadzone is None:
+            self.step = 2 * limit / (2**bits - 1)
+            self.deadzone = self.step / 2
+        elif 0 < deadzone < limit:
+            self.step = (limit - deadzone) / self.top
+            self.deadzone = deadzone
+        else:
+            raise ValueError(f"a dead zone lies between 0 and the limit {limit}, not at {deadzone}")
+        self.bound = max(self.deadzone, self.step / 2)
+        self.saturated = 0
+        positive = [self.deadzone + self.step / 2 + i * self.step for i in range(self.top)]
+        self.levels: list[float] = [0.0, *positive, nan, *(-y for y in reversed(positive))]
+
+    @property
+    def invalid(self) -> int:
+        """−2^(R−1)."""
+        return -self.top - 1
+
+    @property
+    def level(self) -> Callable[[float], float]:
+        """See `Quantizer.level`."""
+        return self.levels.__getitem__  # type: ignore[return-value]  # a code out of a frame is an int
+
+    def encode(self, y: float) -> int:
+        """The code of a value; see `Quantizer.encode`."""
+        x = (abs(y) - self.deadzone) / self.step * _TIE
+        if x <= 0.0:
+            return 0
+        if x > self.top:
+            self.saturated += 1
+            return self.top if y > 0 else -self.top
+        if y != y:
+            raise ValueError("NaN has no code; send the code for 'no valid value'")
+        return ceil(x) if y > 0 else -ceil(x)
+
+    def decode(self, code: float) -> float:
+        """The level of a code; NaN for `invalid`."""
+        if not (isinstance(code, int) and -self.top - 1 <= code <= self.top):
+            raise ValueError(f"{code!r} is not a code of {self.bits} bits")
+        return self.levels[code]
+
+
+class Continuous(Quantizer):
+    """The paper's "cont.": no quantization. The value is its own code; beyond the range, the limit; NaN is invalid.
+
+    Args:
+        limit: Edge of the range [signal's unit], > 0.
+
+    Raises:
+        ValueError: The limit is not positive and finite.
+    """
+
+    def __init__(self, limit: float) -> None:
+        if not 0 < limit < float("inf"):
+            raise ValueError(f"a signal's limit is positive and finite, not {limit}")
+        self.limit = limit
+        self.bound = 0.0
+        self.saturated = 0
+
+    @property
+    def invalid(self) -> float:
+        """NaN."""
+        return nan
+
+    @property
+    def level(self) -> Callable[[float], float]:
+        """See `Quantizer.level`."""
+        return float
+
+    def encode(self, y: float) -> float:
+        """The value itself, within ±limit; see `Quantizer.encode`."""
+        if -self.limit <= y <= self.limit:
+            return y
+        if y != y:
+            raise ValueError("NaN has no code; send the code for 'no valid value'")
+        self.saturated += 1
+        return copysign(self.limit, y)
+
+    def decode(self, code: float) -> float:
+        """The value itself; NaN for `invalid`."""
+        return float(code)

@@ -1,0 +1,1 @@
+"""The controller daemon, and what records, judges and replays its traffic."""

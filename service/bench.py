@@ -1,0 +1,151 @@
+"""Roles as child processes of this one: what the demo and the tests on real processes start and stop.
+
+Each child runs the same command a user would type, with the effective configuration in a file of its own. A child asks
+the kernel to be told when its parent dies, so that nothing is left behind. ^C reaches only the parent, which stops its
+children one by one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Literal, Self
+
+import zenoh
+
+from protocol import topics
+from protocol.network import join
+from service.config import ENV_PREFIX, Settings
+
+RoleName = Literal["controller", "emulator", "recorder"]
+
+_TOKENS: Final = {"emulator": "plant", "recorder": "recorder"}
+START_WAIT_S: Final = 20.0
+STOP_WAIT_S: Final = 10.0
+
+
+class BenchError(Exception):
+    """A process did not start or ended early; one line with what it said last."""
+
+
+def free_rendezvous() -> str:
+    """A loopback endpoint that nobody listens on right now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Bench:
+    """Processes of one network on this machine. A context: leaving it stops them all.
+
+    Args:
+        settings: The configuration of them all.
+
+    Attributes:
+        zenoh: A session of our own on their network.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._folder = tempfile.TemporaryDirectory(prefix="aeroloop-")
+        self._config = Path(self._folder.name) / "aeroloop.toml"
+        self._config.write_text(settings.toml())
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._alive: set[str] = set()
+        self._changed = threading.Condition()
+        self.zenoh = join(settings.network)
+        self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for role in ("controller", "emulator", "recorder"):
+            if role in self._children:
+                self.stop(role)
+        self.zenoh.close()  # type: ignore[no-untyped-call]  # zenoh's stub gives close() no return type
+        self._folder.cleanup()
+
+    def start(self, role: RoleName) -> subprocess.Popen[bytes]:
+        """Start a role; it is not yet on the network when this returns."""
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
+        command = [sys.executable, "-m", "service.cli", role, "--config", str(self._config), "--with-parent", "--quiet"]
+        with self._log(role).open("wb") as stderr:
+            child = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                env=environment,
+                start_new_session=True,
+            )
+        self._children[role] = child
+        return child
+
+    def await_role(self, role: RoleName, timeout_s: float = START_WAIT_S) -> None:
+        """Wait until a role's liveliness token is there.
+
+        Raises:
+            BenchError: It ended, or the time is over.
+        """
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while _TOKENS[role] not in self._alive:
+                self._check(role)
+                if time.monotonic() > deadline:
+                    raise BenchError(f"the {role} did not join the network within {timeout_s:g} s")
+                self._changed.wait(0.1)
+
+    def running(self, role: RoleName) -> bool:
+        """Whether a role that was started is still running."""
+        return self._children[role].poll() is None
+
+    def stop(self, role: RoleName, how: signal.Signals = signal.SIGTERM) -> int:
+        """Stop a role and wait for it; killed if it does not end by itself. Returns its exit code."""
+        child = self._children[role]
+        if child.poll() is None:
+            child.send_signal(how)
+        try:
+            return child.wait(STOP_WAIT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            return child.wait()
+
+    def check(self) -> None:
+        """Raise if any process has failed.
+
+        Raises:
+            BenchError: With what it said last.
+        """
+        for role in self._children:
+            self._check(role)
+
+    def _check(self, role: str) -> None:
+        code = self._children[role].poll()
+        if code:
+            said = self._log(role).read_text(errors="replace").strip().splitlines()
+            raise BenchError(f"the {role} ended with exit code {code}" + (f": {said[-1]}" if said else ""))
+
+    def _log(self, role: str) -> Path:
+        return Path(self._folder.name) / f"{role}.stderr"
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        address = topics.read_key(str(sample.key_expr))
+        if address is None or address.role is None:
+            return
+        with self._changed:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._alive.add(address.role)
+            else:
+                self._alive.discard(address.role)
+            self._changed.notify_all()

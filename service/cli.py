@@ -1,0 +1,296 @@
+"""The command `aeroloop`: parse, call one function, print.
+
+What is printed is for a person; `--json` is for a program. Errors are one line on stderr: exit code 2 for usage and
+configuration, 1 for a run that failed, 130 for ^C.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from protocol.role import Role
+    from service.config import Settings
+    from service.figures import Figures
+
+# Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
+
+_PR_SET_PDEATHSIG: Final = 1
+PAPER_DURATION_S: Final = 50.0
+
+T = TypeVar("T")
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
+)
+lab = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
+log_group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
+show = typer.Typer(no_args_is_help=True, help="What would be used.")
+app.add_typer(lab, name="lab")
+app.add_typer(log_group, name="log")
+app.add_typer(show, name="show")
+
+_state = {"debug": False}
+
+Config = Annotated[
+    Path | None, typer.Option("--config", "-c", help="TOML file with the configuration.", show_default=False)
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.", show_default=False),
+]
+Duration = Annotated[float, typer.Option("--duration", min=0.01, help="Length of the experiment [s].")]
+BitsOut = Annotated[
+    str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
+]
+BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Say only warnings and errors on stderr.")]
+WithParent = Annotated[bool, typer.Option("--with-parent", hidden=True)]
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app()
+
+
+@app.callback()
+def options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Options of every command."""
+    _state["debug"] = debug
+
+
+@app.command()
+def demo(
+    duration: Duration = PAPER_DURATION_S,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")
+    ] = False,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the paper's experiment over Zenoh in three processes, and judge its log."""
+    settings = _settings(config, [*(overrides or []), *(["loop.lockstep=true"] if lockstep else [])])
+    settings = _with_bits(settings, bits_out, bits_in)
+
+    def run() -> tuple[Figures, bool]:
+        from service.demo import run_demo
+        from service.display import live_demo
+
+        if json or not sys.stderr.isatty():
+            return run_demo(settings, duration, log)
+        with live_demo(duration) as update:
+            return run_demo(settings, duration, log, update)
+
+    figures, complete = _guard(run)
+    _print_figures(figures, json)
+    if not complete:
+        raise typer.Exit(130)
+
+
+@app.command()
+def controller(
+    duration: Annotated[
+        float | None, typer.Option("--duration", min=0.01, help="End after this long [s].", show_default=False)
+    ] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    with_parent: WithParent = False,
+) -> None:
+    """Run the controller daemon until SIGTERM."""
+    settings = _settings(
+        config, [*(overrides or []), *([f"controller.duration_s={duration}"] if duration is not None else [])]
+    )
+
+    def run(role: Role) -> None:
+        from service.daemon import Daemon
+
+        Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller).run()
+
+    _run_role("controller", settings, run, quiet=quiet, with_parent=with_parent)
+
+
+@app.command()
+def emulator(
+    config: Config = None, overrides: Overrides = None, quiet: Quiet = False, with_parent: WithParent = False
+) -> None:
+    """Run the emulated plant until SIGTERM."""
+    settings = _settings(config, overrides)
+
+    def run(role: Role) -> None:
+        from plant_emulator.emulator import Emulator
+
+        Emulator(role, settings.loop, settings.wire, settings.plant).run()
+
+    _run_role("plant", settings, run, quiet=quiet, with_parent=with_parent)
+
+
+@app.command()
+def recorder(
+    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    with_parent: WithParent = False,
+) -> None:
+    """Record everything on the network into an MCAP log until SIGTERM."""
+    settings = _settings(config, overrides)
+    if log is not None:
+        settings.recorder.path = log
+
+    def run(role: Role) -> None:
+        from service.recorder import Recorder
+
+        Recorder(role, settings.recorder).run()
+
+    _run_role("recorder", settings, run, quiet=quiet, with_parent=with_parent)
+
+
+@lab.command()
+def experiment(
+    duration: Duration = PAPER_DURATION_S,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the closed loop in this process, in lockstep and through real frames, without a network."""
+    settings = _with_bits(_settings(config, overrides), bits_out, bits_in)
+
+    def run() -> Figures:
+        from service.display import progress_bar
+        from service.experiment import run_experiment
+
+        with progress_bar("experiment", duration, hidden=json) as update:
+            return run_experiment(settings, duration, update)
+
+    _print_figures(_guard(run), json)
+
+
+@log_group.command()
+def review(log: Annotated[Path, typer.Argument(help="An MCAP log.", show_default=False)], json: Json = False) -> None:
+    """Compute every figure from a log alone."""
+
+    def run() -> Figures:
+        from service.review import review
+
+        return review(log)
+
+    _print_figures(_guard(run), json)
+
+
+@show.command("config")
+def show_config(config: Config = None, overrides: Overrides = None) -> None:
+    """Print the effective configuration as TOML."""
+    typer.echo(_settings(config, overrides).toml(), nl=False)
+
+
+@show.command()
+def spec(config: Config = None, overrides: Overrides = None) -> None:
+    """Print the wire as configured: frames, widths, steps."""
+    from service.display import wire_table
+
+    wire_table(_settings(config, overrides).wire)
+
+
+# ── what every command shares ──
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    typer.echo(f"aeroloop: {message}", err=True)
+    raise typer.Exit(code)
+
+
+def _settings(config: Path | None, overrides: list[str] | None) -> Settings:
+    from service.config import ConfigError, load
+
+    try:
+        return load(config, overrides or [])
+    except ConfigError as error:
+        if _state["debug"]:
+            raise
+        _fail(str(error), 2)
+
+
+def _with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
+    """The settings with the bits given on the command line."""
+    from service.config import ConfigError, with_bits
+
+    try:
+        return with_bits(settings, bits_out, bits_in)
+    except ConfigError as error:
+        if _state["debug"]:
+            raise
+        _fail(str(error), 2)
+
+
+def _guard(run: Callable[[], T]) -> T:
+    """Run, and turn what can go wrong into one line and an exit code."""
+    from protocol.network import NetworkError
+    from service.bench import BenchError
+    from service.recorder import RecorderError
+    from service.review import ReviewError
+
+    try:
+        return run()
+    except (NetworkError, BenchError, RecorderError, ReviewError, ValueError) as error:
+        if _state["debug"]:
+            raise
+        _fail(str(error).splitlines()[0], 1)
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+
+
+def _run_role(
+    kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, with_parent: bool
+) -> None:
+    """Join the network as a role and run until a signal says stop."""
+    logging.basicConfig(
+        level=logging.WARNING if quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
+    )
+    if with_parent:
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+    def live() -> None:
+        from protocol.role import Role
+        from service.daemon import controller_name
+
+        name = controller_name() if kind == "controller" else None
+        with Role(kind, settings.vehicle, settings.network, settings.contract(), name) as role:
+            role.stop_on_signals()
+            run(role)
+
+    _guard(live)
+
+
+def _print_figures(figures: Figures, json: bool) -> None:
+    if json:
+        typer.echo(figures.model_dump_json(indent=2))
+    else:
+        from service.display import figures_table
+
+        figures_table(figures)
+
+
+if __name__ == "__main__":
+    main()

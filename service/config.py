@@ -1,0 +1,170 @@
+"""The configuration: every section's model, put together from defaults, a TOML file, the environment and `--set`.
+
+Each package owns the models of its own settings; this is the one place that knows them all. With no file at all, the
+result is the paper's experiment.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tomli_w
+from pydantic import Field, StringConstraints, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
+
+from plant_emulator.settings import PlantSettings
+from protocol import topics
+from protocol.clock import LoopSettings
+from protocol.frames import WireSpec
+from protocol.network import NetworkSettings
+from protocol.quantizer import MAX_BITS, MIN_BITS
+from service.daemon import ControllerSettings
+from service.law import LawSettings
+from service.recorder import RecorderSettings
+from service.reference import SinusoidSettings
+
+ENV_PREFIX = "AEROLOOP_"
+
+
+class ConfigError(Exception):
+    """The configuration is wrong; one line that names the key and says what it takes."""
+
+
+class Settings(BaseSettings):
+    """Everything that can be configured; sections as in the TOML file."""
+
+    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, env_nested_delimiter="__", extra="forbid")
+
+    vehicle: Annotated[str, StringConstraints(pattern=f"^{topics.NAME}$")] = Field(
+        default="aero", description="name of the vehicle, one chunk of every key"
+    )
+    loop: LoopSettings = LoopSettings()
+    wire: WireSpec = WireSpec()
+    reference: SinusoidSettings = SinusoidSettings()
+    law: LawSettings = LawSettings()
+    controller: ControllerSettings = ControllerSettings()
+    plant: PlantSettings = PlantSettings()
+    recorder: RecorderSettings = RecorderSettings()
+    network: NetworkSettings = NetworkSettings()
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """`--set` over environment over file."""
+        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
+    def contract(self) -> dict[str, Any]:
+        """The effective configuration, for a role's contract."""
+        return self.model_dump(mode="json")
+
+    def toml(self) -> str:
+        """The effective configuration as a TOML file that gives it again."""
+        return tomli_w.dumps(_for_toml(self.contract()))
+
+
+def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
+    """The effective configuration.
+
+    Args:
+        file: A TOML file, or None.
+        overrides: `section.key=value`, values as TOML writes them (quotes may be left out).
+
+    Raises:
+        ConfigError: What is wrong and where.
+    """
+    if file is not None and not file.is_file():
+        raise ConfigError(f"no configuration file at {file}")
+
+    class Configured(Settings):
+        model_config = SettingsConfigDict(toml_file=file)
+
+    try:
+        return Configured(**_tree(overrides))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{file} is not TOML: {error}") from None
+    except ValidationError as error:
+        raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
+
+
+def from_contract(config: dict[str, Any]) -> Settings:
+    """The configuration that a role told in its contract.
+
+    Raises:
+        ConfigError: It is not one that this version understands.
+    """
+    try:
+        return Settings.model_validate(config)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
+
+
+def _tree(overrides: Sequence[str]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for override in overrides:
+        path, equals, text = override.partition("=")
+        if not equals or not path:
+            raise ConfigError(f"--set takes section.key=value, not {override!r}")
+        *sections, name = path.strip().split(".")
+        branch = tree
+        for section in sections:
+            branch = branch.setdefault(section, {})
+        branch[name] = _value(text.strip())
+    return tree
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _explain(error: dict[str, Any]) -> str:
+    where = ".".join(str(part) for part in error["loc"]) or "the configuration"
+    if error["type"] == "extra_forbidden":
+        return f"unknown configuration key {where}; `aeroloop show config` lists the known ones"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    return f"{where}: {message[0].lower()}{message[1:]}, not {error['input']!r}"
+
+
+def _for_toml(tree: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no null: bits say "cont", and anything else that is not set is left out."""
+    out: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            out[name] = _for_toml(value)
+        elif value is not None:
+            out[name] = value
+        elif name == "bits":
+            out[name] = "cont"
+    return out
+
+
+def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
+    """The settings with other bits: `bits_out` for ε and ω, `bits_in` for u; None leaves them as they are.
+
+    Raises:
+        ConfigError: Not a number of bits, and not "cont".
+    """
+    wire = settings.wire.model_dump()
+    for bits, signals, option in ((bits_out, ("attitude", "rate"), "--bits-out"), (bits_in, ("voltage",), "--bits-in")):
+        if bits is not None:
+            if bits != "cont" and not (bits.isdecimal() and MIN_BITS <= int(bits) <= MAX_BITS):
+                raise ConfigError(f"{option} takes {MIN_BITS} to {MAX_BITS} bits or cont, not {bits!r}")
+            for signal in signals:
+                wire[signal]["bits"] = bits if bits == "cont" else int(bits)
+    return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})

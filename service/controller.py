@@ -1,0 +1,141 @@
+"""The controller end of the loop, sans-I/O: measurement frame in, command frame out, at tick k.
+
+It knows no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
+run this one code path. The law's time is k times the period.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+
+import casadi as ca
+
+from protocol.attitude import IDENTITY, Quaternion, received_quaternion
+from protocol.frames import WireSpec
+from protocol.symbolic import Compiled
+from service.law import LawSettings, law_function
+
+
+class Controller:
+    """The adaptive law between two frames.
+
+    Args:
+        wire: How frames are read and written.
+        law: Parameters and gains.
+        reference: t ↦ q_d, ω_d, ω̇_d, as `reference_function` makes it.
+        period: Time between ticks [s].
+
+    Attributes:
+        tick_index: k of the last measurement answered; −1 before the first.
+        counter: Its counter.
+        voltages: The last u before quantization [V]. Shape (actuators,).
+        sign: ±1, the equilibrium that is approached; 0 before the first measurement.
+        refused: Malformed measurement frames so far.
+        invalid: Measurements that said "no valid value" so far.
+
+    Raises:
+        ValueError: The law's B cannot be inverted.
+    """
+
+    def __init__(self, wire: WireSpec, law: LawSettings, reference: ca.Function, period: float) -> None:
+        self.wire = wire
+        self.period = period
+        self.tick_index = -1
+        self.counter = 0
+        self.voltages: tuple[float, ...] = (0.0,) * wire.actuators
+        self.refused = 0
+        self.invalid = 0
+        self._law = Compiled(law_function(law, period))
+        inputs, outputs = self._law.inputs, self._law.outputs
+        desired = {name: inputs[name] for name in ("q_d", "omega_d", "omega_d_dot")}
+        self._reference = Compiled(reference, shared=desired)
+        self._time = self._reference.inputs["t"]
+        self._q, self._omega, self._sign = inputs["q"], inputs["omega"], inputs["s"]
+        self._theta, self._theta_next = inputs["theta"], outputs["theta_next"]
+        self._u, self._eta_e, self._eps_e = outputs["u"], outputs["eta_e"], outputs["eps_e"]
+        self._theta[:] = memoryview(array("d", law.damping_estimate))
+        self._attitude: Quaternion = IDENTITY
+        self._first_motor = 3 - wire.actuators
+        self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
+        self._encode = [q.encode for q in self._voltage]
+        self._no_command = tuple(q.invalid for q in self._voltage)
+        self._read, self._write = wire.measurement.unpack, wire.command.pack
+        self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
+        self._rate_level: Callable[[float], float] = wire.rate.quantizer().level
+
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """Answer a measurement.
+
+        Args:
+            frame: The newest measurement frame, or None if none came since the last tick.
+            k: Tick index; the law's time is k·period.
+
+        Returns:
+            The command frame that answers it; None if there is nothing to answer, which includes malformed bytes. A
+            measurement without a valid value is answered by a command without one: the plant then goes to 0 V.
+        """
+        if frame is None:
+            return None
+        read = self._read(frame)
+        if read is None:
+            self.refused += 1
+            return None
+        counter, codes = read
+        attitude, rate = self._attitude_level, self._rate_level
+        x, y, z = attitude(codes[0]), attitude(codes[1]), attitude(codes[2])
+        wx, wy, wz = rate(codes[3]), rate(codes[4]), rate(codes[5])
+        if (total := x + y + z + wx + wy + wz) != total:  # NaN: no valid value
+            self.invalid += 1
+            return self._write(counter, self._no_command)
+        self._attitude = received_quaternion(x, y, z, self._attitude)
+        self._q[0], self._q[1], self._q[2], self._q[3] = self._attitude
+        self._omega[0], self._omega[1], self._omega[2] = wx, wy, wz
+        self._time[0] = k * self.period
+        self._reference()
+        if self.tick_index < 0:
+            self._choose_sign()
+        self._law()
+        self._theta[:] = self._theta_next
+        self.tick_index, self.counter = k, counter
+        voltages = self._u.tolist()[self._first_motor :]
+        if (total := sum(voltages)) != total:
+            return self._write(counter, self._no_command)
+        self.voltages = voltages
+        return self._write(counter, [encode(u) for encode, u in zip(self._encode, voltages, strict=True)])
+
+    def _choose_sign(self) -> None:
+        """z₁₊ or z₁₋ by the sign of η̃ at the first measurement, for good (Assumption 3)."""
+        self._sign[0] = 1.0
+        self._law()
+        self._sign[0] = 1.0 if self._eta_e[0] >= 0 else -1.0
+
+    @property
+    def sign(self) -> int:
+        """±1, the equilibrium that is approached; 0 before the first measurement."""
+        return int(self._sign[0])
+
+    @property
+    def attitude_error(self) -> tuple[float, float, float]:
+        """ε̃ at the last measurement [1]."""
+        return tuple(self._eps_e)  # type: ignore[return-value]  # three elements
+
+    @property
+    def rate_error(self) -> tuple[float, float, float]:
+        """ω_e at the last measurement, body frame [rad/s]."""
+        return tuple(self._law.outputs["omega_e"])  # type: ignore[return-value]  # three elements
+
+    @property
+    def desired(self) -> Quaternion:
+        """q_d at the last measurement [1]."""
+        return tuple(self._law.inputs["q_d"])  # type: ignore[return-value]  # four elements
+
+    @property
+    def damping_estimate(self) -> tuple[float, float, float]:
+        """θ̂ after the last measurement [N·m·s/rad]."""
+        return tuple(self._theta)  # type: ignore[return-value]  # three elements
+
+    @property
+    def saturated(self) -> int:
+        """Commanded voltages beyond the quantizer's range so far."""
+        return sum(q.saturated for q in self._voltage)

@@ -1,0 +1,111 @@
+"""The demo: controller, emulator and recorder as three processes on loopback, and the figures out of their log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+import zenoh
+
+from protocol import topics
+from protocol.attitude import angle
+from protocol.messages import Status, Telemetry
+from service.bench import Bench, free_rendezvous
+from service.config import Settings
+from service.figures import Figures
+from service.review import review
+
+REFRESH_S = 0.1
+
+
+@dataclass
+class Progress:
+    """What the demo shows while it runs, gathered from the network."""
+
+    settings: Settings
+    time_s: float = 0.0
+    error_rad: float = 0.0
+    voltages: tuple[float, ...] = ()
+    statuses: dict[str, Status] = field(default_factory=dict)
+
+    def hear(self, sample: zenoh.Sample) -> None:
+        """Take in a telemetry or status message."""
+        address = topics.read_key(str(sample.key_expr))
+        if address is None:
+            return
+        payload = sample.payload.to_bytes()
+        if address.topic.name == "telemetry":
+            telemetry = Telemetry.model_validate_json(payload)
+            self.time_s = telemetry.tick * self.settings.loop.period
+            self.error_rad = angle(*telemetry.attitude_error)
+            self.voltages = telemetry.voltages
+        elif address.topic.name == "status" and address.role is not None:
+            self.statuses[address.role] = Status.model_validate_json(payload)
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks a second of the controller, as it last said."""
+        return self.statuses["controller"].rate_hz if "controller" in self.statuses else 0.0
+
+    @property
+    def skipped(self) -> int:
+        """Ticks skipped by both ends so far."""
+        return sum(status.skipped for status in self.statuses.values())
+
+    @property
+    def bits_per_s(self) -> tuple[float, float]:
+        """Payload bits a second of measurements and commands, at the present rate."""
+        wire = self.settings.wire
+        return 8 * wire.measurement.size * self.rate_hz, 8 * wire.command.size * self.rate_hz
+
+
+def run_demo(
+    settings: Settings, duration_s: float, log: Path | None, show: Callable[[Progress], None] | None = None
+) -> tuple[Figures, bool]:
+    """Run the experiment over Zenoh in three processes and review its log.
+
+    Args:
+        settings: The configuration; the rendezvous is replaced by a free one.
+        duration_s: How long, on the law's clock [s].
+        log: Where the log goes; None for a new file in the recorder's directory.
+        show: Called ten times a second with what is known.
+
+    Returns:
+        The figures, and whether it ran to the end (False after ^C).
+
+    Raises:
+        BenchError: A process did not start, or failed.
+        ReviewError: The log cannot be judged.
+    """
+    path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
+    settings = settings.model_copy(
+        update={
+            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
+            "controller": settings.controller.model_copy(update={"duration_s": duration_s, "require_recorder": True}),
+            "recorder": settings.recorder.model_copy(update={"path": path.absolute()}),
+        }
+    )
+    progress = Progress(settings)
+    complete = True
+    with Bench(settings) as bench:
+        for topic in ("telemetry", "status"):
+            bench.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.hear)
+        try:
+            bench.start("recorder")
+            bench.start("emulator")
+            bench.await_role("recorder")
+            bench.await_role("emulator")
+            bench.start("controller")
+            while bench.running("controller"):
+                bench.check()
+                if show is not None:
+                    show(progress)
+                time.sleep(REFRESH_S)
+            bench.check()
+        except KeyboardInterrupt:
+            complete = False
+    figures = review(path)
+    return figures, complete

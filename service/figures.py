@@ -1,0 +1,128 @@
+"""Figures of merit: one set of names, one way to compute them, whoever asks.
+
+The demo, the experiment and the review of a log all feed the same `Score`, tick by tick, so that their figures can be
+compared to the last bit. `z_track` and `u_total` are (C.81), summed as the rectangles that a sampled loop holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import degrees
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol.attitude import angle
+from protocol.clock import WATCHDOG_S
+from protocol.frames import FrameFormat, WireSpec
+from protocol.messages import Percentiles
+
+
+class Stream(BaseModel):
+    """Traffic in one direction, over the time that was judged."""
+
+    model_config = ConfigDict(frozen=True)
+
+    frames_per_s: float | None
+    bits_per_s: float | None = Field(description="payload bits, padding included")
+
+
+class Figures(BaseModel):
+    """How well it tracked and what it cost. What could not be had is null, with the reason in `reasons`."""
+
+    model_config = ConfigDict(frozen=True)
+
+    duration_s: float = Field(description="time that was judged, on the law's clock [s]")
+    z_track: float | None = Field(description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]; 0.0049 is 49 in Table C.2")
+    u_total: float | None = Field(description="∫ uᵀu dt of the commands as sent [V²·s]")
+    max_error_deg: float | None = Field(description="largest attitude error as measured [deg]")
+    final_error_deg: float | None = Field(description="attitude error at the last tick as measured [deg]")
+    measurement: Stream
+    command: Stream
+    skipped_ticks: int | None
+    latency_us: Percentiles | None
+    log: str | None
+    reasons: dict[str, str] = Field(default_factory=dict, description="why a figure is null")
+
+
+class Score:
+    """Sums over a run.
+
+    Args:
+        wire: Sizes of the frames.
+        period: Time between ticks [s].
+        watchdog_s: How long a plant holds a command that no other follows [s].
+    """
+
+    def __init__(self, wire: WireSpec, period: float, watchdog_s: float = WATCHDOG_S) -> None:
+        self._wire = wire
+        self._period = period
+        self._longest_hold = max(1, round(watchdog_s / period))
+        self._first: int | None = None
+        self._error_tick = self._command_tick = 0
+        self._error_square = self._command_square = 0.0
+        self._errors = self._commands = 0
+        self._z_track = self._u_total = 0.0
+        self._max_angle = self._angle = 0.0
+
+    def error(self, k: int, error: Sequence[float]) -> None:
+        """The attitude error ε̃ at tick k; it stands until the next. Shape (3,)."""
+        if self._first is None:
+            self._first = k
+        else:
+            self._z_track += self._error_square * ((k - self._error_tick) * self._period)
+        x, y, z = error
+        self._error_tick = k
+        self._error_square = x * x + y * y + z * z
+        self._angle = angle(x, y, z)
+        self._max_angle = max(self._max_angle, self._angle)
+        self._errors += 1
+
+    def command(self, k: int, voltages: Sequence[float]) -> None:
+        """The voltages [V] commanded at tick k; they stand until the next, or until the watchdog. Shape (actuators,)."""
+        if self._commands:
+            held = min(k - self._command_tick, self._longest_hold)
+            self._u_total += self._command_square * (held * self._period)
+        self._command_tick = k
+        self._command_square = sum(u * u for u in voltages)
+        self._commands += 1
+
+    @property
+    def ticks(self) -> int:
+        """Ticks from the first to the last error, both counted."""
+        return 0 if self._first is None else self._error_tick - self._first + 1
+
+    def figures(
+        self,
+        *,
+        skipped_ticks: int | None = None,
+        latency: Percentiles | None = None,
+        log: str | None = None,
+        reasons: dict[str, str] | None = None,
+    ) -> Figures:
+        """The figures so far; the last error and the last command stand for one period."""
+        reasons = dict(reasons or {})
+        duration = self.ticks * self._period
+        if not self._errors:
+            for name in ("z_track", "max_error_deg", "final_error_deg"):
+                reasons[name] = "no measurement was answered"
+        if not self._commands:
+            reasons["u_total"] = "no command was sent"
+        return Figures(
+            duration_s=round(duration, 9),
+            z_track=self._z_track + self._error_square * self._period if self._errors else None,
+            u_total=self._u_total + self._command_square * self._period if self._commands else None,
+            max_error_deg=degrees(self._max_angle) if self._errors else None,
+            final_error_deg=degrees(self._angle) if self._errors else None,
+            measurement=_stream(self._errors, self._wire.measurement, duration),
+            command=_stream(self._commands, self._wire.command, duration),
+            skipped_ticks=skipped_ticks,
+            latency_us=latency,
+            log=log,
+            reasons=reasons,
+        )
+
+
+def _stream(frames: int, kind: FrameFormat, duration: float) -> Stream:
+    if not duration:
+        return Stream(frames_per_s=None, bits_per_s=None)
+    return Stream(frames_per_s=frames / duration, bits_per_s=frames * kind.size * 8 / duration)
