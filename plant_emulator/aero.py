@@ -43,7 +43,7 @@ class AeroSettings(BaseModel):
     )
     damping: tuple[float, float, float] = Field(
         default=(0.0, 0.0071, 0.0220),
-        description="θ, true viscous damping about the body axes [N·m·s/rad]; pitch and yaw from Quanser's lab material",
+        description="θ, true viscous damping about the body axes [N·m·s/rad]; pitch, yaw from Quanser's lab material",
     )
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage at a motor [V]")
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
@@ -86,9 +86,7 @@ class Aero(EmulatedPlant):
         after = rk4(lambda state: dynamics(state, u), x, period, settings.substeps)
         q = from_euler(ca.vertcat(0, after[0], after[1]))
         omega = ca.vertcat(-ca.sin(after[0]) * after[3], after[2], ca.cos(after[0]) * after[3])
-        self._step = Compiled(
-            ca.Function("step", [x, u], [after, q, omega], ["x", "u"], ["after", "attitude", "rate"])
-        )
+        self._step = Compiled(ca.Function("step", [x, u], [after, q, omega], ["x", "u"], ["after", "attitude", "rate"]))
         self._x = self._step.inputs["x"]
         self._u = self._step.inputs["u"]
         self._after = self._step.outputs["after"]

@@ -131,7 +131,7 @@ class Emulator:
         if arrival is not None:
             self._received += 1
             read = self._endpoint.wire.command.unpack(arrival.frame)
-            if read is not None and 0 < (elapsed := arrival.at_ns - self._sent_at[read[0]]):
+            if read is not None and (elapsed := arrival.at_ns - self._sent_at[read[0]]) > 0:
                 self._latency.add(elapsed)
         self._follow_session()
         if self._truth_every and k % self._truth_every == 0:

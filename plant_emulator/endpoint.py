@@ -94,7 +94,7 @@ class Endpoint:
         return sum(q.saturated for q in (*self._attitude, *self._rate))
 
     def claim(self, claim: Claim) -> Grant | Refusal:
-        """Grant a claim, or say which field differs or who holds the plant. The first measurement is the next tick's."""
+        """Grant a claim, or say which field differs or who holds the plant. The next tick measures first."""
         differences = self.wire.differences(claim.wire)
         if claim.protocol != PROTOCOL_VERSION:
             differences.append(f"protocol: {PROTOCOL_VERSION}, not {claim.protocol}")

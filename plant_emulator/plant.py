@@ -44,7 +44,7 @@ class Plant(ABC):
 
     @abstractmethod
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Put voltages [V] on the motors until told otherwise; beyond its limits the plant clips. Shape (actuators,)."""
+        """Put voltages [V] on the motors until told otherwise; the plant clips to its limits. Shape (actuators,)."""
 
     @abstractmethod
     def advance(self) -> None:

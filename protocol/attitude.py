@@ -34,7 +34,7 @@ def T(q: ca.SX) -> ca.SX:
 
 
 def R(q: ca.SX) -> ca.SX:
-    """Rotation matrix of (C.8), body to inertial. A member of SO(3) as in (C.9); it moves as in (C.10). Shape (3, 3)."""
+    """Rotation matrix of (C.8), body to inertial. In SO(3) as in (C.9), moving as in (C.10). Shape (3, 3)."""
     eta, eps = q[0], q[1:4]
     return ca.SX.eye(3) + 2 * eta * S(eps) + 2 * S(eps) @ S(eps)
 

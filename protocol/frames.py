@@ -28,7 +28,7 @@ COUNTERS: Final = 1 << COUNTER_BITS
 
 
 def bits_or_continuous(value: object) -> object:
-    """"cont" stands for no quantization wherever a person writes bits (TOML has no null)."""
+    """The word "cont" stands for no quantization wherever a person writes bits (TOML has no null)."""
     return None if value == "cont" else value
 
 
@@ -67,8 +67,12 @@ class WireSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    attitude: SignalSpec = Field(default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]")
-    rate: SignalSpec = Field(default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]")
+    attitude: SignalSpec = Field(
+        default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]"
+    )
+    rate: SignalSpec = Field(
+        default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]"
+    )
     voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
     actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
 

@@ -87,7 +87,7 @@ def join(settings: NetworkSettings) -> zenoh.Session:
             "give a free one with --set network.listen='[\"tcp/127.0.0.1:0\"]'"
         ) from None
     if settings.rendezvous and not settings.connect and not _has_peer(session):
-        session.close()  # type: ignore[no-untyped-call]  # zenoh's stub gives close() no return type
+        session.close()
         raise NetworkError(
             f"the rendezvous {settings.rendezvous} does not answer as Zenoh; its port is in use by another program, or "
             "its host is out of reach: choose another with --set network.rendezvous=tcp/127.0.0.1:PORT"

@@ -16,10 +16,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from math import ceil, copysign, nan
+from typing import Final
 
-MIN_BITS, MAX_BITS = 2, 16
+MIN_BITS: Final = 2
+MAX_BITS: Final = 16
 
-_TIE = 1 - 2.0**-50
+_TIE: Final[float] = 1 - 2.0**-50
 """A value within a few units in the last place of an interval's edge lies on the edge: dividing by l rounds."""
 
 
@@ -91,9 +93,9 @@ class UniformQuantizer(Quantizer):
             raise ValueError(f"a quantizer's limit is positive and finite, not {limit}")
         self.bits = bits
         self.limit = limit
-        self.top = 2 ** (bits - 1) - 1
+        self.top: int = 2 ** (bits - 1) - 1
         if deadzone is None:
-            self.step = 2 * limit / (2**bits - 1)
+            self.step: float = 2 * limit / (2**bits - 1)
             self.deadzone = self.step / 2
         elif 0 < deadzone < limit:
             self.step = (limit - deadzone) / self.top

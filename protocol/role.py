@@ -1,8 +1,8 @@
 """What every process is on the network: alive, configured, doing well or not, and stoppable.
 
 A Role joins the network, answers questions about its configuration and, once its owner is ready, shows a liveliness
-token; the owner publishes status, events and whatever else through it. It is a context: leaving it closes the Zenoh session, without which a
-Python process would not end.
+token; the owner publishes status, events and whatever else through it. It is a context: leaving it closes the Zenoh
+session, without which a Python process would not end.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Role:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.zenoh.close()  # type: ignore[no-untyped-call]  # zenoh's stub gives close() no return type
+        self.zenoh.close()
 
     def announce(self) -> None:
         """Show the liveliness token. Declarations keep their order on a link: who sees it knows ours before it too."""
@@ -78,7 +78,7 @@ class Role:
     def stop_on_signals(self) -> None:
         """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""
 
-        def ask_to_stop(signum: int, frame: FrameType | None) -> None:
+        def ask_to_stop(_signum: int, _frame: FrameType | None) -> None:
             self.stop.set()
 
         signal.signal(signal.SIGTERM, ask_to_stop)

@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import casadi as ca
 
-Buffer: TypeAlias = memoryview
+Buffer: TypeAlias = "memoryview[float]"
 """A row of doubles, written and read by index. Matrices lie column by column, as CasADi keeps them."""
 
 
@@ -49,11 +49,11 @@ class Compiled:
         for i in range(function.n_in()):
             name = function.name_in(i)
             self.inputs[name] = self._memory(name, function.size_in(i), shared)
-            self._buffer.set_arg(i, self.inputs[name])
+            self._buffer.set_arg(i, self.inputs[name])  # type: ignore[call-arg, arg-type]  # any memoryview will do
         for i in range(function.n_out()):
             name = function.name_out(i)
             self.outputs[name] = self._memory(name, function.size_out(i), shared)
-            self._buffer.set_res(i, self.outputs[name])
+            self._buffer.set_res(i, self.outputs[name])  # type: ignore[call-arg, arg-type]  # the same
 
     @staticmethod
     def _memory(name: str, shape: tuple[int, int], shared: Mapping[str, Buffer]) -> Buffer:

@@ -39,23 +39,23 @@ class Topic:
     model: str
 
 
+# fmt: off
 TOPICS: Final = {
     topic.name: topic
     for topic in (
-        # fmt: off
-        Topic("claim",       "claim",                 "query", "controller",    "once a session",          "Claim"),
-        Topic("release",     "release",               "query", "controller",    "once a session",          "Release"),
-        Topic("contract",    "contract/{role}",       "query", "every role",    "when asked",              "Contract"),
-        Topic("measurement", "{session}/measurement", "frame", "plant",         "every tick of a session", "Measurement"),
-        Topic("command",     "{session}/command",     "frame", "controller",    "answers a measurement",   "Command"),
-        Topic("telemetry",   "telemetry",             "json",  "controller",    "telemetry_rate",          "Telemetry"),
-        Topic("truth",       "truth",                 "json",  "plant",         "truth_rate",              "Truth"),
-        Topic("status",      "status/{role}",         "json",  "every role",    "1 Hz and on change",      "Status"),
-        Topic("event",       "event",                 "json",  "every role",    "when it happens",         "Event"),
-        Topic("alive",       "alive/{role}",          "token", "every role",    "while it lives",          ""),
-        # fmt: on
+        Topic("claim", "claim", "query", "controller", "once a session", "Claim"),
+        Topic("release", "release", "query", "controller", "once a session", "Release"),
+        Topic("contract", "contract/{role}", "query", "every role", "when asked", "Contract"),
+        Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", "Measurement"),
+        Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),
+        Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", "Telemetry"),
+        Topic("truth", "truth", "json", "plant", "truth_rate", "Truth"),
+        Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", "Status"),
+        Topic("event", "event", "json", "every role", "when it happens", "Event"),
+        Topic("alive", "alive/{role}", "token", "every role", "while it lives", ""),
     )
 }
+# fmt: on
 
 _PATTERNS: Final = [
     (

@@ -73,7 +73,7 @@ class Bench:
         for role in ("controller", "emulator", "recorder"):
             if role in self._children:
                 self.stop(role)
-        self.zenoh.close()  # type: ignore[no-untyped-call]  # zenoh's stub gives close() no return type
+        self.zenoh.close()
         self._folder.cleanup()
 
     def start(self, role: RoleName) -> subprocess.Popen[bytes]:

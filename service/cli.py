@@ -9,11 +9,12 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
 
 import typer
+from typer.exceptions import TyperException
 
 if TYPE_CHECKING:
     from protocol.role import Role
@@ -61,7 +62,27 @@ WithParent = Annotated[bool, typer.Option("--with-parent", hidden=True)]
 
 def main() -> None:
     """Entry point of the command."""
-    app()
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run a command line and return its exit code. Whatever goes wrong is one line on stderr."""
+    _state["debug"] = False
+    try:
+        return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
+    except TyperException as error:
+        if message := error.format_message():  # empty where help was printed because nothing was asked
+            command = " ".join(["aeroloop", *arguments[:1]])
+            typer.echo(f"aeroloop: {message} (`{command} --help` tells more)", err=True)
+        return error.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        return 130
+    except Exception as error:
+        if _state["debug"]:
+            raise
+        text = f"{type(error).__name__}: {error}".splitlines()[0]
+        typer.echo(f"aeroloop: unexpected {text}; `aeroloop --debug …` shows where", err=True)
+        return 1
 
 
 @app.callback()
@@ -75,9 +96,7 @@ def options(
 @app.command()
 def demo(
     duration: Duration = PAPER_DURATION_S,
-    lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")
-    ] = False,
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
     log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
@@ -94,6 +113,8 @@ def demo(
         from service.display import live_demo
 
         if json or not sys.stderr.isatty():
+            how = "in lockstep" if settings.loop.lockstep else "in real time"
+            typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
             return run_demo(settings, duration, log)
         with live_demo(duration) as update:
             return run_demo(settings, duration, log, update)
@@ -259,9 +280,7 @@ def _guard(run: Callable[[], T]) -> T:
         raise typer.Exit(130) from None
 
 
-def _run_role(
-    kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, with_parent: bool
-) -> None:
+def _run_role(kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, with_parent: bool) -> None:
     """Join the network as a role and run until a signal says stop."""
     logging.basicConfig(
         level=logging.WARNING if quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"

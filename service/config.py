@@ -41,7 +41,9 @@ class ConfigError(Exception):
 class Settings(BaseSettings):
     """Everything that can be configured; sections as in the TOML file."""
 
-    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, env_nested_delimiter="__", extra="forbid")
+    model_config = SettingsConfigDict(
+        env_prefix=ENV_PREFIX, env_nested_delimiter="__", extra="forbid", nested_model_default_partial_update=True
+    )
 
     vehicle: Annotated[str, StringConstraints(pattern=f"^{topics.NAME}$")] = Field(
         default="aero", description="name of the vehicle, one chunk of every key"
@@ -61,8 +63,8 @@ class Settings(BaseSettings):
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
         env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the library names the arguments
+        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the same
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """`--set` over environment over file."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)

@@ -43,7 +43,7 @@ class Controller:
         self.period = period
         self.tick_index = -1
         self.counter = 0
-        self.voltages: tuple[float, ...] = (0.0,) * wire.actuators
+        self.voltages: list[float] = [0.0] * wire.actuators
         self.refused = 0
         self.invalid = 0
         self._law = Compiled(law_function(law, period))
@@ -98,7 +98,7 @@ class Controller:
         self._law()
         self._theta[:] = self._theta_next
         self.tick_index, self.counter = k, counter
-        voltages = self._u.tolist()[self._first_motor :]
+        voltages: list[float] = self._u.tolist()[self._first_motor :]  # type: ignore[assignment]  # doubles
         if (total := sum(voltages)) != total:
             return self._write(counter, self._no_command)
         self.voltages = voltages

@@ -1,8 +1,9 @@
-"""The controller process: claim a vehicle, then wait → receive → tick → send → account, until told to stop.
+"""The controller process: claim a vehicle, then wait → tick → send → account, until told to stop.
 
-Whenever it has no session it claims again, four times a second, so either end may start first and either may be
-restarted. When measurements stop coming for longer than `stale_s` it gives the session up and says nothing more; the
-plant's watchdog does the rest.
+The plant's clock leads: a tick is due when its measurement arrives. In lockstep the very same loop runs as fast as the
+plant asks. Whenever the daemon has no session it claims again, four times a second, so either end may start first and
+either may be restarted. When measurements stop coming for longer than `stale_s` it gives the session up and says
+nothing more; the plant's watchdog does the rest.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from protocol import topics
-from protocol.clock import LoopSettings, TickGrid, prepare_process
+from protocol.clock import LoopSettings, prepare_process
 from protocol.frames import COUNTERS, WireSpec
 from protocol.links import Arrival, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry
@@ -30,12 +31,10 @@ from service.reference import SinusoidSettings, reference_function
 log: Final = logging.getLogger("aeroloop")
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
-PHASE_LOCK: Final = 64
-"""The grid follows the plant's clock: each measurement moves it by this fraction of how far off it came."""
-
 CLAIM_PERIOD_S: Final = 0.25
 ANSWER_WAIT_S: Final = 1.0
-FIRST_MEASUREMENT_S: Final = 1.0
+LOCKSTEP_PATIENCE_S: Final = 2.0
+"""In lockstep the plant takes its time; only a plant that is gone is stale."""
 
 
 class ControllerSettings(BaseModel):
@@ -49,13 +48,6 @@ class ControllerSettings(BaseModel):
     duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
     telemetry_rate_hz: float = Field(default=50.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
-    lead: float = Field(
-        default=0.4,
-        gt=0,
-        lt=1,
-        description="when in the plant's period the controller ticks: late enough for a delayed measurement to be "
-        "there, early enough for its answer to act in the same period [periods]",
-    )
 
 
 class DaemonState(StrEnum):
@@ -98,14 +90,14 @@ class Daemon:
         self._reference = reference_function(reference)
         self._settings = settings
         self._controller = self._new_controller()
-        self._stale_ticks = max(1, loop.ticks(settings.stale_s))
+        self._patience_s = max(LOCKSTEP_PATIENCE_S, settings.stale_s) if loop.lockstep else settings.stale_s
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
         self._telemetry_every = max(1, round(loop.rate_hz / settings.telemetry_rate_hz))
         self._state = DaemonState.SEARCHING
         self._session: str | None = None
         self._recorders = 0
         self._told = ""
-        self._sent = self._received = self._skipped = self._ticks = self._refused = self._saturated = 0
+        self._sent = self._received = self._skipped = self._refused = self._saturated = 0
         self._notes: list[str] = []
         self._status_due = 0
         self._status_ticks = 0
@@ -128,7 +120,7 @@ class Daemon:
                     self._role.stop.wait(CLAIM_PERIOD_S)
                     continue
                 try:
-                    finished = self._run_lockstep(link) if self._loop.lockstep else self._run_real_time(link)
+                    finished = self._run(link)
                 finally:
                     self._release()
                     link.close()
@@ -137,65 +129,48 @@ class Daemon:
             self._role.event("stopped", f"{self._role.name} stopped commanding")
             self._publish_status()
 
-    # ── the two loops ──
+    def _run(self, link: ZenohLink) -> bool:
+        """One session: a tick for every measurement. True once the duration is over, False if the session was lost.
 
-    def _run_real_time(self, link: ZenohLink) -> bool:
-        """One session on the grid. True once the duration is over, False if the session was lost."""
-        first = link.wait(FIRST_MEASUREMENT_S)
-        if first is None or (read := self._wire.measurement.unpack(first.frame)) is None:
-            return self._lose("no measurement came")
-        # The plant counts from 0 at the grant, so its counter is the law's tick, even if a first frame was lost.
-        k = seen = read[0]
-        period_ns = self._loop.period_ns
-        lead_ns = round(self._settings.lead * period_ns)
-        grid = TickGrid(period_ns, start_ns=first.at_ns + lead_ns - k * period_ns)
-        grid.tick = k
-        self._tick(link, first, k)
-        while not self._role.stop.is_set() and (self._last_tick is None or seen < self._last_tick):
-            skipped = grid.skipped
-            k = grid.wait()
-            self._skipped += grid.skipped - skipped
-            arrival = link.take()
-            measured = self._tick_of(arrival, k)
-            self._tick(link, arrival, measured)
-            if arrival is not None:
-                seen = measured
-                early_ns = grid.start_ns + measured * period_ns - arrival.at_ns - lead_ns
-                grid.start_ns -= max(-period_ns, min(period_ns, early_ns)) // PHASE_LOCK
-            elif k - seen >= self._stale_ticks:
-                return self._lose(f"no measurement for {(k - seen) * self._loop.period * 1e3:.0f} ms")
-        return not self._role.stop.is_set()
-
-    def _tick_of(self, arrival: Arrival | None, k: int) -> int:
-        """The tick at which a measurement was taken: the one with its counter that is nearest to our own tick k."""
-        read = self._wire.measurement.unpack(arrival.frame) if arrival is not None else None
-        if read is None:
-            return k
-        return k + (read[0] - k + COUNTERS // 2) % COUNTERS - COUNTERS // 2
-
-    def _run_lockstep(self, link: ZenohLink) -> bool:
-        """One session, a tick for every measurement. True once the duration is over, False if the session was lost."""
-        k, seen = -1, time.monotonic()
-        while not self._role.stop.is_set() and k != self._last_tick:
+        The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
+        """
+        controller, stop = self._controller, self._role.stop
+        k, heard = -1, time.monotonic()
+        while not stop.is_set() and (self._last_tick is None or k < self._last_tick):
             arrival = link.wait(self._settings.stale_s)
-            if arrival is not None:
-                k, seen = k + 1, time.monotonic()
-                self._tick(link, arrival, k)
-            elif time.monotonic() - seen > FIRST_MEASUREMENT_S:
-                return self._lose(f"no measurement for {FIRST_MEASUREMENT_S:g} s")
-        return not self._role.stop.is_set()
+            if arrival is None:
+                if time.monotonic() - heard > self._patience_s:
+                    return self._lose(f"no measurement for {(time.monotonic() - heard) * 1e3:.0f} ms")
+                continue
+            heard = time.monotonic()
+            measured = self._tick_of(arrival, k + 1)
+            command = controller.tick(arrival.frame, measured)
+            if command is not None:
+                link.send(command)
+            self._account(command, measured - k - 1)
+            k = measured
+        return not stop.is_set()
 
-    def _tick(self, link: ZenohLink, arrival: Arrival | None, k: int) -> None:
-        command = self._controller.tick(arrival.frame if arrival else None, k)
+    def _tick_of(self, arrival: Arrival, due: int) -> int:
+        """The tick at which a measurement was taken: the first with its counter that is not before the one due.
+
+        Reordering by the network would make it a tick of the past; nothing that old is left by the slot that keeps
+        only the newest frame. A malformed frame counts as the one that was due, and is refused by the controller.
+        """
+        read = self._wire.measurement.unpack(arrival.frame)
+        return due if read is None else due + (read[0] - due) % COUNTERS
+
+    def _account(self, command: bytes | None, missed: int) -> None:
+        self._received += 1
+        self._skipped += missed
         if command is not None:
-            link.send(command)
             self._sent += 1
-        self._ticks += 1
-        if arrival is not None:
-            self._received += 1
-            if k % self._telemetry_every == 0 or self._state is not DaemonState.RUNNING:
-                self._state = DaemonState.RUNNING
-                self._publish_telemetry()
+        if self._state is not DaemonState.RUNNING:
+            self._state = DaemonState.RUNNING
+            self._publish_telemetry()
+            self._role.event("claimed", f"{self._role.name} has {self._role.vehicle}", self._session)
+        elif self._controller.tick_index % self._telemetry_every == 0:
+            self._publish_telemetry()
         self._publish_when_due()
 
     # ── the session ──
@@ -225,7 +200,6 @@ class Daemon:
             self._saturated += self._controller.saturated
             self._controller = self._new_controller()
             self._session, self._state, self._told = claim.session, DaemonState.CLAIMED, ""
-            role.event("claimed", f"{role.name} has {role.vehicle}", claim.session)
             return link
         link.close()
         if answer is not None and answer.reason != self._told:
@@ -301,8 +275,8 @@ class Daemon:
                 state=self._state,
                 session=self._session,
                 uptime_s=self._role.uptime_s,
-                ticks=self._ticks,
-                rate_hz=(self._ticks - self._status_ticks) / (now - self._status_time),
+                ticks=self._received,
+                rate_hz=(self._received - self._status_ticks) / (now - self._status_time),
                 skipped=self._skipped,
                 received=self._received,
                 sent=self._sent,
@@ -311,7 +285,7 @@ class Daemon:
                 notes=self._notes,
             )
         )
-        self._status_ticks, self._status_time = self._ticks, now
+        self._status_ticks, self._status_time = self._received, now
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
 

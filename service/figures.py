@@ -38,7 +38,7 @@ class Figures(BaseModel):
     final_error_deg: float | None = Field(description="attitude error at the last tick as measured [deg]")
     measurement: Stream
     command: Stream
-    skipped_ticks: int | None
+    skipped_ticks: int | None = Field(description="ticks that no command answered, whatever the reason")
     latency_us: Percentiles | None
     log: str | None
     reasons: dict[str, str] = Field(default_factory=dict, description="why a figure is null")
@@ -78,7 +78,7 @@ class Score:
         self._errors += 1
 
     def command(self, k: int, voltages: Sequence[float]) -> None:
-        """The voltages [V] commanded at tick k; they stand until the next, or until the watchdog. Shape (actuators,)."""
+        """The voltages [V] commanded at tick k; held until the next, or the watchdog. Shape (actuators,)."""
         if self._commands:
             held = min(k - self._command_tick, self._longest_hold)
             self._u_total += self._command_square * (held * self._period)
@@ -94,7 +94,6 @@ class Score:
     def figures(
         self,
         *,
-        skipped_ticks: int | None = None,
         latency: Percentiles | None = None,
         log: str | None = None,
         reasons: dict[str, str] | None = None,
@@ -103,7 +102,7 @@ class Score:
         reasons = dict(reasons or {})
         duration = self.ticks * self._period
         if not self._errors:
-            for name in ("z_track", "max_error_deg", "final_error_deg"):
+            for name in ("z_track", "max_error_deg", "final_error_deg", "skipped_ticks"):
                 reasons[name] = "no measurement was answered"
         if not self._commands:
             reasons["u_total"] = "no command was sent"
@@ -115,7 +114,7 @@ class Score:
             final_error_deg=degrees(self._angle) if self._errors else None,
             measurement=_stream(self._errors, self._wire.measurement, duration),
             command=_stream(self._commands, self._wire.command, duration),
-            skipped_ticks=skipped_ticks,
+            skipped_ticks=self.ticks - self._commands if self._errors else None,
             latency_us=latency,
             log=log,
             reasons=reasons,

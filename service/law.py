@@ -120,11 +120,7 @@ def build_law(p: LawSettings) -> Law:
     Phi = ca.diag(-omega)  # (C.44)
     u = ca.solve(
         B,
-        -G @ z1
-        - C2 @ z2
-        - Phi @ theta
-        - Psi
-        - J @ (S(omega) @ R_ib @ omega_d - R_ib @ omega_d_dot - alpha_bar),
+        -G @ z1 - C2 @ z2 - Phi @ theta - Psi - J @ (S(omega) @ R_ib @ omega_d - R_ib @ omega_d_dot - alpha_bar),
     )  # (C.22), (C.37)
     tau = Gamma @ Phi @ z2  # (C.23)
     theta_dot = projection(tau, theta, Gamma, p.damping_bound)  # (C.38)

@@ -79,7 +79,9 @@ class LogFile:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: BinaryIO = path.open("wb")
         except OSError as error:
-            raise RecorderError(f"cannot write the log {path}: {error.strerror}; name another with --log PATH") from None
+            raise RecorderError(
+                f"cannot write the log {path}: {error.strerror}; name another with --log PATH"
+            ) from None
         self.path = path
         self.written = 0
         self._chunk_ns = round(chunk_s * 1e9)
@@ -196,9 +198,7 @@ class Recorder:
     def _take(self, sample: zenoh.Sample) -> None:
         now = time.time_ns()
         if len(self._queue) < MAX_QUEUED:
-            self._queue.append(
-                Taken(str(sample.key_expr), sample.payload.to_bytes(), published_ns(sample, now), now)
-            )
+            self._queue.append(Taken(str(sample.key_expr), sample.payload.to_bytes(), published_ns(sample, now), now))
         else:
             self._lost += 1
 

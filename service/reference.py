@@ -1,7 +1,7 @@
 """What the body shall do: Euler angles as expressions of time, and what the law needs of them.
 
 A reference says roll, pitch and yaw as a CasADi expression of t. The desired quaternion, the angular velocity of (C.12)
-in the inertial frame and its derivative follow by CasADi's own derivatives, so they are exact and agree with each other.
+in the inertial frame and its derivative follow by CasADi's own derivatives, so they are exact and agree.
 """
 
 from __future__ import annotations

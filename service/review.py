@@ -10,6 +10,7 @@ tick always; from there the counter is unwrapped, over gaps with the help of the
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Final, NamedTuple
 from mcap.exceptions import McapError
 from mcap.reader import McapReader, make_reader
 from pydantic import ValidationError
+from zstandard import ZstdError
 
 from protocol import topics
 from protocol.frames import COUNTERS
@@ -57,6 +59,7 @@ class Session:
         self._waiting: deque[Seen] = deque(maxlen=MAX_WAITING)  # measurements whose tick is not known yet
         self._early: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands to them
         self._unanswered: deque[tuple[int, bytes]] = deque()
+        self._ahead: deque[Seen] = deque()  # commands that the log has before the measurement they answer
         self._last: tuple[int, int] | None = None  # tick and time of the last measurement
         self.malformed = 0
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
@@ -74,6 +77,9 @@ class Session:
             if k > tick:
                 self._last = k, seen.published_ns
                 self._unanswered.append((k, seen.frame))
+                ahead, self._ahead = self._ahead, deque()
+                for command in ahead:
+                    self.command(command)
 
     def command(self, seen: Seen) -> None:
         """A command frame: it and the measurements up to the one it answers now count."""
@@ -87,7 +93,10 @@ class Session:
         echo, codes = read
         answered = next((k for k, _ in reversed(self._unanswered) if k % COUNTERS == echo), None)
         if answered is None:
-            return  # answers what the log does not have
+            # Two links to the recorder keep no order between them. Past half a round the measurement is not coming.
+            if self._last is not None and len(self._ahead) < COUNTERS // 2:
+                self._ahead.append(seen)
+            return
         while self._unanswered and self._unanswered[0][0] <= answered:
             k, frame = self._unanswered.popleft()
             self._controller.tick(frame, k)
@@ -101,9 +110,7 @@ class Session:
         if self._last is not None:
             return
         waiting = list(self._waiting)
-        found = next(
-            (i for i in reversed(range(len(waiting))) if self._counter(waiting[i]) == telemetry.counter), None
-        )
+        found = next((i for i in reversed(range(len(waiting))) if self._counter(waiting[i]) == telemetry.counter), None)
         if found is None:
             return  # the measurement that it speaks of came before the log began
         self._waiting.clear()
@@ -171,8 +178,10 @@ def review(path: Path) -> Figures:
                     statuses[address.vehicle, address.role] = Status.model_validate_json(payload)
     except OSError as error:
         raise ReviewError(f"cannot read {path}: {error.strerror}") from None
-    except (McapError, ValidationError, ConfigError) as error:
-        raise ReviewError(f"{path} is not a whole aeroloop log: {str(error).splitlines()[0] or type(error).__name__}") from None
+    except (McapError, struct.error, ZstdError, ValidationError, ConfigError) as error:
+        raise ReviewError(
+            f"{path} is not a whole aeroloop log: {str(error).splitlines()[0] or type(error).__name__}"
+        ) from None
     if not sessions:
         raise ReviewError(f"{path} holds no session: no measurement or command frame was recorded")
     vehicle, name = max(sessions, key=lambda which: sessions[which].score.ticks)
@@ -206,12 +215,7 @@ def _settings(reader: McapReader, path: Path) -> Settings:
 
 def _judge(session: Session, ends: dict[str, Status], path: Path) -> Figures:
     reasons: dict[str, str] = {}
-    skipped: int | None = None
-    if "plant" in ends and "controller" in ends:
-        skipped = ends["plant"].skipped + ends["controller"].skipped
-    else:
-        reasons["skipped_ticks"] = "the log has no status of both ends"
     latency: Percentiles | None = ends["plant"].latency_us if "plant" in ends else None
     if latency is None:
         reasons["latency_us"] = "the log has no status of the plant with a latency"
-    return session.score.figures(skipped_ticks=skipped, latency=latency, log=str(path), reasons=reasons)
+    return session.score.figures(latency=latency, log=str(path), reasons=reasons)
