@@ -80,6 +80,8 @@ class Aero(EmulatedPlant):
         period: Time that `advance` lets pass [s].
     """
 
+    actuators = 2
+
     def __init__(self, settings: AeroSettings, period: float) -> None:
         dynamics = aero_dynamics(settings)
         x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 2)

@@ -53,6 +53,9 @@ class Endpoint:
         lockstep: Whether each answer is waited for; a claim must say the same.
         watchdog_s: 0 V after this long without a fresh command [s].
 
+    Raises:
+        ValueError: The wire commands another number of actuators than the plant has.
+
     Attributes:
         state: What it is doing.
         session: Name of the session it is in, or None.
@@ -65,6 +68,8 @@ class Endpoint:
     def __init__(
         self, plant: Plant, wire: WireSpec, period_ns: int, *, lockstep: bool = False, watchdog_s: float = WATCHDOG_S
     ) -> None:
+        if plant.actuators != wire.actuators:
+            raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
         self.plant = plant
         self.wire = wire
         self.period_ns = period_ns
@@ -75,10 +80,10 @@ class Endpoint:
         self.notices: list[Notice] = []
         self.refused = 0
         self.accepted = 0
-        self._attitude = [wire.attitude.quantizer() for _ in range(3)]
-        self._rate = [wire.rate.quantizer() for _ in range(3)]
+        self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
+        self._encode = [quantizer.encode for quantizer in self._quantizers]
         self._level = wire.voltage.quantizer().level
-        self._no_measurement = tuple(q.invalid for q in (*self._attitude, *self._rate))
+        self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
         self._watchdog = max(1, round(watchdog_s * 1e9 / period_ns))
@@ -86,12 +91,13 @@ class Endpoint:
         self._tick = -1
         self._session_tick = 0  # tick of the session's first measurement
         self._fresh_tick = 0  # tick of the last fresh command, or of the grant
-        self._echo = -1  # what the last fresh command answered
+        self._echo = -1  # the last fresh command's echo
+        self._answered = -1  # and the tick of the measurement that it answered
 
     @property
     def saturated(self) -> int:
         """Measured values beyond their quantizer's range so far."""
-        return sum(q.saturated for q in (*self._attitude, *self._rate))
+        return sum(quantizer.saturated for quantizer in self._quantizers)
 
     def claim(self, claim: Claim) -> Grant | Refusal:
         """Grant a claim, or say which field differs or who holds the plant. The next tick measures first."""
@@ -109,7 +115,7 @@ class Endpoint:
         self.session, self.holder, self.state = claim.session, claim.controller, PlantState.GRANTED
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
-        self._echo = -1
+        self._echo = self._answered = -1
         self._notice("claimed", f"granted to {claim.controller}")
         return Grant(session=claim.session)
 
@@ -157,14 +163,12 @@ class Endpoint:
         """Counter of the last measurement."""
         return (self._tick - self._session_tick) % COUNTERS
 
-    def _measure(self) -> tuple[float, ...]:
+    def _measure(self) -> list[float]:
         attitude, rate = self.plant.measure()
         if not isfinite(sum(attitude) + sum(rate)):
             return self._no_measurement
-        return (
-            *(q.encode(x) for q, x in zip(self._attitude, sent_vector(attitude), strict=True)),
-            *(q.encode(x) for q, x in zip(self._rate, rate, strict=True)),
-        )
+        values = (*sent_vector(attitude), *rate)
+        return [encode(value) for encode, value in zip(self._encode, values, strict=True)]
 
     def _command(self, frame: bytes) -> None:
         """Act on a command frame if it is well-formed, newer than the last, and valid."""
@@ -175,28 +179,20 @@ class Endpoint:
             self.refused += 1
             return
         echo, codes = read
-        if not self._is_fresh(echo):
+        # The echo is a tick modulo 16: the latest measurement with that counter. Newer than the last one answered is
+        # fresh. An echo that never changes is a sender that repeats itself, however long ago it began.
+        answered = self._tick - (self.counter - echo) % COUNTERS
+        if echo == self._echo or answered <= self._answered:
             return
         voltages = tuple(self._level(code) for code in codes)
         if not isfinite(sum(voltages)):
             self._end(PlantState.TRIPPED, "tripped", f"{self.holder} commands 'no valid value': 0 V")
             return
         self._voltages = voltages
-        self._echo = echo
+        self._echo, self._answered = echo, answered
         self._fresh_tick = self._tick
         self.state = PlantState.DRIVEN
         self.accepted += 1
-
-    def _is_fresh(self, echo: int) -> bool:
-        """A command that answers the same measurement as the last one did, or an older one, is not fresh.
-
-        The counter goes round in 16 ticks, so "older" can be told only while the last command is less than half a
-        round old; after that any other echo counts as newer.
-        """
-        if self._echo < 0:
-            return True
-        ahead = (echo - self._echo) % COUNTERS
-        return ahead != 0 and (ahead < COUNTERS // 2 or self._tick - self._fresh_tick >= COUNTERS // 2)
 
     def _watch(self, tick: int) -> None:
         """End the session when no fresh command came in time."""

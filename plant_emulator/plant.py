@@ -40,7 +40,13 @@ class State(NamedTuple):
 
 
 class Plant(ABC):
-    """A plant with 2 or 3 actuators, advanced by its owner."""
+    """A plant, advanced by its owner.
+
+    Attributes:
+        actuators: Number of its motors, 2 or 3.
+    """
+
+    actuators: int
 
     @abstractmethod
     def actuate(self, voltages: Sequence[float]) -> None:

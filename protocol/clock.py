@@ -71,15 +71,20 @@ class TickGrid:
         self.skipped = 0
 
     def wait(self) -> int:
-        """Sleep until the next tick is due and return its index. Ticks already a period or more late are skipped."""
+        """Sleep until the next tick is due and return its index.
+
+        A tick that is a little late is taken at once; after a stall of a period or more, the next one still ahead.
+        """
         k = self.tick + 1
-        ahead = self.start_ns + k * self.period_ns - time.monotonic_ns()
-        if ahead > 0:
-            time.sleep(ahead * 1e-9)
-        elif -ahead >= self.period_ns:
-            missed = -ahead // self.period_ns
+        now = time.monotonic_ns()
+        late = now - self.start_ns - k * self.period_ns
+        if late >= self.period_ns:
+            missed = -(-late // self.period_ns)
             self.skipped += missed
             k += missed
+        ahead = self.start_ns + k * self.period_ns - now
+        if ahead > 0:
+            time.sleep(ahead * 1e-9)
         self.tick = k
         return k
 

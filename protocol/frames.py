@@ -148,10 +148,10 @@ class FrameFormat:
         """
         if len(codes) != len(self.widths):
             raise ValueError(f"this frame holds {len(self.widths)} codes, not {len(codes)}")
-        for i in self._floats:
-            if isinf(codes[i]):
-                raise ValueError("an infinite value does not travel; clip it, or send NaN for 'no valid value'")
         try:
+            for i in self._floats:
+                if isinf(codes[i]):
+                    raise ValueError("an infinite value does not travel; clip it, or send NaN for 'no valid value'")
             frame: bytes = self._format.pack(counter, *self._gap, *codes, *self._tail)
         except (OverflowError, TypeError) as error:
             raise ValueError(f"counter {counter!r} with codes {tuple(codes)!r} does not fit: {error}") from None

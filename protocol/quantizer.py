@@ -102,6 +102,8 @@ class UniformQuantizer(Quantizer):
             self.deadzone = deadzone
         else:
             raise ValueError(f"a dead zone lies between 0 and the limit {limit}, not at {deadzone}")
+        if not 0 < self.step < float("inf"):
+            raise ValueError(f"a limit of {limit} leaves no step that a float can hold")
         self.bound = max(self.deadzone, self.step / 2)
         self.saturated = 0
         positive = [self.deadzone + self.step / 2 + i * self.step for i in range(self.top)]
@@ -119,7 +121,7 @@ class UniformQuantizer(Quantizer):
 
     def encode(self, y: float) -> int:
         """The code of a value; see `Quantizer.encode`."""
-        x = (abs(y) - self.deadzone) / self.step * _TIE
+        x: float = (abs(y) - self.deadzone) / self.step * _TIE
         if x <= 0.0:
             return 0
         if x > self.top:

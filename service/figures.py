@@ -62,7 +62,9 @@ class Score:
         self._error_square = self._command_square = 0.0
         self._errors = self._commands = 0
         self._z_track = self._u_total = 0.0
-        self._max_angle = self._angle = 0.0
+        self._largest: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self._largest_square = 0.0
+        self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def error(self, k: int, error: Sequence[float]) -> None:
         """The attitude error ε̃ at tick k; it stands until the next. Shape (3,)."""
@@ -73,8 +75,9 @@ class Score:
         x, y, z = error
         self._error_tick = k
         self._error_square = x * x + y * y + z * z
-        self._angle = angle(x, y, z)
-        self._max_angle = max(self._max_angle, self._angle)
+        self._last = x, y, z
+        if self._error_square > self._largest_square:
+            self._largest, self._largest_square = self._last, self._error_square
         self._errors += 1
 
     def command(self, k: int, voltages: Sequence[float]) -> None:
@@ -110,8 +113,8 @@ class Score:
             duration_s=round(duration, 9),
             z_track=self._z_track + self._error_square * self._period if self._errors else None,
             u_total=self._u_total + self._command_square * self._period if self._commands else None,
-            max_error_deg=degrees(self._max_angle) if self._errors else None,
-            final_error_deg=degrees(self._angle) if self._errors else None,
+            max_error_deg=degrees(angle(*self._largest)) if self._errors else None,
+            final_error_deg=degrees(angle(*self._last)) if self._errors else None,
             measurement=_stream(self._errors, self._wire.measurement, duration),
             command=_stream(self._commands, self._wire.command, duration),
             skipped_ticks=self.ticks - self._commands if self._errors else None,

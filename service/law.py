@@ -21,11 +21,12 @@ the wire; (C.36) is the quantizer at the controller's exit.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import hypot
 from typing import Annotated
 
 import casadi as ca
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from protocol.attitude import R, S
 
@@ -63,6 +64,12 @@ class LawSettings(BaseModel):
     )
     damping_bound: float = Field(default=0.05, gt=0, description="k_θ: ‖θ‖ is known to be below this [N·m·s/rad]")
 
+    @model_validator(mode="after")
+    def _estimate_within_bound(self) -> LawSettings:
+        if hypot(*self.damping_estimate) > self.damping_bound:
+            raise ValueError(f"the first damping estimate lies beyond damping_bound, {self.damping_bound}")
+        return self
+
 
 @dataclass(frozen=True)
 class Law:
@@ -91,7 +98,7 @@ def build_law(p: LawSettings) -> Law:
     Raises:
         ValueError: B cannot be inverted.
     """
-    if abs(np.linalg.det(np.array(p.allocation))) < 1e-12:
+    if np.linalg.cond(np.array(p.allocation)) > 1e12:
         raise ValueError("law.allocation (B) has no inverse: every axis needs a motor that acts on it")
     J, B = ca.diag(ca.SX(p.inertia)), ca.SX(np.array(p.allocation))
     C1, C2, Gamma = (ca.diag(ca.SX(gains)) for gains in (p.C1, p.C2, p.Gamma))
@@ -158,6 +165,8 @@ def law_function(p: LawSettings, period: float) -> ca.Function:
     """
     law = build_law(p)
     theta_next = law.theta + period * law.theta_dot
+    # Euler's step leaves the ball along its tangent; the projection of Remark 5 holds in continuous time only.
+    theta_next *= ca.fmin(1, p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
     return ca.Function(
         "law",
         [law.q, law.omega, law.q_d, law.omega_d, law.omega_d_dot, law.theta, law.s],

@@ -180,7 +180,7 @@ def review(path: Path) -> Figures:
         raise ReviewError(f"cannot read {path}: {error.strerror}") from None
     except (McapError, struct.error, ZstdError, ValidationError, ConfigError) as error:
         raise ReviewError(
-            f"{path} is not a whole aeroloop log: {str(error).splitlines()[0] or type(error).__name__}"
+            f"{path} is not a whole aeroloop log: {(str(error) or type(error).__name__).splitlines()[0]}"
         ) from None
     if not sessions:
         raise ReviewError(f"{path} holds no session: no measurement or command frame was recorded")

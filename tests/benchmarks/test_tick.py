@@ -5,9 +5,9 @@ Run with `uv run pytest tests/benchmarks --benchmark-enable`. Figures are for re
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import cycle
 
+import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
@@ -18,7 +18,7 @@ from protocol.messages import Claim
 from service.controller import Controller
 from service.law import LawSettings
 from service.reference import SinusoidSettings, reference_function
-from tests.service import numpy_twin
+from tests.service import numpy_twin as twin
 
 PERIOD = 0.002
 TICKS = 2000
@@ -53,3 +53,29 @@ def test_controller_tick(benchmark: BenchmarkFixture, measurements: list[bytes])
         return controller.tick(frame, k)
 
     assert benchmark(tick) is not None
+
+
+def test_the_same_tick_in_plain_numpy(benchmark: BenchmarkFixture, measurements: list[bytes]) -> None:
+    """The tests' NumPy twin of the law and the reference, between the project's own frames and quantizers."""
+    wire, p, paper = WireSpec(), LawSettings(), SinusoidSettings()
+    body = twin.Body(
+        J=np.diag(p.inertia), m=p.mass, g=p.gravity, r_g=np.array(p.centre_of_mass), B=np.array(p.allocation),
+        C1=np.diag(p.C1), C2=np.diag(p.C2), Gamma=np.diag(p.Gamma), bound=p.damping_bound,
+    )  # fmt: skip
+    reference = twin.Sinusoids(np.radians(paper.amplitude), np.array(paper.frequency))
+    level, quantizer = wire.attitude.quantizer().level, wire.voltage.quantizer()
+    theta, last = np.array(p.damping_estimate), np.array([1.0, 0.0, 0.0, 0.0])
+    frames = cycle(enumerate(measurements))
+
+    def tick() -> bytes:
+        nonlocal theta, last
+        k, frame = next(frames)
+        read = wire.measurement.unpack(frame)
+        assert read is not None
+        values = np.array([level(code) for code in read[1]])
+        last = twin.reconstructed(values[:3], last)
+        state = twin.law(body, last, values[3:], *reference.desired(k * PERIOD), theta, 1.0)
+        theta = theta + PERIOD * state.theta_dot
+        return wire.command.pack(read[0], [quantizer.encode(float(u)) for u in state.u[1:]])
+
+    assert len(benchmark(tick)) == wire.command.size

@@ -1,9 +1,9 @@
 """A second control law, reference and plant in plain NumPy: what the tests compare the project with.
 
-Nothing here imports the project, so an error has to be made twice, in two notations, to go unseen. The law is typed from
-the paper's (C.11) and (C.16)–(C.49). The reference is differentiated by hand. The plant does not project the rigid body
-onto its free motions as plant_emulator.aero does: it keeps all three axes of (C.2) and solves for the torque with which
-the mechanism holds the roll.
+Nothing here imports the project, so an error has to be made twice, in two notations, to go unseen. The law is typed
+from the paper's (C.11) and (C.16)–(C.49). The reference is differentiated by hand. The plant does not project the rigid
+body onto its free motions as plant_emulator.aero does: it keeps all three axes of (C.2) and solves for the torque with
+which the mechanism holds the roll.
 
 Vectors have shape (3,), quaternions (4,) with the scalar first.
 """
@@ -37,7 +37,7 @@ def rotation(q: Array) -> Array:
 
 
 def reconstructed(eps: Array, last: Array) -> Array:
-    """(C.11) with Remarks 1 and 2: the unit quaternion of a received ε, with the sign of whichever is nearer to `last`."""
+    """(C.11) with Remarks 1 and 2: of the two unit quaternions of a received ε, the one nearer to `last`."""
     square = float(eps @ eps)
     q = np.append(0.0, eps / np.sqrt(square)) if square > 1 else np.append(np.sqrt(1 - square), eps)
     return -q if np.linalg.norm(q - last) > np.linalg.norm(q + last) else q
@@ -109,7 +109,7 @@ def projected(p: Body, theta: Array, tau: Array) -> Array:
     P, slope = theta @ theta - inner, 2 * theta
     if P <= 0 or slope @ tau <= 0:
         return tau
-    c = min(1.0, P / (p.bound**2 - inner))
+    c = min(1.0, float(P) / (p.bound**2 - inner))
     removed: Array = c * (p.Gamma @ np.outer(slope, slope)) / (slope @ p.Gamma @ slope) @ tau
     return tau - removed
 

@@ -1,0 +1,142 @@
+"""SPEC.md and the code say the same: its golden vectors are read from the text itself and tried on the code."""
+
+from __future__ import annotations
+
+import re
+from math import isnan
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import protocol
+from protocol.frames import FrameFormat, WireSpec
+from protocol.messages import PROTOCOL_VERSION
+from protocol.quantizer import UniformQuantizer
+from protocol.topics import TOPICS
+
+SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
+
+QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
+FRAMES: Final = "| frame | bits of ε, ω / u | actuators | counter | codes | hex |"
+REFUSED: Final = "| frame | bits of ε, ω / u | actuators | hex | why |"
+
+Row = tuple[str, ...]
+
+
+def cells(line: str) -> Row:
+    """The cells of a row, without spaces and backticks around them."""
+    return tuple(cell.strip().strip("`").strip() for cell in line.strip().strip("|").split("|"))
+
+
+def rows(header: str, under: str = "") -> list[Row]:
+    """Rows of every table with exactly this header below a heading that contains `under`."""
+    found: list[Row] = []
+    heading, inside, fenced = "", False, False
+    for line in SPEC.read_text(encoding="utf-8").splitlines():
+        if line.startswith("```"):
+            fenced = not fenced
+        elif line.startswith("#") and not fenced:
+            heading, inside = line, False
+        elif line == header and under in heading:
+            inside = True
+        elif not line.startswith("|"):
+            inside = False
+        elif inside and not set(line) <= set("|-: "):
+            found.append(cells(line))
+    return found
+
+
+QUANTIZER_ROWS: Final = rows(QUANTIZER, "Golden vectors")
+FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
+REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
+
+
+def number(text: str) -> int:
+    """The integer that a code cell starts with; `-128` may be followed by a word."""
+    found = re.fullmatch(r"([-−]?\d+)`?( invalid)?", text)
+    assert found, f"{text!r} is not a code"
+    return int(found[1].replace("−", "-"))
+
+
+def form(frame: str, bits: str, actuators: str) -> FrameFormat:
+    """The format that the first cells of a row describe."""
+    widths = [cell.strip() for cell in bits.split(",")]
+    wire: dict[str, object]
+    if frame == "measurement":
+        attitude, rate = widths
+        wire = {"attitude": {"bits": as_bits(attitude), "limit": 1.0}, "rate": {"bits": as_bits(rate), "limit": 1.0}}
+        return WireSpec.model_validate(wire).measurement
+    assert frame == "command", f"{frame!r} is neither a measurement nor a command"
+    (voltage,) = widths
+    wire = {"voltage": {"bits": as_bits(voltage), "limit": 24.0}, "actuators": int(actuators)}
+    return WireSpec.model_validate(wire).command
+
+
+def as_bits(text: str) -> int | str:
+    """A width as a person writes it."""
+    return text if text == "cont" else int(text)
+
+
+@pytest.mark.parametrize(
+    ("found", "least"),
+    [
+        pytest.param(QUANTIZER_ROWS, 6, id="quantizer"),
+        pytest.param(FRAME_ROWS, 8, id="frames"),
+        pytest.param(REFUSED_ROWS, 4, id="refused"),
+    ],
+)
+def test_the_golden_vectors_are_there(found: list[Row], least: int) -> None:
+    assert len(found) >= least
+    assert len(set(found)) == len(found)
+
+
+@pytest.mark.parametrize("row", QUANTIZER_ROWS, ids=" ".join)
+def test_the_quantizer_gives_its_golden_vectors(row: Row) -> None:
+    bits, limit, deadzone, value, code, level = row
+    quantizer = UniformQuantizer(int(bits), float(limit), None if deadzone == "l/2" else float(deadzone))
+    if isnan(float(value)):
+        assert number(code) == quantizer.invalid
+        assert isnan(float(level))
+        assert isnan(quantizer.decode(number(code)))
+        return
+    assert quantizer.encode(float(value)) == number(code)
+    # The text gives at least twelve significant digits; zero is exact.
+    assert quantizer.decode(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
+
+
+@pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)
+def test_frames_are_their_golden_vectors(row: Row) -> None:
+    frame, bits, actuators, counter, codes, text = row
+    layout = form(frame, bits, actuators)
+    expected = [
+        float(code) if width is None else int(code) for width, code in zip(layout.widths, codes.split(), strict=True)
+    ]
+    assert text == text.lower()
+    assert layout.pack(int(counter), expected).hex() == text.replace(" ", "")
+    arrived = layout.unpack(bytes.fromhex(text))
+    assert arrived is not None
+    assert arrived[0] == int(counter)
+    assert [repr(code) for code in arrived[1]] == [repr(code) for code in expected]  # repr: NaN equals itself
+
+
+@pytest.mark.parametrize("row", REFUSED_ROWS, ids=" ".join)
+def test_golden_vectors_that_must_be_refused_are_refused(row: Row) -> None:
+    frame, bits, actuators, text, why = row
+    assert why
+    assert form(frame, bits, actuators).unpack(bytes.fromhex(text)) is None
+
+
+def test_the_table_of_topics_is_that_of_the_code() -> None:
+    told = [
+        cells(line)[:2]
+        for line in SPEC.read_text(encoding="utf-8").splitlines()
+        if line.startswith("|") and len(cells(line)) == 5
+    ]
+    start = next(i for i, row in enumerate(told) if row[0] == "topic")
+    table = {name: key for name, key in told[start + 1 :] if not set(name) <= set("-: ")}
+    assert table == {topic.name: topic.key for topic in TOPICS.values()}
+
+
+def test_the_text_is_of_the_version_that_a_claim_carries() -> None:
+    assert re.search(rf"^# .*version {PROTOCOL_VERSION}$", SPEC.read_text(encoding="utf-8"), re.MULTILINE)
