@@ -9,25 +9,22 @@ The mechanism does no work along A, so projecting (C.2) onto A's columns (Kane's
 
     Aᵀ J A ν̇ = Aᵀ (Ψ(q, ω) + Φ(ω) θ + B u − J Ȧ ν)
 
-Roll's row of B does not matter to them; two motors act, u₂ and u₃.
+A load, a torque about each joint, is added to the right-hand side. Roll's row of B does not matter; two motors act, u₂
+and u₃.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from plant_emulator.integrate import rk4
-from plant_emulator.plant import EmulatedPlant, Measurement, State
+from plant_emulator.mechanism import Mechanism
 from protocol.attitude import R, S, from_euler
-from protocol.symbolic import Compiled
 
 
 class AeroSettings(BaseModel):
-    """The physical Aero. Defaults: Table C.1 of the paper; damping as measured (see `damping`)."""
+    """The Aero's body. Defaults: Table C.1 of the paper but for the centre of mass, which `lab calibrate` fitted."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -35,30 +32,34 @@ class AeroSettings(BaseModel):
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
     centre_of_mass: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, -0.0038), description="r_g, pivot to centre of mass, body frame [m]"
+        default=(0.0, 0.0, -0.003955),
+        description="r_g, pivot to centre of mass, body frame [m]; height by `lab calibrate`, Table C.1: -0.0038",
     )
     thrust: tuple[tuple[float, float], tuple[float, float]] = Field(
         default=((0.0011, 0.0011), (-0.0014, 0.00176)),
         description="pitch and yaw rows of B, columns u2 and u3 [N·m/V]",
     )
     damping: tuple[float, float, float] = Field(
-        default=(0.0, 0.0071, 0.0220),
-        description="θ, true viscous damping about the body axes [N·m·s/rad]; pitch, yaw from Quanser's lab material",
+        default=(0.0, 0.0, 0.0),
+        description="θ of (C.2), damping about the *body* axes [N·m·s/rad]; the bench has its friction in the joints",
     )
-    voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage at a motor [V]")
-    substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
+
+
+def free_motions(pitch: ca.SX) -> ca.SX:
+    """A(p) of the module's head: ω = A [ṗ, ẏ]. Shape (3, 2)."""
+    return ca.vertcat(ca.horzcat(0, -ca.sin(pitch)), ca.horzcat(1, 0), ca.horzcat(0, ca.cos(pitch)))
 
 
 def aero_dynamics(settings: AeroSettings) -> ca.Function:
-    """ẋ(x, u) of the Aero. x = [pitch, yaw, ṗ, ẏ] in rad and rad/s, u = [u₂, u₃] in V."""
-    x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 2)
+    """ẋ(x, u, load) of the Aero: x = [pitch, yaw, ṗ, ẏ], u = [u₂, u₃] in V, load about pitch and yaw in N·m."""
+    x, u, load = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("load", 2)
     pitch, yaw, nu = x[0], x[1], x[2:4]
     J = ca.diag(ca.SX(settings.inertia))
     r_g = ca.SX(settings.centre_of_mass)
     theta = ca.SX(settings.damping)
     B = ca.vertcat(ca.SX.zeros(1, 2), ca.SX(np.array(settings.thrust)))
 
-    A = ca.vertcat(ca.horzcat(0, -ca.sin(pitch)), ca.horzcat(1, 0), ca.horzcat(0, ca.cos(pitch)))
+    A = free_motions(pitch)
     A_dot = ca.jacobian(ca.vec(A), pitch).reshape((3, 2)) * nu[0]
     q = from_euler(ca.vertcat(0, pitch, yaw))
     omega = A @ nu
@@ -67,54 +68,41 @@ def aero_dynamics(settings: AeroSettings) -> ca.Function:
     g = -S(r_g) @ R(q).T @ weight  # (C.6)
     Psi = -S(omega) @ (J @ omega) - g  # (C.4)
     Phi = ca.diag(-omega)  # (C.5)
-    torque = A.T @ (Psi + Phi @ theta + B @ u - J @ A_dot @ nu)
+    torque = A.T @ (Psi + Phi @ theta + B @ u - J @ A_dot @ nu) + load
     nu_dot = ca.solve(A.T @ J @ A, torque)
-    return ca.Function("aero", [x, u], [ca.vertcat(nu, nu_dot)], ["x", "u"], ["x_dot"])
+    return ca.Function("aero", [x, u, load], [ca.vertcat(nu, nu_dot)], ["x", "u", "load"], ["x_dot"])
 
 
-class Aero(EmulatedPlant):
-    """The Aero, emulated. Starts level, at rest, at yaw 0: q = [1, 0, 0, 0].
+class Aero(Mechanism):
+    """x = [pitch, yaw, ṗ, ẏ] in rad and rad/s; the axes are the two joints. Starts level, at rest, at yaw 0.
 
     Args:
         settings: The physical parameters.
-        period: Time that `advance` lets pass [s].
     """
 
+    initial = (0.0, 0.0, 0.0, 0.0)
     actuators = 2
+    axes = 2
 
-    def __init__(self, settings: AeroSettings, period: float) -> None:
-        dynamics = aero_dynamics(settings)
-        x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 2)
-        after = rk4(lambda state: dynamics(state, u), x, period, settings.substeps)
-        q = from_euler(ca.vertcat(0, after[0], after[1]))
-        omega = ca.vertcat(-ca.sin(after[0]) * after[3], after[2], ca.cos(after[0]) * after[3])
-        self._step = Compiled(ca.Function("step", [x, u], [after, q, omega], ["x", "u"], ["after", "attitude", "rate"]))
-        self._x = self._step.inputs["x"]
-        self._u = self._step.inputs["u"]
-        self._after = self._step.outputs["after"]
-        self._attitude = self._step.outputs["attitude"]
-        self._rate = self._step.outputs["rate"]
-        self._attitude[0] = 1.0
-        self._limit = settings.voltage_limit
+    def __init__(self, settings: AeroSettings) -> None:
+        self._dynamics = aero_dynamics(settings)
 
-    def actuate(self, voltages: Sequence[float]) -> None:
-        """Hold two voltages [V], clipped to the supply's limits."""
-        for i in range(2):
-            self._u[i] = max(-self._limit, min(self._limit, voltages[i]))
+    def derivative(self, x: ca.SX, voltages: ca.SX, load: ca.SX) -> ca.SX:
+        """ẋ under the voltages of u₂ and u₃ [V] and torques about pitch and yaw [N·m]."""
+        return self._dynamics(x, voltages, load)
 
-    def advance(self) -> None:
-        """Integrate one period."""
-        self._step()
-        self._x[:] = self._after
+    def attitude(self, x: ca.SX) -> ca.SX:
+        """R_z(yaw) R_y(pitch) as q."""
+        return from_euler(ca.vertcat(0, x[0], x[1]))
 
-    def measure(self) -> Measurement:
-        """Perfect sensors."""
-        return Measurement(tuple(self._attitude), tuple(self._rate))  # type: ignore[arg-type]  # lengths are 4 and 3
+    def rate(self, x: ca.SX) -> ca.SX:
+        """ω = A ν."""
+        return free_motions(x[0]) @ x[2:4]
 
-    def truth(self) -> State:
-        """The state as integrated."""
-        return State(tuple(self._attitude), tuple(self._rate), tuple(self._u))  # type: ignore[arg-type]  # as above
+    def axis_rates(self, x: ca.SX) -> ca.SX:
+        """ν = [ṗ, ẏ]."""
+        return x[2:4]
 
-    def close(self) -> None:
-        """0 V."""
-        self.actuate((0.0, 0.0))
+    def axis_angles(self, x: ca.SX) -> ca.SX:
+        """[pitch, yaw]."""
+        return x[0:2]

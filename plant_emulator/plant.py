@@ -63,11 +63,3 @@ class Plant(ABC):
     @abstractmethod
     def close(self) -> None:
         """Leave the plant safe: 0 V, nothing held. Closing twice does no harm."""
-
-
-class EmulatedPlant(Plant):
-    """A plant that is computed, so its state is known."""
-
-    @abstractmethod
-    def truth(self) -> State:
-        """The unquantized state now."""

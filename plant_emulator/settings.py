@@ -1,19 +1,33 @@
-"""What the plant end can be told."""
+"""What the plant end can be told, and the plant that follows from it: the one place where the pieces are chosen."""
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from plant_emulator.aero import Aero, AeroSettings
-from plant_emulator.plant import EmulatedPlant
+from plant_emulator.emulated import EmulatedPlant
+from plant_emulator.friction import FrictionSettings
+from plant_emulator.mechanism import Mechanism
+from plant_emulator.rigid_body import RigidBody, RigidBodySettings
+from plant_emulator.rotor import RotorSettings
+from plant_emulator.sensors import Sensors, SensorSettings
+from plant_emulator.wind import Wind, WindSettings
 from protocol.clock import WATCHDOG_S
 
 
 class PlantSettings(BaseModel):
-    """The plant end: which plant, and how it looks after itself."""
+    """The plant end: which plant, what acts on it and looks at it, and how it looks after itself."""
 
     model_config = ConfigDict(extra="forbid")
 
+    kind: Literal["aero", "rigid_body"] = Field(default="aero", description="which body is emulated")
+    ideal: bool = Field(
+        default=False,
+        description="the paper's equations and nothing else: Table C.1, damping θ = [0, 0.0071, 0.0220] about the body "
+        "axes, no rotor lag, no friction, no wind, perfect sensors",
+    )
     watchdog_s: float = Field(
         default=WATCHDOG_S, gt=0, le=10, description="0 V after this long without a fresh command [s]"
     )
@@ -21,8 +35,46 @@ class PlantSettings(BaseModel):
         default=2.0, gt=0, le=600, description="lockstep only: 0 V after waiting this long for an answer [s]"
     )
     truth_rate_hz: float = Field(default=50.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
+    voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
+    substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
     aero: AeroSettings = AeroSettings()
+    rigid_body: RigidBodySettings = RigidBodySettings()
+    rotor: RotorSettings = RotorSettings()
+    friction: FrictionSettings = FrictionSettings()
+    wind: WindSettings = WindSettings()
+    sensors: SensorSettings = SensorSettings()
+
+    @model_validator(mode="after")
+    def _sensors_fit_the_body(self) -> PlantSettings:
+        needs_joints = self.sensors.attitude == "encoders" or self.sensors.rate == "derivative"
+        if self.kind == "rigid_body" and needs_joints and not self.ideal:
+            raise ValueError(
+                "a free body has no joints for encoders: set sensors.attitude to 'perfect' and sensors.rate to 'gyro' "
+                "or 'perfect', or set ideal"
+            )
+        return self
 
     def build(self, period: float) -> EmulatedPlant:
         """The plant, to be advanced in steps of `period` [s]."""
-        return Aero(self.aero, period)
+        mechanism: Mechanism
+        if self.kind == "rigid_body":
+            mechanism = RigidBody(self.rigid_body)
+        else:
+            mechanism = Aero(IDEAL_AERO if self.ideal else self.aero)
+        wind = WindSettings() if self.ideal else self.wind
+        return EmulatedPlant(
+            mechanism,
+            IDEAL_ROTOR if self.ideal else self.rotor,
+            IDEAL_FRICTION if self.ideal else self.friction,
+            Wind(wind, mechanism.axes, period),
+            Sensors(IDEAL_SENSORS if self.ideal else self.sensors, period),
+            period=period,
+            voltage_limit=self.voltage_limit,
+            substeps=self.substeps,
+        )
+
+
+IDEAL_AERO = AeroSettings(centre_of_mass=(0.0, 0.0, -0.0038), damping=(0.0, 0.0071, 0.0220))
+IDEAL_ROTOR = RotorSettings(lag_up_s=0.0, lag_down_s=0.0)
+IDEAL_FRICTION = FrictionSettings(viscous=(), coulomb=())
+IDEAL_SENSORS = SensorSettings(attitude="perfect", rate="perfect")

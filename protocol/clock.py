@@ -129,7 +129,9 @@ def prepare_process() -> list[str]:
     if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0):
         refused.append("timer slack stays at the system's default")
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+        # Every thread: what carries the frames must not wait for other work any more than the loop itself.
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(10))
     except OSError as error:
         refused.append(f"SCHED_FIFO: {error.strerror}")
     return refused

@@ -18,8 +18,10 @@ from typer.exceptions import TyperException
 
 if TYPE_CHECKING:
     from protocol.role import Role
+    from service.calibrate import Calibration
     from service.config import Settings
     from service.figures import Figures
+    from service.tables import Tables
 
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
@@ -206,6 +208,58 @@ def experiment(
     _print_figures(_guard(run), json)
 
 
+@lab.command()
+def tables(
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Predict every cell of the paper's Tables C.2 to C.4, beside what was published."""
+    settings = _settings(config, overrides)
+
+    def run() -> Tables:
+        from service.display import count_bar
+        from service.tables import predict
+
+        with count_bar("cells", hidden=json) as update:
+            return predict(settings, seeds, update)
+
+    result = _guard(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    elif markdown:
+        from service.tables import markdown as as_markdown
+
+        typer.echo(as_markdown(result))
+    else:
+        from service.display import paper_tables
+
+        paper_tables(result)
+
+
+@lab.command()
+def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Fit the bench to two of the paper's cells, calm and windy, and print the fitted values."""
+    settings = _settings(config, overrides)
+
+    def run() -> Calibration:
+        from service.calibrate import calibrate
+        from service.display import count_bar
+
+        with count_bar("experiments", hidden=json) as update:
+            return calibrate(settings, lambda runs: update(runs, None))
+
+    result = _guard(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from service.display import calibration_table
+
+        calibration_table(result)
+
+
 @log_group.command()
 def review(log: Annotated[Path, typer.Argument(help="An MCAP log.", show_default=False)], json: Json = False) -> None:
     """Compute every figure from a log alone."""
@@ -267,12 +321,22 @@ def _guard(run: Callable[[], T]) -> T:
     """Run, and turn what can go wrong into one line and an exit code."""
     from protocol.network import NetworkError
     from service.bench import BenchError
+    from service.calibrate import CalibrationError
+    from service.daemon import SessionLostError
     from service.recorder import RecorderError
     from service.review import ReviewError
 
     try:
         return run()
-    except (NetworkError, BenchError, RecorderError, ReviewError, ValueError) as error:
+    except (
+        NetworkError,
+        BenchError,
+        CalibrationError,
+        RecorderError,
+        ReviewError,
+        SessionLostError,
+        ValueError,
+    ) as error:
         if _state["debug"]:
             raise
         _fail(str(error).splitlines()[0], 1)

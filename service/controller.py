@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import casadi as ca
 
-from protocol.attitude import IDENTITY, Quaternion, received_quaternion
+from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
 from protocol.frames import WireSpec
 from protocol.symbolic import Compiled
 from service.law import LawSettings, law_function
@@ -114,6 +114,16 @@ class Controller:
     def sign(self) -> int:
         """±1, the equilibrium that is approached; 0 before the first measurement."""
         return int(self._sign[0])
+
+    @property
+    def attitude(self) -> Quaternion:
+        """q^Q of the last measurement [1]."""
+        return self._attitude
+
+    @property
+    def rate(self) -> Vector:
+        """ω^Q of the last measurement, body frame [rad/s]."""
+        return tuple(self._omega)  # type: ignore[return-value]  # three elements
 
     @property
     def attitude_error(self) -> tuple[float, float, float]:

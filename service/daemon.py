@@ -50,6 +50,10 @@ class ControllerSettings(BaseModel):
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
 
 
+class SessionLostError(Exception):
+    """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
+
+
 class DaemonState(StrEnum):
     """What the daemon is doing."""
 
@@ -96,7 +100,7 @@ class Daemon:
         self._state = DaemonState.SEARCHING
         self._session: str | None = None
         self._recorders = 0
-        self._told = ""
+        self._told = self._lost = ""
         self._sent = self._received = self._skipped = self._refused = self._saturated = 0
         self._notes: list[str] = []
         self._status_due = 0
@@ -124,6 +128,11 @@ class Daemon:
                 finally:
                     self._release()
                     link.close()
+                if not finished and self._last_tick is not None and not self._role.stop.is_set():
+                    raise SessionLostError(
+                        f"{self._lost} after {self._controller.tick_index + 1} ticks, so the run is over; "
+                        "a machine too busy for real time can still run it in lockstep"
+                    )
         finally:
             self._state = DaemonState.HOLDING
             self._role.event("stopped", f"{self._role.name} stopped commanding")
@@ -222,7 +231,7 @@ class Daemon:
         return None
 
     def _lose(self, reason: str) -> bool:
-        self._state = DaemonState.SEARCHING
+        self._state, self._lost = DaemonState.SEARCHING, reason
         self._role.event("lost", f"{reason}: stopped commanding, looking for {self._role.vehicle}", self._session)
         return False
 

@@ -9,15 +9,25 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from protocol.frames import FrameFormat, SignalSpec, WireSpec
 from protocol.quantizer import UniformQuantizer
+from service import paper
 from service.figures import Figures
 
 if TYPE_CHECKING:
+    from service.calibrate import Calibration
     from service.demo import Progress as DemoProgress
+    from service.tables import Tables
 
 _stderr = Console(stderr=True)
 
@@ -73,6 +83,89 @@ def progress_bar(title: str, total_s: float, *, hidden: bool = False) -> Iterato
     ) as bar:
         task = bar.add_task(title, total=total_s)
         yield lambda reached: bar.update(task, completed=reached)
+
+
+@contextmanager
+def count_bar(what: str, *, hidden: bool = False) -> Iterator[Callable[[int, int | None], None]]:
+    """A bar on stderr that is told how many are done, of how many if that is known; never in a pipe."""
+    with Progress(
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=_stderr,
+        transient=True,
+        disable=hidden or not _stderr.is_terminal,
+    ) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def paper_tables(tables: Tables) -> None:
+    """Print the paper's tables, ours beside the published."""
+    console = Console()
+    for title, table, digits in (
+        ("z_track [1e-4 s], Table C.2", tables.C2, 1),
+        ("u_total [V²·s], Table C.3", tables.C3, 0),
+    ):
+        grid = Table("in ╲ out", title=f"{title}: ours (paper's)", title_justify="left", box=None)
+        for out in paper.OUTPUT_BITS:
+            grid.add_column("cont" if out is None else f"{out} bits", justify="right")
+        for i, inp in enumerate(paper.INPUT_BITS):
+            spread = table.spread[i] if table.spread else [None] * len(paper.OUTPUT_BITS)
+            cells = [
+                _beside(mine, theirs, deviation, digits)
+                for mine, theirs, deviation in zip(table.ours[i], table.paper[i], spread, strict=True)
+            ]
+            grid.add_row("cont" if inp is None else f"{inp} bits", *cells)
+        console.print(grid)
+        console.print(f"mean absolute relative error of the 23 predicted cells: {table.mare:.1%}\n")
+    grid = Table("", title="with and without wind, Table C.4: ours (paper's)", title_justify="left", box=None)
+    for air in ("calm", "wind"):
+        grid.add_column(f"z_track, {air}", justify="right")
+        grid.add_column(f"u_total, {air}", justify="right")
+    for case, rows in tables.C4.ours.items():
+        cells = [
+            _beside(
+                rows[air][name],
+                tables.C4.paper[case][air][name],
+                tables.C4.spread[case][air][name] if tables.C4.spread else None,
+                digits,
+            )
+            for air in ("calm", "wind")
+            for name, digits in (("z_track_1e-4", 1), ("u_total", 0))
+        ]
+        grid.add_row(case, *cells)
+    console.print(grid)
+    console.print(f"mean absolute relative error of the predicted windy cell: {tables.C4.mare:.1%}")
+
+
+def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> str:
+    plus_minus = "" if spread is None else f" ±{spread:.{digits}f}"
+    return f"{mine:.{digits}f}{plus_minus} ({theirs})"
+
+
+def calibration_table(fit: Calibration) -> None:
+    """Print what was fitted, beside what was measured."""
+    table = Table("parameter", "fitted", "elsewhere", "what that is", box=None)
+    table.add_row(
+        "plant.friction.coulomb, yaw",
+        f"{fit.yaw_coulomb:.6f} N·m",
+        f"{fit.yaw_coulomb_measured} N·m",
+        "measured from spin-downs of another Aero",
+    )
+    table.add_row(
+        "plant.aero.centre_of_mass, z",
+        f"{fit.centre_of_mass_height:.6f} m",
+        f"{fit.centre_of_mass_height_paper} m",
+        "Table C.1, which the controller believes",
+    )
+    pitch, yaw = fit.wind_torque
+    table.add_row("plant.wind.torque", f"{pitch:.6f}, {yaw:.6f} N·m", "–", "the paper's fan was not measured")
+    Console().print(table)
+    for name, residual in fit.residuals.items():
+        Console().print(f"residual {name}: {residual:+.2%}")
+    Console().print(f"{fit.runs} experiments")
 
 
 @contextmanager

@@ -5,7 +5,8 @@ controller did, with the controller's own code, and asks it for the error. A mea
 answered it or a later one: what the controller never used, it does not answer for.
 
 The law's tick is not in a frame, only its counter modulo 16. Telemetry says both now and then, and the session's first
-tick always; from there the counter is unwrapped, over gaps with the help of the times of publication.
+tick always; from there the counter is unwrapped, over gaps with the help of the times of publication. Those times also
+say which measurement a command answers: the latest before it that had its echo for a counter, as for the plant.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from pydantic import ValidationError
 from zstandard import ZstdError
 
 from protocol import topics
+from protocol.attitude import Quaternion, Vector
 from protocol.frames import COUNTERS
-from protocol.messages import Contract, Percentiles, Status, Telemetry
+from protocol.messages import Contract, Event, Percentiles, Status, Telemetry
 from service.config import ConfigError, Settings, from_contract
 from service.controller import Controller
 from service.figures import Figures, Score
@@ -45,11 +47,29 @@ class Seen(NamedTuple):
     published_ns: int
 
 
-class Session:
-    """One session's frames, scored as they are read."""
+class Tick(NamedTuple):
+    """One tick of a session as the controller saw it: what the figures of the paper draw."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    k: int
+    attitude: Quaternion
+    desired: Quaternion
+    rate: Vector
+    desired_rate: Vector
+    attitude_error: Vector
+    rate_error: Vector
+    voltages: tuple[float, ...]
+
+
+class Session:
+    """One session's frames, scored as they are read.
+
+    Args:
+        settings: The configuration of its controller.
+        keep: Whether to keep every tick, for figures.
+    """
+
+    def __init__(self, settings: Settings, *, keep: bool = False) -> None:
+        self.settings = settings
         self._wire = settings.wire
         self._period_ns = settings.loop.period_ns
         self._controller = Controller(
@@ -57,53 +77,26 @@ class Session:
         )
         self._level = settings.wire.voltage.quantizer().level
         self._waiting: deque[Seen] = deque(maxlen=MAX_WAITING)  # measurements whose tick is not known yet
-        self._early: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands to them
-        self._unanswered: deque[tuple[int, bytes]] = deque()
-        self._ahead: deque[Seen] = deque()  # commands that the log has before the measurement they answer
+        self._commands: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
+        self._measured: deque[tuple[int, Seen]] = deque()  # measurements that no command has answered yet
         self._last: tuple[int, int] | None = None  # tick and time of the last measurement
         self.malformed = 0
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
+        self.ticks: list[Tick] | None = [] if keep else None
 
     def measurement(self, seen: Seen) -> None:
-        """A measurement frame."""
-        read = self._wire.measurement.unpack(seen.frame)
-        if read is None:
+        """A measurement frame; commands that were published before it can now be told which tick they answer."""
+        counter = self._counter(seen)
+        if counter is None:
             self.malformed += 1
         elif self._last is None:
             self._waiting.append(seen)
         else:
-            tick, time_ns = self._last
-            k = self._unwrap(read[0], tick, seen.published_ns - time_ns)
-            if k > tick:
-                self._last = k, seen.published_ns
-                self._unanswered.append((k, seen.frame))
-                ahead, self._ahead = self._ahead, deque()
-                for command in ahead:
-                    self.command(command)
+            self._take(self._unwrap(counter, *self._last, seen.published_ns), seen)
 
     def command(self, seen: Seen) -> None:
-        """A command frame: it and the measurements up to the one it answers now count."""
-        if self._last is None:
-            self._early.append(seen)
-            return
-        read = self._wire.command.unpack(seen.frame)
-        if read is None:
-            self.malformed += 1
-            return
-        echo, codes = read
-        answered = next((k for k, _ in reversed(self._unanswered) if k % COUNTERS == echo), None)
-        if answered is None:
-            # Two links to the recorder keep no order between them. Past half a round the measurement is not coming.
-            if self._last is not None and len(self._ahead) < COUNTERS // 2:
-                self._ahead.append(seen)
-            return
-        while self._unanswered and self._unanswered[0][0] <= answered:
-            k, frame = self._unanswered.popleft()
-            self._controller.tick(frame, k)
-            if self._controller.tick_index == k:
-                self.score.error(k, self._controller.attitude_error)
-        voltages = [self._level(code) for code in codes]
-        self.score.command(answered, [0.0 if u != u else u for u in voltages])
+        """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
+        self._commands.append(seen)
 
     def telemetry(self, telemetry: Telemetry) -> None:
         """The first one tells which tick the measurements so far belong to."""
@@ -114,48 +107,116 @@ class Session:
         if found is None:
             return  # the measurement that it speaks of came before the log began
         self._waiting.clear()
-        self._last = telemetry.tick, waiting[found].published_ns
-        earlier = self._backwards(waiting[: found + 1], telemetry.tick)
-        self._unanswered.extend(earlier)
+        for k, seen in self._backwards(waiting[: found + 1], telemetry.tick):
+            self._take(k, seen)
         for seen in waiting[found + 1 :]:
             self.measurement(seen)
-        commands, self._early = self._early, deque()
-        for seen in commands:
-            self.command(seen)
+
+    def finish(self) -> None:
+        """No more is to come: what still waits is judged by what there is."""
+        self._answer(None)
+
+    def _take(self, k: int, seen: Seen) -> None:
+        self._answer(seen.published_ns)
+        if self._last is None or k > self._last[0]:
+            self._last = k, seen.published_ns
+            self._measured.append((k, seen))
+
+    def _answer(self, until_ns: int | None) -> None:
+        """Score the commands published before `until_ns`, each with the latest measurement before it of its echo.
+
+        Zenoh's timestamps are hybrid logical clocks: an answer is always stamped later than its question, on any host.
+        """
+        while self._commands and (until_ns is None or self._commands[0].published_ns < until_ns):
+            seen = self._commands.popleft()
+            read = self._wire.command.unpack(seen.frame)
+            if read is None:
+                self.malformed += 1
+                continue
+            echo, codes = read
+            answered = next((k for k, _ in reversed(self._measured) if k % COUNTERS == echo), None)
+            if answered is None:
+                continue  # answers what the log does not have, or repeats an answer
+            voltages = [self._level(code) for code in codes]
+            if voltages[0] != voltages[0]:
+                voltages = [0.0] * len(voltages)  # "no valid value": the plant goes to 0 V
+            while self._measured and self._measured[0][0] <= answered:
+                self._score(*self._measured.popleft(), voltages)
+            self.score.command(answered, voltages)
+
+    def _score(self, k: int, seen: Seen, voltages: list[float]) -> None:
+        controller = self._controller
+        controller.tick(seen.frame, k)
+        if controller.tick_index != k:
+            return  # a measurement without a valid value
+        self.score.error(k, controller.attitude_error)
+        if self.ticks is not None:
+            rate, rate_error = controller.rate, controller.rate_error
+            desired_rate = rate[0] - rate_error[0], rate[1] - rate_error[1], rate[2] - rate_error[2]
+            self.ticks.append(
+                Tick(
+                    k,
+                    controller.attitude,
+                    controller.desired,
+                    rate,
+                    desired_rate,
+                    controller.attitude_error,
+                    rate_error,
+                    tuple(voltages),
+                )
+            )
 
     def _counter(self, seen: Seen) -> int | None:
         read = self._wire.measurement.unpack(seen.frame)
         return None if read is None else read[0]
 
-    def _backwards(self, frames: list[Seen], tick: int) -> list[tuple[int, bytes]]:
-        """Ticks of measurements that came before a known one, counted down."""
-        known: list[tuple[int, bytes]] = [(tick, frames[-1].frame)]
+    def _backwards(self, frames: list[Seen], tick: int) -> list[tuple[int, Seen]]:
+        """Ticks of measurements that came before a known one, the last; counted down."""
+        known = [(tick, frames[-1])]
         for seen in reversed(frames[:-1]):
             counter = self._counter(seen)
             assert counter is not None  # malformed ones never get here
             k = known[-1][0] - ((known[-1][0] - counter) % COUNTERS or COUNTERS)
             if k < 0:
                 break
-            known.append((k, seen.frame))
+            known.append((k, seen))
         return known[::-1]
 
-    def _unwrap(self, counter: int, tick: int, elapsed_ns: int) -> int:
-        """The tick with this counter that is nearest to where the time of publication puts it, after `tick`."""
+    def _unwrap(self, counter: int, tick: int, tick_ns: int, published_ns: int) -> int:
+        """The tick with this counter, after `tick`, that is nearest to where the time of publication puts it."""
         step = (counter - tick) % COUNTERS
-        if self._settings.loop.lockstep:
+        if self.settings.loop.lockstep:
             return tick + step
-        rounds = round((elapsed_ns / self._period_ns - step) / COUNTERS)
+        rounds = round(((published_ns - tick_ns) / self._period_ns - step) / COUNTERS)
         return tick + step + max(0, rounds) * COUNTERS
 
 
+class Review(NamedTuple):
+    """What a log says: figures of its longest session, that session, and what ended others."""
+
+    figures: Figures
+    session: Session
+    trips: list[str]
+
+
 def review(path: Path) -> Figures:
-    """The figures of a log's longest session.
+    """Judge a log: the figures of its longest session. Raises ReviewError as `read` does."""
+    return read(path).figures
+
+
+def read(path: Path, *, keep: bool = False) -> Review:
+    """Read a log and judge its longest session.
+
+    Args:
+        path: The log.
+        keep: Whether to keep every tick of every session, for figures.
 
     Raises:
         ReviewError: Not a log, a broken one, or one without a session.
     """
     sessions: dict[tuple[str, str], Session] = {}
     statuses: dict[tuple[str, str], Status] = {}
+    trips: list[str] = []
     try:
         with path.open("rb") as file:
             reader = make_reader(file)
@@ -164,7 +225,7 @@ def review(path: Path) -> Figures:
                 if address.session is not None:
                     which = address.vehicle, address.session
                     if which not in sessions:
-                        sessions[which] = Session(settings)
+                        sessions[which] = Session(settings, keep=keep)
                     seen = Seen(payload, published_ns)
                     if address.topic.name == "measurement":
                         sessions[which].measurement(seen)
@@ -174,6 +235,10 @@ def review(path: Path) -> Figures:
                     telemetry = Telemetry.model_validate_json(payload)
                     if session := sessions.get((address.vehicle, telemetry.session)):
                         session.telemetry(telemetry)
+                elif address.topic.name == "event":
+                    event = Event.model_validate_json(payload)
+                    if event.kind == "tripped":
+                        trips.append(event.text)
                 elif address.topic.name == "status" and address.role is not None:
                     statuses[address.vehicle, address.role] = Status.model_validate_json(payload)
     except OSError as error:
@@ -184,9 +249,12 @@ def review(path: Path) -> Figures:
         ) from None
     if not sessions:
         raise ReviewError(f"{path} holds no session: no measurement or command frame was recorded")
+    for session in sessions.values():
+        session.finish()
     vehicle, name = max(sessions, key=lambda which: sessions[which].score.ticks)
     ends = {role: status for (of, role), status in statuses.items() if of == vehicle}
-    return _judge(sessions[vehicle, name], ends, path)
+    longest = sessions[vehicle, name]
+    return Review(_judge(longest, ends, path), longest, trips)
 
 
 def _messages(reader: McapReader) -> Iterator[tuple[topics.Address, bytes, int]]:

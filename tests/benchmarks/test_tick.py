@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from plant_emulator.aero import Aero, AeroSettings
 from plant_emulator.endpoint import Endpoint
+from plant_emulator.settings import PlantSettings
 from protocol.frames import WireSpec
 from protocol.messages import Claim
 from service.controller import Controller
@@ -32,7 +32,7 @@ def _controller() -> Controller:
 def measurements() -> list[bytes]:
     """Measurement frames of four seconds of the paper's experiment."""
     wire = WireSpec()
-    endpoint = Endpoint(Aero(AeroSettings(), PERIOD), wire, round(PERIOD * 1e9))
+    endpoint = Endpoint(PlantSettings(ideal=True).build(PERIOD), wire, round(PERIOD * 1e9))
     endpoint.claim(Claim(controller="c", session="s", period_ns=round(PERIOD * 1e9), lockstep=False, wire=wire))
     controller = _controller()
     frames = []

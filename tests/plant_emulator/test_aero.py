@@ -14,9 +14,27 @@ import numpy.typing as npt
 import pytest
 
 from plant_emulator.aero import Aero, AeroSettings, aero_dynamics
+from plant_emulator.emulated import EmulatedPlant
+from plant_emulator.sensors import Sensors
+from plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS
+from plant_emulator.wind import Wind, WindSettings
 
 LOSSLESS = AeroSettings(damping=(0.0, 0.0, 0.0), inertia=(0.01, 0.02, 0.03), centre_of_mass=(0.001, 0.002, -0.0038))
 """At 0 V it keeps its energy. J_x and J_z differ, which the paper's do not: that couples pitch and yaw."""
+
+
+def _plant(p: AeroSettings, period: float, substeps: int = 2) -> EmulatedPlant:
+    """The bare Aero: nothing acts on it but its motors, and its sensors are perfect."""
+    return EmulatedPlant(
+        Aero(p),
+        IDEAL_ROTOR,
+        IDEAL_FRICTION,
+        Wind(WindSettings(), 2, period),
+        Sensors(IDEAL_SENSORS, period),
+        period=period,
+        voltage_limit=24.0,
+        substeps=substeps,
+    )
 
 
 def _random_settings(rng: np.random.Generator) -> AeroSettings:
@@ -59,17 +77,17 @@ def _lagrange(p: AeroSettings, x: npt.NDArray[np.float64], u: npt.NDArray[np.flo
 def test_the_dynamics_agree_with_lagranges_equations_at_moving_states(paper: bool) -> None:
     rng = np.random.default_rng(1)
     for _ in range(1 if paper else 20):
-        p = AeroSettings() if paper else _random_settings(rng)
+        p = IDEAL_AERO if paper else _random_settings(rng)
         dynamics = aero_dynamics(p)
         for _ in range(20):
             x, u = rng.normal(size=4), rng.normal(size=2) * 10
-            got = np.array(dynamics(x, u), dtype=np.float64).ravel()
+            got = np.array(dynamics(x, u, np.zeros(2)), dtype=np.float64).ravel()
             expected = np.array(_lagrange(p, x, u))
             # about a hundred operations of 2e-16 each; torques of some units cancel to accelerations of some tenths
             assert np.linalg.norm(got - expected) <= 1e-12 * np.linalg.norm(expected)
 
 
-def _energy(p: AeroSettings, plant: Aero) -> float:
+def _energy(p: AeroSettings, plant: EmulatedPlant) -> float:
     """½ ωᵀJω + m g h, from what the plant says of itself; h by the last row of the rotation matrix."""
     (w, x, y, z), omega, _ = plant.truth()
     rx, ry, rz = p.centre_of_mass
@@ -77,9 +95,9 @@ def _energy(p: AeroSettings, plant: Aero) -> float:
     return sum(J * rate * rate for J, rate in zip(p.inertia, omega, strict=True)) / 2 + p.mass * p.gravity * height
 
 
-def _thrown(p: AeroSettings, period: float) -> Aero:
+def _thrown(p: AeroSettings, period: float) -> EmulatedPlant:
     """An Aero that pitches and yaws at 1 rad/s or so, motors off."""
-    plant = Aero(p, period)
+    plant = _plant(p, period)
     plant.actuate((20.0, -10.0))
     for _ in range(round(1.0 / period)):
         plant.advance()
@@ -103,10 +121,10 @@ def test_without_damping_and_input_the_energy_stays() -> None:
 
 
 def test_with_damping_the_energy_falls() -> None:
-    plant = _thrown(AeroSettings(), 0.02)
+    plant = _thrown(IDEAL_AERO, 0.02)
     energies = []
     for _ in range(50):
-        energies.append(_energy(AeroSettings(), plant))
+        energies.append(_energy(IDEAL_AERO, plant))
         plant.advance()
     assert all(after < before for before, after in pairwise(energies))
 
@@ -115,7 +133,7 @@ def test_halving_the_step_divides_the_error_by_sixteen() -> None:
     """Fourth order, over a whole period with its substeps."""
 
     def end(substeps: int) -> npt.NDArray[np.float64]:
-        plant = Aero(AeroSettings(substeps=substeps), 1.0)
+        plant = _plant(IDEAL_AERO, 1.0, substeps)
         plant.actuate((24.0, -20.0))
         for _ in range(3):
             plant.advance()
@@ -131,8 +149,8 @@ def test_halving_the_step_divides_the_error_by_sixteen() -> None:
 @pytest.mark.parametrize("substeps", [1, 2, 5])
 def test_a_period_lasts_as_long_whatever_its_substeps(substeps: int) -> None:
     """Constant torque on a body without weight or damping: after t the pitch rate is u B t / J, and exactly so."""
-    p = AeroSettings(substeps=substeps, damping=(0.0, 0.0, 0.0), gravity=0.0, thrust=((0.001, 0.0), (0.0, 0.001)))
-    plant = Aero(p, 0.1)
+    p = AeroSettings(damping=(0.0, 0.0, 0.0), gravity=0.0, thrust=((0.001, 0.0), (0.0, 0.001)))
+    plant = _plant(p, 0.1, substeps)
     plant.actuate((10.0, 0.0))
     plant.advance()
     # Runge–Kutta is exact for a constant acceleration; some tens of operations of 2e-16
@@ -141,7 +159,7 @@ def test_a_period_lasts_as_long_whatever_its_substeps(substeps: int) -> None:
 
 def test_roll_is_held() -> None:
     """R_z R_y has no roll: 2(wx + yz) = 0, and the body's rates have none about the held axis."""
-    plant = Aero(AeroSettings(), 0.01)
+    plant = _plant(IDEAL_AERO, 0.01)
     plant.actuate((24.0, 10.0))
     for _ in range(200):
         plant.advance()
@@ -155,7 +173,7 @@ def test_roll_is_held() -> None:
 def test_the_attitude_turns_with_the_rates() -> None:
     """(C.1): q̇ = ½ q ⊗ [0, ω], by a central difference."""
     period = 1e-3
-    plant = Aero(AeroSettings(), period)
+    plant = _plant(IDEAL_AERO, period)
     plant.actuate((24.0, 10.0))
     states = []
     for _ in range(1000):
@@ -171,7 +189,7 @@ def test_the_attitude_turns_with_the_rates() -> None:
 
 @pytest.mark.parametrize(("commanded", "held"), [((30.0, -1e9), (24.0, -24.0)), ((-24.5, 23.5), (-24.0, 23.5))])
 def test_voltages_are_clipped_to_the_supply(commanded: tuple[float, float], held: tuple[float, float]) -> None:
-    plant, other = Aero(AeroSettings(), 0.01), Aero(AeroSettings(), 0.01)
+    plant, other = _plant(IDEAL_AERO, 0.01), _plant(IDEAL_AERO, 0.01)
     plant.actuate(commanded)
     other.actuate(held)
     for _ in range(10):
@@ -182,7 +200,7 @@ def test_voltages_are_clipped_to_the_supply(commanded: tuple[float, float], held
 
 
 def test_it_starts_level_at_rest_and_stays_there_at_0_v() -> None:
-    plant = Aero(AeroSettings(), 0.002)
+    plant = _plant(IDEAL_AERO, 0.002)
     level = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert plant.measure() == level
     for _ in range(1000):
@@ -191,7 +209,7 @@ def test_it_starts_level_at_rest_and_stays_there_at_0_v() -> None:
 
 
 def test_a_closed_plant_has_no_voltage() -> None:
-    plant = Aero(AeroSettings(), 0.002)
+    plant = _plant(IDEAL_AERO, 0.002)
     plant.actuate((10.0, -10.0))
     plant.close()
     plant.close()  # twice does no harm
@@ -201,7 +219,7 @@ def test_a_closed_plant_has_no_voltage() -> None:
 
 
 def test_the_sensors_are_perfect() -> None:
-    plant = _thrown(AeroSettings(), 0.002)
+    plant = _thrown(IDEAL_AERO, 0.002)
     attitude, rate, _ = plant.truth()
     assert plant.measure() == (attitude, rate)
     assert attitude != (1.0, 0.0, 0.0, 0.0)

@@ -69,7 +69,7 @@ def test_a_frame_put_by_another_thread_wakes_who_waits() -> None:
         arrival = back.wait(PATIENCE_S)
         assert arrival is not None
         assert arrival.frame == b"%d" % i
-    assert time.monotonic() - started < PATIENCE_S
+        assert time.monotonic() - started < PATIENCE_S
     thread.join(PATIENCE_S)
     assert not thread.is_alive()
 

@@ -29,7 +29,7 @@ def cells(line: str) -> Row:
     return tuple(cell.strip().strip("`").strip() for cell in line.strip().strip("|").split("|"))
 
 
-def rows(header: str, under: str = "") -> list[Row]:
+def rows(header: str, under: str) -> list[Row]:
     """Rows of every table with exactly this header below a heading that contains `under`."""
     found: list[Row] = []
     heading, inside, fenced = "", False, False

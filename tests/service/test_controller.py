@@ -11,8 +11,8 @@ from math import cos, isnan, nan, pi, radians, sin
 import numpy as np
 import pytest
 
-from plant_emulator.aero import Aero, AeroSettings
 from plant_emulator.endpoint import Endpoint
+from plant_emulator.settings import IDEAL_AERO, PlantSettings
 from protocol.attitude import Quaternion, Vector, sent_vector
 from protocol.frames import COUNTERS, WireSpec
 from protocol.messages import Claim, Grant
@@ -229,7 +229,7 @@ def test_a_measurement_without_a_valid_value_does_not_choose_the_sign() -> None:
 def test_from_a_large_attitude_the_body_turns_the_short_way() -> None:
     """Yaw −170° to a desired 170°: with z₁₋ it turns by −20°, through the back, and not by +340°."""
     held = SinusoidSettings(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi / 60))  # crest at 30 s, and slow there
-    aero = AeroSettings()
+    aero = IDEAL_AERO
     plant = twin.LockedBody(
         _body(LAW), np.vstack([np.zeros(2), aero.thrust]), np.array(aero.damping), np.array([0.0, radians(-170), 0, 0])
     )
@@ -313,8 +313,8 @@ def test_through_full_turns_of_a_quantized_attitude_no_voltage_jumps() -> None:
 
 def test_the_closed_loop_agrees_with_the_twins() -> None:
     """Controller, frames, endpoint and Aero against law twin and plant twin, tick by tick."""
-    aero = AeroSettings()
-    plant = Aero(aero, PERIOD)
+    aero = IDEAL_AERO
+    plant = PlantSettings(ideal=True).build(PERIOD)
     endpoint = Endpoint(plant, CONTINUOUS, PERIOD_NS, lockstep=True)
     claim = Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, wire=CONTINUOUS)
     assert isinstance(endpoint.claim(claim), Grant)
@@ -337,7 +337,7 @@ def test_the_closed_loop_agrees_with_the_twins() -> None:
         _, sent = _answer(CONTINUOUS, command)
         assert sent == pytest.approx(held, rel=5e-11, abs=5e-11)
         measurement = endpoint.tick(command, k + 1)
-        body.advance(held, PERIOD, aero.substeps)
+        body.advance(held, PERIOD, PlantSettings().substeps)
         assert plant.truth().attitude == pytest.approx(body.q, abs=1e-12)
         assert plant.truth().rate == pytest.approx(body.omega, abs=1e-12)
     assert limited > 0  # the start is hard enough to meet the limits, which are part of what is compared

@@ -1,0 +1,33 @@
+"""Friction about each axis: viscous torque in proportion to the rate, Coulomb torque against its direction.
+
+The Coulomb torque turns over smoothly, c·tanh(rate/width), within a rate so small that no sensor of the plant sees it;
+a jump would make the integration depend on where its steps fall.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class FrictionSettings(BaseModel):
+    """Friction about the axes: pitch and yaw of the Aero, x, y, z of a free body (missing ones are 0)."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    viscous: tuple[float, ...] = Field(
+        default=(0.0071, 0.0220), max_length=3, description="viscous friction about the axes [N·m·s/rad]; lab material"
+    )
+    coulomb: tuple[float, ...] = Field(
+        default=(0.0009, 0.003056),
+        max_length=3,
+        description="Coulomb friction about the axes [N·m]; pitch measured (spin-down), yaw fitted by `lab calibrate`",
+    )
+    width: float = Field(default=0.01, gt=0, le=1, description="rate within which Coulomb friction turns over [rad/s]")
+
+
+def friction_torque(settings: FrictionSettings, rates: ca.SX) -> ca.SX:
+    """Torque about each axis [N·m] from the rates about them [rad/s]. Shape (axes,)."""
+    axes = rates.numel()
+    viscous, coulomb = (ca.SX((*values, 0.0, 0.0, 0.0)[:axes]) for values in (settings.viscous, settings.coulomb))
+    return -viscous * rates - coulomb * ca.tanh(rates / settings.width)

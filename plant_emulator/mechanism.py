@@ -1,0 +1,49 @@
+"""What a body is to the emulator: a few equations, to which rotors, friction, wind and sensors are added from outside.
+
+A mechanism has axes about which it moves freely: two joints for the Aero, three body axes for a free body. A load is
+a torque about each axis; friction and wind are loads, and so need to know nothing else of the mechanism.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import casadi as ca
+
+
+class Mechanism(ABC):
+    """Equations of motion in CasADi. States are in rad, rad/s and, for a quaternion, 1.
+
+    Attributes:
+        initial: State at the start. Its length is the number of states.
+        actuators: Number of motors.
+        axes: Number of axes that a load acts about.
+    """
+
+    initial: tuple[float, ...]
+    actuators: int
+    axes: int
+
+    @abstractmethod
+    def derivative(self, x: ca.SX, voltages: ca.SX, load: ca.SX) -> ca.SX:
+        """ẋ under voltages that make thrust [V], shape (actuators,), and a load on each axis [N·m], shape (axes,)."""
+
+    @abstractmethod
+    def attitude(self, x: ca.SX) -> ca.SX:
+        """q, body relative to inertial. Shape (4,)."""
+
+    @abstractmethod
+    def rate(self, x: ca.SX) -> ca.SX:
+        """ω in the body frame [rad/s]. Shape (3,)."""
+
+    @abstractmethod
+    def axis_rates(self, x: ca.SX) -> ca.SX:
+        """Rates about the axes [rad/s], shape (axes,): what friction opposes."""
+
+    @abstractmethod
+    def axis_angles(self, x: ca.SX) -> ca.SX:
+        """Angles of the joints [rad], for encoders. Shape (axes,), or (0,) where there are no joints."""
+
+    def settle(self, x: ca.SX) -> ca.SX:
+        """The state after a step, put back where integration has let it drift off."""
+        return x

@@ -1,0 +1,48 @@
+"""Rotors: a motor does not change its thrust at once.
+
+The voltage that makes thrust follows the commanded one with a first-order lag, a little faster up than down, because
+drag helps to brake a rotor less than the motor helps to drive it. Near zero a rotor may make no thrust at all.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RotorSettings(BaseModel):
+    """How thrust follows voltage. Lags of 0 leave the rotors out."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    lag_up_s: float = Field(
+        default=0.154, ge=0, le=10, description="time constant while |thrust| rises [s]; measured on an Aero"
+    )
+    lag_down_s: float = Field(
+        default=0.176, ge=0, le=10, description="time constant while |thrust| falls [s]; measured on an Aero"
+    )
+    dead_zone_v: float = Field(
+        default=0.0,
+        ge=0,
+        le=24,
+        description="no thrust below this [V]; 2–3 V measured on an Aero, but off: with 2.5 V the calm cell without "
+        "quantization gives z_track 59e-4 and u_total 12087, where the paper has 35e-4 and 7980",
+    )
+
+    @property
+    def present(self) -> bool:
+        """Whether there is any lag."""
+        return self.lag_up_s > 0 and self.lag_down_s > 0
+
+
+def rotor_derivative(settings: RotorSettings, state: ca.SX, command: ca.SX) -> ca.SX:
+    """V̇ of the voltages that make thrust [V/s], from those voltages and the commanded ones [V]. Shape as given."""
+    rising = ca.fabs(command) > ca.fabs(state)
+    return (command - state) / ca.if_else(rising, settings.lag_up_s, settings.lag_down_s)
+
+
+def thrust_voltage(settings: RotorSettings, state: ca.SX) -> ca.SX:
+    """What is left of a voltage after the dead zone [V]. Shape as given."""
+    if not settings.dead_zone_v:
+        return state
+    return ca.sign(state) * ca.fmax(ca.fabs(state) - settings.dead_zone_v, 0)

@@ -1,0 +1,117 @@
+"""Sensors: what the plant end knows of the true state.
+
+Attitude comes from encoders that count steps of the joints, zeroed somewhere within a step, or is perfect. Angular
+velocity is the filtered derivative of the encoders' angles, or comes from a gyro with noise and bias, or is perfect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, exp, floor, pi, sin, sqrt
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from plant_emulator.plant import Measurement
+from protocol.attitude import Quaternion, Vector
+
+_BLOCK = 4096  # random numbers are drawn this many samples at a time
+
+
+class SensorSettings(BaseModel):
+    """What measures attitude and angular velocity."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    attitude: Literal["encoders", "perfect"] = Field(default="encoders", description="encoders need joints: the Aero")
+    counts: tuple[int, int] = Field(
+        default=(2048, 4096), description="encoder counts a turn, pitch and yaw; Aero 2 has 2880 in pitch"
+    )
+    rate: Literal["derivative", "gyro", "perfect"] = Field(
+        default="derivative", description="derivative: of the encoders' angles, filtered"
+    )
+    bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
+    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter")
+    gyro_noise: float = Field(default=0.0, ge=0, description="standard deviation of a gyro sample [rad/s]")
+    gyro_bias: Vector = Field(default=(0.0, 0.0, 0.0), description="constant error of the gyro, body frame [rad/s]")
+    seed: int = Field(default=0, ge=0, description="of the encoders' zeros and of the gyro's noise")
+
+
+class FilteredDerivative:
+    """The rate of a sampled angle, by the filter ωn² s / (s² + 2ζωn s + ωn²), exact for an angle held over a period.
+
+    Args:
+        bandwidth: ωn [rad/s].
+        damping_ratio: ζ, 0…1.
+        period: Time between samples [s].
+    """
+
+    def __init__(self, bandwidth: float, damping_ratio: float, period: float) -> None:
+        decay = damping_ratio * bandwidth
+        ringing = bandwidth * sqrt(1 - damping_ratio**2)
+        envelope, c, s = exp(-decay * period), cos(ringing * period), sin(ringing * period) / ringing
+        self._from_lag = envelope * (c + decay * s)
+        self._from_rate = envelope * s
+        self._rate_from_lag = -envelope * bandwidth**2 * s
+        self._rate_from_rate = envelope * (c - decay * s)
+        self._angle: float | None = None
+        self._rate = 0.0
+
+    def update(self, angle: float) -> float:
+        """Take in a sample [rad] and return the rate [rad/s]; the first sample is where it starts, at rest."""
+        if self._angle is None:
+            self._angle = angle
+        lag = self._angle - angle
+        self._angle = angle + self._from_lag * lag + self._from_rate * self._rate
+        self._rate = self._rate_from_lag * lag + self._rate_from_rate * self._rate
+        return self._rate
+
+
+class Sensors:
+    """Samples of one plant.
+
+    Args:
+        settings: What measures.
+        period: Time between samples [s].
+    """
+
+    def __init__(self, settings: SensorSettings, period: float) -> None:
+        self._settings = settings
+        self._steps = [2 * pi / counts for counts in settings.counts]
+        self._filters = [FilteredDerivative(settings.bandwidth, settings.damping_ratio, period) for _ in self._steps]
+        self._random = np.random.default_rng(settings.seed)
+        self._zeros: list[float] = self._random.random(len(self._steps)).tolist()
+        self._noise: list[Vector] = []
+
+    def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
+        """What the sensors say of a true attitude q [1], rate ω [rad/s] and joint angles [rad]; once a period."""
+        settings = self._settings
+        if settings.attitude == "perfect" and settings.rate == "perfect":
+            return Measurement(attitude, rate)
+        seen = [
+            step * floor(angle / step + zero)
+            for angle, step, zero in zip(angles, self._steps, self._zeros, strict=False)  # no joints, no encoders
+        ]
+        if settings.attitude == "encoders":
+            attitude = _attitude_of(seen)
+        if settings.rate == "gyro":
+            rate = self._gyro(rate)
+        elif settings.rate == "derivative":
+            pitch_rate, yaw_rate = (f.update(angle) for f, angle in zip(self._filters, seen, strict=True))
+            rate = (-sin(seen[0]) * yaw_rate, pitch_rate, cos(seen[0]) * yaw_rate)
+        return Measurement(attitude, rate)
+
+    def _gyro(self, rate: Vector) -> Vector:
+        if not self._noise:
+            drawn = self._random.standard_normal((_BLOCK, 3)) * self._settings.gyro_noise + self._settings.gyro_bias
+            self._noise = [tuple(row) for row in drawn.tolist()]
+        error = self._noise.pop()
+        return rate[0] + error[0], rate[1] + error[1], rate[2] + error[2]
+
+
+def _attitude_of(angles: Sequence[float]) -> Quaternion:
+    """q of a body that first yaws, then pitches by joint angles [pitch, yaw] in rad."""
+    pitch, yaw = angles[0] / 2, angles[1] / 2
+    cp, sp, cy, sy = cos(pitch), sin(pitch), cos(yaw), sin(yaw)
+    return cy * cp, -sy * sp, cy * sp, sy * cp

@@ -1,0 +1,67 @@
+"""Wind: a steady torque about each axis and gusts around it.
+
+The gust is an Ornstein–Uhlenbeck process, the simplest noise with a memory (Dryden's longitudinal gust is the same
+filter): it forgets with time constant `gust_time_s` and keeps a standard deviation of `gust` times the steady torque.
+It is seeded, and stepped exactly, so that a run repeats whatever the period.
+"""
+
+from __future__ import annotations
+
+from math import exp, hypot, sqrt
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+_BLOCK = 4096  # random numbers are drawn this many periods at a time: one draw costs more than a plant's step
+
+
+class WindSettings(BaseModel):
+    """What blows at the plant. The default is calm; when it blows, it is the paper's fan as fitted."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    blowing: bool = Field(default=False, description="whether the fan is on")
+    torque: tuple[float, ...] = Field(
+        default=(-0.000841, 0.009963),
+        max_length=3,
+        description="steady torque about the axes [N·m], missing ones 0; fitted by `lab calibrate`",
+    )
+    gust: float = Field(
+        default=0.0, ge=0, le=10, description="standard deviation of gusts, as a part of the steady torque"
+    )
+    gust_time_s: float = Field(default=1.0, gt=0, le=1000, description="how long a gust is remembered [s]")
+    seed: int = Field(default=0, ge=0, description="of the gusts' random numbers")
+
+
+class Wind:
+    """Torque about each axis, period by period.
+
+    Args:
+        settings: What blows.
+        axes: Number of axes.
+        period: Time between samples [s].
+    """
+
+    def __init__(self, settings: WindSettings, axes: int, period: float) -> None:
+        self._steady = np.array((*settings.torque, 0.0, 0.0, 0.0)[:axes]) * settings.blowing
+        self._deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
+        self._keep = exp(-period / settings.gust_time_s)
+        self._kick = self._deviation * sqrt(1 - self._keep**2)
+        self._random = np.random.default_rng(settings.seed)
+        self._gust = self._deviation * self._random.standard_normal(axes)
+        self._block: list[list[float]] = []
+
+    def sample(self) -> list[float]:
+        """Torque about each axis for the next period [N·m]. Shape (axes,)."""
+        if not self._block:
+            self._block = self._draw()
+        return self._block.pop()
+
+    def _draw(self) -> list[list[float]]:
+        torques = np.tile(self._steady, (_BLOCK, 1))
+        if self._kick:
+            for row, kick in zip(torques, self._random.standard_normal(torques.shape) * self._kick, strict=True):
+                self._gust = self._keep * self._gust + kick
+                row += self._gust
+        drawn: list[list[float]] = torques[::-1].tolist()
+        return drawn

@@ -1,0 +1,72 @@
+"""Cells of the paper's experiment, run side by side on every core.
+
+A cell is one lockstep experiment: bits out, bits in, wind or calm, a seed. Cells know nothing of each other, so they go
+to a pool of processes; the configuration travels as its dump, and only figures come back.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any, NamedTuple
+
+from service.config import Settings
+from service.experiment import run_experiment
+from service.paper import DURATION_S
+
+
+class Cell(NamedTuple):
+    """One experiment. Bits of None are the paper's "cont."."""
+
+    bits_out: int | None
+    bits_in: int | None
+    windy: bool = False
+    seed: int = 0
+
+
+class Result(NamedTuple):
+    """What a cell gave, in the units of the paper's tables."""
+
+    z_track: float  # [1e-4 s]
+    u_total: float  # [V²·s]
+
+
+def run_cell(config: dict[str, Any], cell: Cell) -> Result:
+    """Run one cell of a configuration's dump."""
+    settings = Settings.model_validate(config)
+    plant = settings.plant.model_copy(
+        update={
+            "wind": settings.plant.wind.model_copy(update={"blowing": cell.windy, "seed": cell.seed}),
+            "sensors": settings.plant.sensors.model_copy(update={"seed": cell.seed}),
+        }
+    )
+    wire = settings.wire.with_bits(cell.bits_out, cell.bits_in)
+    figures = run_experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S)
+    assert figures.z_track is not None
+    assert figures.u_total is not None
+    return Result(figures.z_track * 1e4, figures.u_total)
+
+
+class Pool:
+    """Processes that run cells, one a core. A context."""
+
+    def __init__(self) -> None:
+        # Spawned, not forked: a fork would inherit threads of whatever the caller has open.
+        self._executor = ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._executor.shutdown(cancel_futures=True)
+
+    def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:
+        """Results of cells in their order; `progress` hears how many are done."""
+        futures = [self._executor.submit(run_cell, settings.contract(), cell) for settings, cell in jobs]
+        for done, future in enumerate(as_completed(futures), 1):
+            future.result()
+            if progress is not None:
+                progress(done)
+        return [future.result() for future in futures]

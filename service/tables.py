@@ -1,0 +1,149 @@
+"""The paper's Tables C.2–C.4, predicted: every cell through real frames in lockstep, ours beside the paper's.
+
+The plant was calibrated on two cells, both without quantization: calm (C.2, C.3) and windy (C.4). All others are
+predictions, and only they count in the mean absolute relative error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from statistics import fmean, stdev
+from typing import Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service import paper
+from service.cells import Cell, Pool, Result
+from service.config import Settings
+
+CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
+Rows = list[list[float]]
+
+
+class Table(BaseModel):
+    """A table, ours and the paper's."""
+
+    model_config = ConfigDict(frozen=True)
+
+    ours: Any
+    paper: Any
+    spread: Any = Field(default=None, description="standard deviation over seeds, shaped as `ours`; null for one seed")
+    mare: float = Field(description="mean absolute relative error of the predicted cells [1]")
+
+
+class Tables(BaseModel):
+    """All three, with units as in the paper."""
+
+    model_config = ConfigDict(frozen=True)
+
+    C2: Table = Field(description="z_track [1e-4 s]; rows: bits of the input, columns: bits of the output")
+    C3: Table = Field(description="u_total [V²·s]")
+    C4: Table = Field(description="both, calm and windy; mare over the quantized windy cell's two figures")
+
+
+def predict(settings: Settings, seeds: int = 1, progress: Callable[[int, int], None] | None = None) -> Tables:
+    """Run every cell, `seeds` times each with seeds from 0 up.
+
+    Args:
+        settings: The configuration; bits and wind are the cells'.
+        seeds: How many runs a cell's mean is taken over.
+        progress: Called with cells done and cells in all.
+    """
+    calm = [(out, inp, False) for inp in paper.INPUT_BITS for out in paper.OUTPUT_BITS]
+    windy = [(*bits, True) for bits in CASES.values()]
+    jobs = [(settings, Cell(*cell, seed)) for cell in (*calm, *windy) for seed in range(seeds)]
+    with Pool() as pool:
+        results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
+    runs = {cell: results[i * seeds : (i + 1) * seeds] for i, cell in enumerate((*calm, *windy))}
+    return Tables(
+        C2=_grid(runs, "z_track", paper.Z_TRACK),
+        C3=_grid(runs, "u_total", paper.U_TOTAL),
+        C4=_wind(runs),
+    )
+
+
+_Runs = dict[tuple[int | None, int | None, bool], list[Result]]
+
+
+def _mean(results: Sequence[Result], name: str) -> float:
+    return fmean(float(getattr(result, name)) for result in results)
+
+
+def _spread(results: Sequence[Result], name: str) -> float:
+    return stdev(float(getattr(result, name)) for result in results)
+
+
+def _grid(runs: _Runs, name: str, published: Sequence[Sequence[int]]) -> Table:
+    def rows(value: Callable[[Sequence[Result], str], float]) -> Rows:
+        return [[round(value(runs[out, inp, False], name), 2) for out in paper.OUTPUT_BITS] for inp in paper.INPUT_BITS]
+
+    ours = rows(_mean)
+    errors = [
+        abs(mine - theirs) / theirs
+        for mine_row, their_row in zip(ours, published, strict=True)
+        for mine, theirs in zip(mine_row, their_row, strict=True)
+    ][:-1]  # the last cell, cont/cont, is the one the plant was calibrated on
+    seeds = len(next(iter(runs.values())))
+    return Table(
+        ours=ours,
+        paper=[list(row) for row in published],
+        spread=rows(_spread) if seeds > 1 else None,
+        mare=fmean(errors),
+    )
+
+
+def _wind(runs: _Runs) -> Table:
+    def both(value: Callable[[Sequence[Result], str], float]) -> dict[str, dict[str, dict[str, float]]]:
+        return {
+            case: {
+                air: {
+                    "z_track_1e-4": round(value(runs[*bits, windy], "z_track"), 2),
+                    "u_total": round(value(runs[*bits, windy], "u_total"), 2),
+                }
+                for air, windy in (("calm", False), ("wind", True))
+            }
+            for case, bits in CASES.items()
+        }
+
+    ours = both(_mean)
+    predicted, published = ours["quantized_8_6"]["wind"], paper.WIND["quantized_8_6"]["wind"]
+    seeds = len(next(iter(runs.values())))
+    return Table(
+        ours=ours,
+        paper=paper.WIND,
+        spread=both(_spread) if seeds > 1 else None,
+        mare=fmean(abs(predicted[name] - published[name]) / published[name] for name in published),
+    )
+
+
+def markdown(tables: Tables) -> str:
+    """Write the tables as Markdown: ours, with the paper's in brackets."""
+    lines: list[str] = []
+    for title, table, digits in (
+        ("z_track, 10⁻⁴ s (Table C.2)", tables.C2, 1),
+        ("u_total, V²·s (Table C.3)", tables.C3, 0),
+    ):
+        header = " | ".join("cont" if out is None else str(out) for out in paper.OUTPUT_BITS)
+        lines += [f"**{title}**: ours (paper's)", "", f"| bits in ╲ out | {header} |", "|---" * 5 + "|"]
+        for i, inp in enumerate(paper.INPUT_BITS):
+            cells = [
+                f"{table.ours[i][j]:.{digits}f}"
+                + (f" ±{table.spread[i][j]:.{digits}f}" if table.spread else "")
+                + f" ({table.paper[i][j]})"
+                for j in range(len(paper.OUTPUT_BITS))
+            ]
+            lines.append(f"| {'cont' if inp is None else inp} | {' | '.join(cells)} |")
+        lines += ["", f"Mean absolute relative error of the 23 predicted cells: {table.mare:.1%}.", ""]
+    lines += ["**With and without wind (Table C.4)**: ours (paper's)", "", "| | z_track calm | u_total calm | z_track "
+              "wind | u_total wind |", "|---|---|---|---|---|"]  # fmt: skip
+    for case, label in (("continuous", "continuous"), ("quantized_8_6", "8 bits out, 6 in")):
+        cells = [
+            f"{tables.C4.ours[case][air][name]:.{digits}f}"
+            + (f" ±{tables.C4.spread[case][air][name]:.{digits}f}" if tables.C4.spread else "")
+            + f" ({tables.C4.paper[case][air][name]})"
+            for air in ("calm", "wind")
+            for name, digits in (("z_track_1e-4", 1), ("u_total", 0))
+        ]
+        lines.append(f"| {label} | {' | '.join(cells)} |")
+    lines += ["", f"Mean absolute relative error of the predicted windy cell: {tables.C4.mare:.1%}."]
+    return "\n".join(lines)
