@@ -3,7 +3,7 @@
 A quaternion `q = [η, ε]` is scalar first, multiplies as Hamilton's, and turns body vectors into the inertial frame
 through `R(q)`. Axes: x roll, y pitch, z yaw, z up. Euler angles are roll, pitch, yaw in radians, applied Z–Y–X.
 
-The first half is written in CasADi and takes symbols or numbers alike; the second half is plain floats for the loop.
+The first half is written in CasADi, for equations; the second half is plain floats, for the loop.
 The paper's letters are kept: S, T and R are its matrices.
 """
 

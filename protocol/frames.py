@@ -6,7 +6,7 @@ Sans-I/O. A frame is a 4-bit counter and R-bit codes, most significant bit first
     command      echo:4    · u … : R_u each             (echo: the counter of the measurement it answers)
 
 A signal without quantization travels as big-endian doubles; in a frame that holds any, four zero bits follow the
-counter, so that doubles start on a byte. What arrives malformed is refused whole, with None and never an exception;
+counter. What arrives malformed is refused whole, with None and never an exception;
 what a caller passes wrongly raises ValueError.
 """
 
@@ -89,9 +89,9 @@ class WireSpec(BaseModel):
     def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
         """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont."."""
         return WireSpec(
-            attitude=SignalSpec(bits=out, limit=self.attitude.limit),
-            rate=SignalSpec(bits=out, limit=self.rate.limit),
-            voltage=SignalSpec(bits=inp, limit=self.voltage.limit),
+            attitude=self.attitude.model_copy(update={"bits": out}),
+            rate=self.rate.model_copy(update={"bits": out}),
+            voltage=self.voltage.model_copy(update={"bits": inp}),
             actuators=self.actuators,
         )
 

@@ -1,16 +1,17 @@
 """What crosses the network and is not a frame: JSON, by pydantic.
 
-Every field has its unit in its description, so that the JSON schema in a log explains the log.
+Fields with a unit say it in their description, so that the JSON schema in a log explains the log.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 from protocol.clock import Histogram
 from protocol.frames import WireSpec
+from protocol.topics import TOPICS
 
 PROTOCOL_VERSION: Final = 1
 
@@ -27,12 +28,22 @@ class Message(BaseModel):
         return self.model_dump_json().encode()
 
 
+def _no_other_topics_key(session: str) -> str:
+    if any(session == topic.key.partition("/")[0] for topic in TOPICS.values()):
+        raise ValueError(f"{session!r} is the key of a topic and cannot name a session")
+    return session
+
+
+SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"), AfterValidator(_no_other_topics_key)]
+"""One chunk of a key, and no other topic's."""
+
+
 class Claim(Message):
     """A controller's question to a plant: may I have this vehicle?"""
 
     protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md the controller speaks")
     controller: str = Field(description="who asks; the name of its liveliness token")
-    session: str = Field(description="the key its frames would travel under; new for every claim")
+    session: SessionName = Field(description="the key its frames would travel under; new for every claim")
     period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
     lockstep: bool = Field(description="the plant waits for each answer before it steps")
     wire: WireSpec

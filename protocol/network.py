@@ -15,6 +15,8 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
 _PATIENCE_S: Final = 2.0
+HANDSHAKE_MS: Final = 2000
+"""A program that holds a port and says nothing is given up after this [ms]."""
 
 
 class NetworkError(Exception):
@@ -56,6 +58,7 @@ def _zenoh_config(settings: NetworkSettings, listen: list[str], connect: list[st
             # Useless at seven bytes, and it leaves files behind when a process is killed.
             "shared_memory": {"enabled": False},
             "link": {"tx": {"lease": settings.lease_ms}},
+            "unicast": {"open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
         },
     }
     return zenoh.Config.from_json5(json.dumps(tree))

@@ -261,13 +261,25 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
 
 
 @log_group.command()
-def review(log: Annotated[Path, typer.Argument(help="An MCAP log.", show_default=False)], json: Json = False) -> None:
-    """Compute every figure from a log alone."""
+def review(
+    log: Annotated[Path, typer.Argument(help="An MCAP log.", show_default=False)],
+    figures: Annotated[
+        Path | None, typer.Option("--figures", help="Draw the paper's figures into this folder.", show_default=False)
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compute every figure of merit from a log alone, and draw the paper's figures if asked."""
 
     def run() -> Figures:
-        from service.review import review
+        from service.review import read
 
-        return review(log)
+        judged = read(log, keep=figures is not None)
+        if figures is not None:
+            from service.plots import draw_figures
+
+            for path in draw_figures(judged.session, figures):
+                typer.echo(f"aeroloop: drew {path}", err=True)
+        return judged.figures
 
     _print_figures(_guard(run), json)
 

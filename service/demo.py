@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -89,23 +91,29 @@ def run_demo(
         }
     )
     progress = Progress(settings)
-    complete = True
-    with Bench(settings) as bench:
+    interrupted = threading.Event()
+    with Bench(settings) as bench, _on_interrupt(interrupted):
         for topic in ("telemetry", "status"):
             bench.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.hear)
-        try:
-            bench.start("recorder")
-            bench.start("emulator")
-            bench.await_role("recorder")
-            bench.await_role("emulator")
-            bench.start("controller")
-            while bench.running("controller"):
-                bench.check()
-                if show is not None:
-                    show(progress)
-                time.sleep(REFRESH_S)
+        bench.start("recorder")
+        bench.start("emulator")
+        bench.await_role("recorder")
+        bench.await_role("emulator")
+        bench.start("controller")
+        while bench.running("controller") and not interrupted.wait(REFRESH_S):
             bench.check()
-        except KeyboardInterrupt:
-            complete = False
-    figures = review(path)
-    return figures, complete
+            if show is not None:
+                show(progress)
+        bench.check()
+    return review(path), not interrupted.is_set()
+
+
+@contextmanager
+def _on_interrupt(event: threading.Event) -> Iterator[None]:
+    """Let ^C and SIGTERM set an event. KeyboardInterrupt could strike, and be lost, in any line of any library."""
+    previous = {which: signal.signal(which, lambda *_: event.set()) for which in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for which, handler in previous.items():
+            signal.signal(which, handler)

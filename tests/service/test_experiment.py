@@ -34,7 +34,8 @@ def test_two_runs_give_the_same_figures_to_the_last_bit(out: str, inp: str) -> N
 
 def test_the_ideal_plant_without_quantization_tracks_as_the_paper_lets_expect(unquantized: Figures) -> None:
     z_track, u_total = _score(unquantized)
-    # The ideal plant gives some 4e-4, against 35e-4 on the bench; 9e-4 still tells the two apart and leaves room for other damping. u_total is 6600–6750 there; 1.5–2 % to each side.
+    # The ideal plant gives some 4e-4, against 35e-4 on the bench; 9e-4 still tells the two apart and leaves room for
+    # other damping. u_total is 6600–6750 there; 1.5–2 % to each side.
     assert 1e-4 < z_track < 9e-4
     assert 6500 < u_total < 6900
     # the worst is the start, where the reference is already in motion; the paper's bench stayed within 2.3°
