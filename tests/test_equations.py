@@ -18,11 +18,8 @@ LEFT_OUT = {
 
 
 def test_every_equation_is_in_the_code_or_left_out_for_a_reason() -> None:
-    code = "".join(
-        path.read_text()
-        for package in ("protocol", "plant_emulator", "service")
-        for path in (ROOT / package).rglob("*.py")
-    )
+    packages = ("protocol", "plant_emulator", "service")
+    code = "".join(path.read_text() for package in packages for path in (ROOT / package).rglob("*.py"))
     # "(C.16)–(C.49)" names a range and vouches for nothing between its ends: the ends of ranges do not count either.
     alone = re.sub(r"\(C\.\d+\)–\(C\.\d+\)", "", code)
     written = {int(number) for number in re.findall(r"\(C\.(\d+)\)", alone)}
