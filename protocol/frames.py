@@ -171,6 +171,22 @@ class FrameFormat:
         return values[0], codes
 
 
+def unwrap(counter: int, tick: int, elapsed_ns: int | None, period_ns: int) -> int:
+    """The tick with this counter, after `tick`, that is nearest to where the time puts it.
+
+    Args:
+        counter: Counter of a measurement, 0…15.
+        tick: Tick of an earlier one.
+        elapsed_ns: Time between their publications [ns]; None in lockstep, where nothing is skipped.
+        period_ns: Period of the plant's grid [ns].
+    """
+    step = (counter - tick) % COUNTERS
+    if elapsed_ns is None:
+        return tick + step
+    rounds = round((elapsed_ns / period_ns - step) / COUNTERS)
+    return tick + step + max(0, rounds) * COUNTERS
+
+
 def pack_measurement(spec: WireSpec, counter: int, codes: Sequence[float]) -> bytes:
     """A measurement frame of codes (ε₁ ε₂ ε₃ ω₁ ω₂ ω₃). Raises ValueError for what does not fit."""
     return spec.measurement.pack(counter, codes)

@@ -15,10 +15,18 @@ import zenoh
 
 
 class Arrival(NamedTuple):
-    """A frame and when it arrived, on `time.monotonic_ns()`."""
+    """A frame, when it arrived on `time.monotonic_ns()`, and when it was published on its sender's wall clock [ns]."""
 
     frame: bytes
     at_ns: int
+    published_ns: int
+
+
+def published_ns(sample: zenoh.Sample, arrived_ns: int) -> int:
+    """Wall-clock time of publication [ns]; that of arrival if the sender does not stamp its messages."""
+    if sample.timestamp is None:
+        return arrived_ns
+    return sample.timestamp.get_time_as_ntp64().as_nanos()
 
 
 class Link(ABC):
@@ -48,9 +56,9 @@ class Mailbox:
         self._changed = Condition()
         self._arrival: Arrival | None = None
 
-    def put(self, frame: bytes) -> None:
+    def put(self, frame: bytes, published_ns: int = 0) -> None:
         """Put a frame in the slot, in place of one that may be there."""
-        arrival = Arrival(frame, time.monotonic_ns())
+        arrival = Arrival(frame, time.monotonic_ns(), published_ns)
         with self._changed:
             self._arrival = arrival
             self._changed.notify()
@@ -82,7 +90,8 @@ class ZenohLink(Link):
     def __init__(self, session: zenoh.Session, send_key: str, receive_key: str, *, lossless: bool = False) -> None:
         self._mailbox = Mailbox()
         self._subscriber = session.declare_subscriber(
-            receive_key, lambda sample: self._mailbox.put(sample.payload.to_bytes())
+            receive_key,
+            lambda sample: self._mailbox.put(sample.payload.to_bytes(), published_ns(sample, time.time_ns())),
         )
         self._publisher = session.declare_publisher(
             send_key,

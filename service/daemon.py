@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from protocol import topics
 from protocol.clock import LoopSettings, prepare_process
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import WireSpec, unwrap
 from protocol.links import Arrival, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry
 from protocol.role import Role
@@ -144,7 +144,7 @@ class Daemon:
         The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
         """
         controller, stop = self._controller, self._role.stop
-        k, heard = -1, time.monotonic()
+        k, published_ns, heard = -1, 0, time.monotonic()
         while not stop.is_set() and (self._last_tick is None or k < self._last_tick):
             arrival = link.wait(self._settings.stale_s)
             if arrival is None:
@@ -152,34 +152,34 @@ class Daemon:
                     return self._lose(f"no measurement for {(time.monotonic() - heard) * 1e3:.0f} ms")
                 continue
             heard = time.monotonic()
-            measured = self._tick_of(arrival, k + 1)
+            elapsed_ns = None if self._loop.lockstep or k < 0 else arrival.published_ns - published_ns
+            measured = self._tick_of(arrival, k, elapsed_ns)
             command = controller.tick(arrival.frame, measured)
             if command is not None:
                 link.send(command)
-            self._account(command, measured - k - 1)
-            k = measured
+            self._account(command, measured, measured - k - 1)
+            k, published_ns = measured, arrival.published_ns
         return not stop.is_set()
 
-    def _tick_of(self, arrival: Arrival, due: int) -> int:
-        """The tick at which a measurement was taken: the first with its counter that is not before the one due.
-
-        Reordering by the network would make it a tick of the past; nothing that old is left by the slot that keeps
-        only the newest frame. A malformed frame counts as the one that was due, and is refused by the controller.
-        """
+    def _tick_of(self, arrival: Arrival, last: int, elapsed_ns: int | None) -> int:
+        """The tick at which a measurement was taken, by its counter; a malformed one counts as the one due."""
         read = self._wire.measurement.unpack(arrival.frame)
-        return due if read is None else due + (read[0] - due) % COUNTERS
+        if read is None:
+            return last + 1
+        return unwrap(read[0], last, elapsed_ns, self._loop.period_ns)
 
-    def _account(self, command: bytes | None, missed: int) -> None:
+    def _account(self, command: bytes | None, measured: int, missed: int) -> None:
         self._received += 1
         self._skipped += missed
         if command is not None:
             self._sent += 1
-        if self._state is not DaemonState.RUNNING:
-            self._state = DaemonState.RUNNING
-            self._publish_telemetry()
-            self._role.event("claimed", f"{self._role.name} has {self._role.vehicle}", self._session)
-        elif self._controller.tick_index % self._telemetry_every == 0:
-            self._publish_telemetry()
+        if self._controller.tick_index == measured:  # it used the measurement
+            if self._state is not DaemonState.RUNNING:
+                self._state = DaemonState.RUNNING
+                self._publish_telemetry()
+                self._role.event("claimed", f"{self._role.name} has {self._role.vehicle}", self._session)
+            elif measured % self._telemetry_every == 0:
+                self._publish_telemetry()
         self._publish_when_due()
 
     # ── the session ──

@@ -54,6 +54,8 @@ def figures_table(figures: Figures) -> None:
             else f"— ({figures.reasons.get('latency_us', 'not measured')})",
         )
     )
+    for trip in figures.trips:
+        rows.append(("tripped", trip))
     if figures.log:
         rows.append(("log", figures.log))
     table = Table(show_header=False, box=None, pad_edge=False)

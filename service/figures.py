@@ -41,6 +41,7 @@ class Figures(BaseModel):
     skipped_ticks: int | None = Field(description="ticks that no command answered, whatever the reason")
     latency_us: Percentiles | None
     log: str | None
+    trips: list[str] = Field(default_factory=list, description="why the plant went to 0 V by itself, each time it did")
     reasons: dict[str, str] = Field(default_factory=dict, description="why a figure is null")
 
 
@@ -99,6 +100,7 @@ class Score:
         *,
         latency: Percentiles | None = None,
         log: str | None = None,
+        trips: Sequence[str] = (),
         reasons: dict[str, str] | None = None,
     ) -> Figures:
         """The figures so far; the last error and the last command stand for one period."""
@@ -120,6 +122,7 @@ class Score:
             skipped_ticks=self.ticks - self._commands if self._errors else None,
             latency_us=latency,
             log=log,
+            trips=list(trips),
             reasons=reasons,
         )
 

@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol import messages, topics
+from protocol.links import published_ns
 from protocol.messages import Contract, Status
 from protocol.role import Role, versions
 
@@ -54,13 +55,6 @@ class Taken(NamedTuple):
     payload: bytes
     published_ns: int
     arrived_ns: int
-
-
-def published_ns(sample: zenoh.Sample, arrived_ns: int) -> int:
-    """Wall-clock time of publication [ns]; time of arrival if the sender does not stamp its messages."""
-    if sample.timestamp is None:
-        return arrived_ns
-    return sample.timestamp.get_time_as_ntp64().as_nanos()
 
 
 class LogFile:

@@ -24,7 +24,7 @@ from zstandard import ZstdError
 
 from protocol import topics
 from protocol.attitude import Quaternion, Vector
-from protocol.frames import COUNTERS
+from protocol.frames import COUNTERS, unwrap
 from protocol.messages import Contract, Event, Percentiles, Status, Telemetry
 from service.config import ConfigError, Settings, from_contract
 from service.controller import Controller
@@ -71,7 +71,6 @@ class Session:
     def __init__(self, settings: Settings, *, keep: bool = False) -> None:
         self.settings = settings
         self._wire = settings.wire
-        self._period_ns = settings.loop.period_ns
         self._controller = Controller(
             settings.wire, settings.law, reference_function(settings.reference), settings.loop.period
         )
@@ -92,7 +91,9 @@ class Session:
         elif self._last is None:
             self._waiting.append(seen)
         else:
-            self._take(self._unwrap(counter, *self._last, seen.published_ns), seen)
+            tick, published_ns = self._last
+            elapsed_ns = None if self.settings.loop.lockstep else seen.published_ns - published_ns
+            self._take(unwrap(counter, tick, elapsed_ns, self.settings.loop.period_ns), seen)
 
     def command(self, seen: Seen) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
@@ -182,21 +183,12 @@ class Session:
             known.append((k, seen))
         return known[::-1]
 
-    def _unwrap(self, counter: int, tick: int, tick_ns: int, published_ns: int) -> int:
-        """The tick with this counter, after `tick`, that is nearest to where the time of publication puts it."""
-        step = (counter - tick) % COUNTERS
-        if self.settings.loop.lockstep:
-            return tick + step
-        rounds = round(((published_ns - tick_ns) / self._period_ns - step) / COUNTERS)
-        return tick + step + max(0, rounds) * COUNTERS
-
 
 class Review(NamedTuple):
-    """What a log says: figures of its longest session, that session, and what ended others."""
+    """What a log says: figures of its longest session, and that session."""
 
     figures: Figures
     session: Session
-    trips: list[str]
 
 
 def review(path: Path) -> Figures:
@@ -254,7 +246,7 @@ def read(path: Path, *, keep: bool = False) -> Review:
     vehicle, name = max(sessions, key=lambda which: sessions[which].score.ticks)
     ends = {role: status for (of, role), status in statuses.items() if of == vehicle}
     longest = sessions[vehicle, name]
-    return Review(_judge(longest, ends, path), longest, trips)
+    return Review(_judge(longest, ends, path, trips), longest)
 
 
 def _messages(reader: McapReader) -> Iterator[tuple[topics.Address, bytes, int]]:
@@ -281,9 +273,9 @@ def _settings(reader: McapReader, path: Path) -> Settings:
     raise ReviewError(f"{path} has no contract of a controller or a plant, so its frames cannot be read")
 
 
-def _judge(session: Session, ends: dict[str, Status], path: Path) -> Figures:
+def _judge(session: Session, ends: dict[str, Status], path: Path, trips: list[str]) -> Figures:
     reasons: dict[str, str] = {}
     latency: Percentiles | None = ends["plant"].latency_us if "plant" in ends else None
     if latency is None:
         reasons["latency_us"] = "the log has no status of the plant with a latency"
-    return session.score.figures(latency=latency, log=str(path), reasons=reasons)
+    return session.score.figures(latency=latency, log=str(path), trips=trips, reasons=reasons)

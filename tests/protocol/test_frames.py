@@ -25,6 +25,7 @@ from protocol.frames import (
     pack_measurement,
     unpack_command,
     unpack_measurement,
+    unwrap,
 )
 from protocol.quantizer import Continuous, UniformQuantizer
 
@@ -392,3 +393,18 @@ def test_with_bits_changes_the_bits_and_nothing_else(spec: WireSpec, out: int | 
     assert (changed.attitude.bits, changed.rate.bits, changed.voltage.bits) == (out, out, inp)
     assert changed.with_bits(8, 6) == spec.with_bits(8, 6)
     assert all(".bits:" in line for line in changed.differences(spec))
+
+
+@given(st.integers(0, 10**6), st.integers(1, 15), st.integers(0, 1000), st.floats(-7.9, 7.9))
+def test_a_counter_is_unwrapped_over_any_gap_by_the_time_that_passed(
+    tick: int, step: int, rounds: int, late: float
+) -> None:
+    """The time may be off by up to half a round, 8 ticks, less what rounding takes."""
+    period_ns = 2_000_000
+    later = tick + step + rounds * COUNTERS
+    elapsed_ns = round((later - tick + late) * period_ns)
+    assert unwrap(later % COUNTERS, tick, elapsed_ns, period_ns) == later
+
+
+def test_in_lockstep_a_counter_is_unwrapped_without_time() -> None:
+    assert [unwrap(counter, 30, None, 1) for counter in (14, 15, 0, 13)] == [30, 31, 32, 45]

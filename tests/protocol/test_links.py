@@ -134,8 +134,8 @@ def test_of_many_frames_only_the_newest_is_given(
     all_are_here = threading.Event()
 
     class Watched(Mailbox):
-        def put(self, frame: bytes) -> None:
-            super().put(frame)
+        def put(self, frame: bytes, published_ns: int = 0) -> None:
+            super().put(frame, published_ns)
             if frame == b"last":
                 all_are_here.set()
 
