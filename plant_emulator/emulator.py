@@ -44,7 +44,12 @@ class Emulator:
         self._settings = settings
         self._plant = settings.build(loop.period)
         self._endpoint = Endpoint(
-            self._plant, wire, loop.period_ns, lockstep=loop.lockstep, watchdog_s=settings.watchdog_s
+            self._plant,
+            wire,
+            loop.period_ns,
+            lockstep=loop.lockstep,
+            watchdog_s=settings.watchdog_s,
+            guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
         )
         self._link: ZenohLink | None = None
         self._inbox: deque[Callable[[], None]] = deque()
@@ -63,6 +68,8 @@ class Emulator:
         role = self._role
         role.answer(topics.key("claim", role.vehicle), lambda q: self._inbox.append(lambda: self._claim(q)))
         role.answer(topics.key("release", role.vehicle), lambda q: self._inbox.append(lambda: self._release(q)))
+        role.answer(topics.key("arm", role.vehicle), lambda q: self._inbox.append(lambda: self._arm(q)))
+        role.answer(topics.key("stop", role.vehicle), lambda q: self._inbox.append(lambda: self._stop(q)))
         role.watch_tokens(self._token)
         role.announce()
         role.event("started", f"{role.vehicle} waits for a claim")
@@ -181,6 +188,15 @@ class Emulator:
         query.reply(query.key_expr, b"true" if released else b"false")
         query.drop()
 
+    def _arm(self, query: zenoh.Query) -> None:
+        query.reply(query.key_expr, b"true" if self._endpoint.arm() else b"false")
+        query.drop()
+
+    def _stop(self, query: zenoh.Query) -> None:
+        self._endpoint.stop()
+        query.reply(query.key_expr, b"true")
+        query.drop()
+
     def _open_link(self, session: str) -> None:
         """Listen for commands before the grant goes out, so that the first one finds somebody."""
         vehicle = self._role.vehicle
@@ -210,6 +226,7 @@ class Emulator:
                 role=self._role.role,
                 state=endpoint.state,
                 session=endpoint.session,
+                cause=endpoint.cause,
                 uptime_s=self._role.uptime_s,
                 ticks=self._k + 1,
                 rate_hz=max(0.0, (self._k - self._status_tick) / (now - self._status_time)),

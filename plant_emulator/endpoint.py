@@ -2,15 +2,17 @@
 
 It knows no socket and no clock: time is the tick index. Whoever owns it feeds it the newest command frame, once a tick,
 and sends what it returns. A command acts from the start of the period in which it arrived; when none has come in time
-the watchdog ends the session, and the motors have 0 V until a new claim.
+the watchdog trips: the session ends, and the motors have 0 V until somebody arms the plant and a controller claims it.
 
-        claim          first command
-  idle ───────► granted ───────────► driven
-   ▲               │ release, holder gone  │
-   └───────────────┴───────────────────────┤
-                                           │ no fresh command in time, or one that says "invalid"
-   granted ◄──────────── tripped ◄─────────┘
-              claim
+              claim                first command
+  idle ────────────────► granted ───────────────► driven
+   ▲  ▲                     │ release                │ release
+   │  └─────────────────────┴────────────────────────┤
+   │ arm                                             │ watchdog, holder gone, invalid command, limit, operator's stop
+   └────────────────────────────────── tripped ◄─────┘
+
+An idle plant that nobody has armed yet, and a tripped one, refuse claims and say why. A claim may carry its own arming
+(`auto_arm`), which clears anything but an operator's stop.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
-from plant_emulator.plant import Plant
+from plant_emulator.limits import Guard
+from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import sent_vector
 from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
 from protocol.frames import COUNTERS, WireSpec
@@ -52,6 +55,7 @@ class Endpoint:
         period_ns: Period of a tick [ns].
         lockstep: Whether each answer is waited for; a claim must say the same.
         watchdog_s: 0 V after this long without a fresh command [s].
+        guard: What else makes it trip; None for nothing.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
@@ -66,7 +70,14 @@ class Endpoint:
     """
 
     def __init__(
-        self, plant: Plant, wire: WireSpec, period_ns: int, *, lockstep: bool = False, watchdog_s: float = WATCHDOG_S
+        self,
+        plant: Plant,
+        wire: WireSpec,
+        period_ns: int,
+        *,
+        lockstep: bool = False,
+        watchdog_s: float = WATCHDOG_S,
+        guard: Guard | None = None,
     ) -> None:
         if plant.actuators != wire.actuators:
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
@@ -86,6 +97,9 @@ class Endpoint:
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
+        self._guard = guard
+        self._latch: str | None = "not armed since it was started"
+        self._operator_stop = False
         self._watchdog = max(1, round(watchdog_s * 1e9 / period_ns))
         self._first_command = max(1, round(FIRST_COMMAND_S * 1e9 / period_ns))
         self._tick = -1
@@ -93,6 +107,11 @@ class Endpoint:
         self._fresh_tick = 0  # tick of the last fresh command, or of the grant
         self._echo = -1  # the last fresh command's echo
         self._answered = -1  # and the tick of the measurement that it answered
+
+    @property
+    def cause(self) -> str | None:
+        """Why claims are held back, or None."""
+        return self._latch
 
     @property
     def saturated(self) -> int:
@@ -112,6 +131,12 @@ class Endpoint:
             return Refusal(reason=f"the plant has {'; '.join(differences)}", differences=differences)
         if self.session is not None:
             return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
+        if claim.auto_arm and not self._operator_stop:
+            self._latch = None
+        if self._latch is not None:
+            return Refusal(reason=f"{self._latch}; `aeroloop op arm` clears it")
+        if self._guard is not None:
+            self._guard.reset()
         self.session, self.holder, self.state = claim.session, claim.controller, PlantState.GRANTED
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
@@ -125,6 +150,19 @@ class Endpoint:
             return False
         self._end(PlantState.IDLE, "released", f"released by {self.holder}")
         return True
+
+    def arm(self) -> bool:
+        """Clear what holds claims back; the next one is granted. False while a controller holds the plant."""
+        if self.session is not None:
+            return False
+        self._latch, self._operator_stop, self.state = None, False, PlantState.IDLE
+        self._notice("armed", "armed by an operator: the next claim is granted")
+        return True
+
+    def stop(self) -> None:
+        """An operator's stop, from any state: 0 V, and no claim is granted before `arm`."""
+        self._end(PlantState.TRIPPED, "tripped", "stopped by an operator: 0 V")
+        self._operator_stop = True
 
     def lost(self, controller: str) -> None:
         """A controller's liveliness token went; if it held the plant, its session ends: 0 V."""
@@ -156,15 +194,20 @@ class Endpoint:
         self._tick = k
         if self.session is None:
             return None
-        return self.wire.measurement.pack(self.counter, self._measure())
+        seen = self.plant.measure()
+        if self._guard is not None and (reason := self._guard.check(seen, self._voltages)) is not None:
+            self._end(PlantState.TRIPPED, "tripped", f"{reason}: 0 V")
+            self.plant.actuate(self._voltages)
+            return None
+        return self.wire.measurement.pack(self.counter, self._encoded(seen))
 
     @property
     def counter(self) -> int:
         """Counter of the last measurement."""
         return (self._tick - self._session_tick) % COUNTERS
 
-    def _measure(self) -> list[float]:
-        attitude, rate = self.plant.measure()
+    def _encoded(self, seen: Measurement) -> list[float]:
+        attitude, rate = seen
         if not isfinite(sum(attitude) + sum(rate)):
             return self._no_measurement
         values = (*sent_vector(attitude), *rate)
@@ -209,6 +252,8 @@ class Endpoint:
 
     def _end(self, state: PlantState, kind: EventKind, text: str) -> None:
         self._notice(kind, text)
+        if kind == "tripped":
+            self._latch = text
         self.state, self.session, self.holder = state, None, None
         self._voltages = self._off
 

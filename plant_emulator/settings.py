@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from plant_emulator.aero import Aero, AeroSettings
 from plant_emulator.emulated import EmulatedPlant
 from plant_emulator.friction import FrictionSettings
+from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.mechanism import Mechanism
 from plant_emulator.rigid_body import RigidBody, RigidBodySettings
 from plant_emulator.rotor import RotorSettings
@@ -37,6 +38,7 @@ class PlantSettings(BaseModel):
     truth_rate_hz: float = Field(default=50.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
+    limits: LimitSettings = LimitSettings()
     aero: AeroSettings = AeroSettings()
     rigid_body: RigidBodySettings = RigidBodySettings()
     rotor: RotorSettings = RotorSettings()
@@ -72,6 +74,10 @@ class PlantSettings(BaseModel):
             voltage_limit=self.voltage_limit,
             substeps=self.substeps,
         )
+
+    def guard(self, period_ns: int, commanded_limit: float) -> Guard:
+        """The plant's limits; a motor is saturated at the supply's limit or at the outermost level commanded [V]."""
+        return Guard(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
 
 
 IDEAL_AERO = AeroSettings(centre_of_mass=(0.0, 0.0, -0.0038), damping=(0.0, 0.0071, 0.0220))

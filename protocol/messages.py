@@ -15,7 +15,7 @@ from protocol.topics import TOPICS
 
 PROTOCOL_VERSION: Final = 1
 
-EventKind = Literal["claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"]
+EventKind = Literal["armed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"]
 
 
 class Message(BaseModel):
@@ -46,6 +46,7 @@ class Claim(Message):
     session: SessionName = Field(description="the key its frames would travel under; new for every claim")
     period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
     lockstep: bool = Field(description="the plant waits for each answer before it steps")
+    auto_arm: bool = Field(default=False, description="arm the plant by this claim, unless an operator stopped it")
     wire: WireSpec
 
 
@@ -108,6 +109,7 @@ class Status(Message):
     role: str
     state: str
     session: str | None = None
+    cause: str | None = Field(default=None, description="plant: why it may not be driven, where that is so")
     uptime_s: float
     ticks: int = Field(description="ticks since start")
     rate_hz: float = Field(description="ticks a second since the last status")

@@ -55,6 +55,11 @@ class Quantizer(ABC):
         """
 
     @property
+    def outermost(self) -> float:
+        """The largest level, where saturation begins [signal's unit]."""
+        return self.quantize(self.limit)
+
+    @property
     @abstractmethod
     def invalid(self) -> float:
         """The code that says "no valid value"."""

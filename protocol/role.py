@@ -55,6 +55,7 @@ class Role:
         self.name = name or role
         self.stop = threading.Event()
         self.zenoh = join(network)
+        self._status = b""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._started = time.monotonic()
         contract = Contract(
@@ -62,6 +63,8 @@ class Role:
         ).encode()
         key = topics.key("contract", vehicle, role=role)
         self.answer(key, lambda query: query.reply(key, contract))
+        status = topics.key("status", vehicle, role=role)
+        self.answer(status, lambda query: query.reply(status, self._status) if self._status else None)
 
     def __enter__(self) -> Self:
         return self
@@ -123,5 +126,6 @@ class Role:
         self.publish("event", Event(role=self.role, kind=kind, text=text, session=session))
 
     def status(self, status: Status) -> None:
-        """Tell how the role is doing."""
+        """Tell how the role is doing, now and to whoever asks before the next time."""
+        self._status = status.encode()
         self.publish("status", status)

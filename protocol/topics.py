@@ -45,6 +45,8 @@ TOPICS: Final = {
     for topic in (
         Topic("claim", "claim", "query", "controller", "once a session", "Claim"),
         Topic("release", "release", "query", "controller", "once a session", "Release"),
+        Topic("arm",         "arm",                   "query", "operator",      "when needed",             ""),
+        Topic("stop",        "stop",                  "query", "operator",      "when needed",             ""),
         Topic("contract", "contract/{role}", "query", "every role", "when asked", "Contract"),
         Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", "Measurement"),
         Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),

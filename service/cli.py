@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from service.calibrate import Calibration
     from service.config import Settings
     from service.figures import Figures
+    from service.operate import Statuses
     from service.tables import Tables
 
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
@@ -38,9 +39,11 @@ app = typer.Typer(
 )
 lab = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
 log_group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
+op = typer.Typer(no_args_is_help=True, help="An operator's verbs, over the network.")
 show = typer.Typer(no_args_is_help=True, help="What would be used.")
 app.add_typer(lab, name="lab")
 app.add_typer(log_group, name="log")
+app.add_typer(op, name="op")
 app.add_typer(show, name="show")
 
 _state = {"debug": False}
@@ -132,15 +135,18 @@ def controller(
     duration: Annotated[
         float | None, typer.Option("--duration", min=0.01, help="End after this long [s].", show_default=False)
     ] = None,
+    auto_arm: Annotated[
+        bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
+    ] = False,
     config: Config = None,
     overrides: Overrides = None,
     quiet: Quiet = False,
     with_parent: WithParent = False,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
-    settings = _settings(
-        config, [*(overrides or []), *([f"controller.duration_s={duration}"] if duration is not None else [])]
-    )
+    options = [f"controller.duration_s={duration}"] if duration is not None else []
+    options += ["controller.auto_arm=true"] if auto_arm else []
+    settings = _settings(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
         from service.daemon import Daemon
@@ -284,6 +290,59 @@ def review(
     _print_figures(_guard(run), json)
 
 
+@op.command()
+def status(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Say how every role of every vehicle on the network is doing."""
+    settings = _settings(config, overrides)
+
+    def run() -> Statuses:
+        from service.operate import gather
+
+        return gather(settings.network)
+
+    found = _guard(run)
+    if json:
+        from json import dumps
+
+        tree = {
+            vehicle: {role: status.model_dump(mode="json") for role, status in roles.items()}
+            for vehicle, roles in found.items()
+        }
+        typer.echo(dumps(tree, indent=2))
+    else:
+        from service.display import status_table
+
+        status_table(found)
+
+
+@op.command()
+def arm(config: Config = None, overrides: Overrides = None) -> None:
+    """Arm the plant, so that the next controller to claim it may drive it."""
+    settings = _settings(config, overrides)
+
+    def run() -> None:
+        from service.operate import arm
+
+        arm(settings.network, settings.vehicle)
+
+    _guard(run)
+    typer.echo(f"{settings.vehicle} is armed")
+
+
+@op.command()
+def stop(config: Config = None, overrides: Overrides = None) -> None:
+    """Stop the plant at once: 0 V, and nobody drives it until it is armed again."""
+    settings = _settings(config, overrides)
+
+    def run() -> None:
+        from service.operate import stop
+
+        stop(settings.network, settings.vehicle)
+
+    _guard(run)
+    typer.echo(f"{settings.vehicle} is stopped at 0 V; `aeroloop op arm` lets it be driven again")
+
+
 @show.command("config")
 def show_config(config: Config = None, overrides: Overrides = None) -> None:
     """Print the effective configuration as TOML."""
@@ -335,6 +394,7 @@ def _guard(run: Callable[[], T]) -> T:
     from service.bench import BenchError
     from service.calibrate import CalibrationError
     from service.daemon import SessionLostError
+    from service.operate import OperatorError
     from service.recorder import RecorderError
     from service.review import ReviewError
 
@@ -342,6 +402,7 @@ def _guard(run: Callable[[], T]) -> T:
         return run()
     except (
         NetworkError,
+        OperatorError,
         BenchError,
         CalibrationError,
         RecorderError,

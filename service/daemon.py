@@ -46,6 +46,9 @@ class ControllerSettings(BaseModel):
         default=0.1, gt=0, le=10, description="stop commanding after this long without a measurement [s]"
     )
     duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
+    auto_arm: bool = Field(
+        default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
+    )
     telemetry_rate_hz: float = Field(default=50.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
 
@@ -195,6 +198,7 @@ class Daemon:
             session=uuid.uuid4().hex[:8],
             period_ns=self._loop.period_ns,
             lockstep=self._loop.lockstep,
+            auto_arm=self._settings.auto_arm,
             wire=self._wire,
         )
         link = ZenohLink(

@@ -86,7 +86,9 @@ def run_demo(
     settings = settings.model_copy(
         update={
             "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
-            "controller": settings.controller.model_copy(update={"duration_s": duration_s, "require_recorder": True}),
+            "controller": settings.controller.model_copy(
+                update={"duration_s": duration_s, "require_recorder": True, "auto_arm": True}
+            ),
             "recorder": settings.recorder.model_copy(update={"path": path.absolute()}),
         }
     )

@@ -27,6 +27,7 @@ from service.figures import Figures
 if TYPE_CHECKING:
     from service.calibrate import Calibration
     from service.demo import Progress as DemoProgress
+    from service.operate import Statuses
     from service.tables import Tables
 
 _stderr = Console(stderr=True)
@@ -168,6 +169,25 @@ def calibration_table(fit: Calibration) -> None:
     for name, residual in fit.residuals.items():
         Console().print(f"residual {name}: {residual:+.2%}")
     Console().print(f"{fit.runs} experiments")
+
+
+def status_table(found: Statuses) -> None:
+    """Print the status of every role."""
+    table = Table("vehicle", "role", "state", "rate", "skipped", "latency p50/p99", "up", "", box=None)
+    for vehicle, roles in sorted(found.items()):
+        for role, status in sorted(roles.items()):
+            latency = status.latency_us
+            table.add_row(
+                vehicle,
+                role,
+                status.state,
+                f"{status.rate_hz:.0f}/s",
+                str(status.skipped),
+                f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+                f"{status.uptime_s:.0f} s",
+                "; ".join([*([status.cause] if status.cause else []), *status.notes]),
+            )
+    Console().print(table)
 
 
 @contextmanager

@@ -32,10 +32,11 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
     loop, wire = settings.loop, settings.wire
     plant = settings.plant.build(loop.period)
     controller = Controller(wire, settings.law, reference_function(settings.reference), loop.period)
-    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s)
+    guard = settings.plant.guard(loop.period_ns, wire.voltage.quantizer().outermost)
+    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, guard=guard)
     score = Score(wire, loop.period, settings.plant.watchdog_s)
     answer = endpoint.claim(
-        Claim(controller="experiment", session="lab", period_ns=loop.period_ns, lockstep=True, wire=wire)
+        Claim(controller="experiment", session="lab", period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
     )
     if isinstance(answer, Refusal):
         raise ValueError(answer.reason)
@@ -46,7 +47,8 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
     for k in range(loop.ticks(duration_s)):
         command = controller.tick(measurement, k)
         if command is None or (read := wire.command.unpack(command)) is None:
-            raise ValueError(f"the controller did not answer at tick {k}")
+            trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
+            raise ValueError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         score.error(k, controller.attitude_error)
         score.command(k, [level(code) for code in read[1]])
         measurement = endpoint.tick(command, k + 1)

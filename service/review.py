@@ -76,6 +76,7 @@ class Session:
         )
         self._level = settings.wire.voltage.quantizer().level
         self._waiting: deque[Seen] = deque(maxlen=MAX_WAITING)  # measurements whose tick is not known yet
+        self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
         self._commands: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
         self._measured: deque[tuple[int, Seen]] = deque()  # measurements that no command has answered yet
         self._last: tuple[int, int] | None = None  # tick and time of the last measurement
@@ -90,6 +91,7 @@ class Session:
             self.malformed += 1
         elif self._last is None:
             self._waiting.append(seen)
+            self._anchor(seen.published_ns)
         else:
             tick, published_ns = self._last
             elapsed_ns = None if self.settings.loop.lockstep else seen.published_ns - published_ns
@@ -99,23 +101,30 @@ class Session:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
         self._commands.append(seen)
 
-    def telemetry(self, telemetry: Telemetry) -> None:
-        """The first one tells which tick the measurements so far belong to."""
-        if self._last is not None:
-            return
-        waiting = list(self._waiting)
-        found = next((i for i in reversed(range(len(waiting))) if self._counter(waiting[i]) == telemetry.counter), None)
-        if found is None:
-            return  # the measurement that it speaks of came before the log began
-        self._waiting.clear()
-        for k, seen in self._backwards(waiting[: found + 1], telemetry.tick):
-            self._take(k, seen)
-        for seen in waiting[found + 1 :]:
-            self.measurement(seen)
+    def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
+        """Which tick a counter stood for; the first that can be matched tells it for the whole session."""
+        if self._last is None:
+            self._anchors.append((telemetry, published_ns))
 
     def finish(self) -> None:
         """No more is to come: what still waits is judged by what there is."""
+        self._anchor(None)
         self._answer(None)
+
+    def _anchor(self, until_ns: int | None) -> None:
+        """Match telemetry from before `until_ns` with the latest measurement before it that had its counter."""
+        while self._last is None and self._anchors and (until_ns is None or self._anchors[0][1] < until_ns):
+            telemetry, published_ns = self._anchors.popleft()
+            waiting = list(self._waiting)
+            for i in reversed(range(len(waiting))):
+                if waiting[i].published_ns < published_ns and self._counter(waiting[i]) == telemetry.counter:
+                    self._waiting.clear()
+                    for k, seen in self._backwards(waiting[: i + 1], telemetry.tick):
+                        self._take(k, seen)
+                    for seen in waiting[i + 1 :]:
+                        self.measurement(seen)
+                    break
+            # else: the measurement that it speaks of came before the log began
 
     def _take(self, k: int, seen: Seen) -> None:
         self._answer(seen.published_ns)
@@ -135,7 +144,14 @@ class Session:
                 self.malformed += 1
                 continue
             echo, codes = read
-            answered = next((k for k, _ in reversed(self._measured) if k % COUNTERS == echo), None)
+            answered = next(
+                (
+                    k
+                    for k, measured in reversed(self._measured)
+                    if k % COUNTERS == echo and measured.published_ns < seen.published_ns
+                ),
+                None,
+            )
             if answered is None:
                 continue  # answers what the log does not have, or repeats an answer
             voltages = [self._level(code) for code in codes]
@@ -226,7 +242,7 @@ def read(path: Path, *, keep: bool = False) -> Review:
                 elif address.topic.name == "telemetry":
                     telemetry = Telemetry.model_validate_json(payload)
                     if session := sessions.get((address.vehicle, telemetry.session)):
-                        session.telemetry(telemetry)
+                        session.telemetry(telemetry, published_ns)
                 elif address.topic.name == "event":
                     event = Event.model_validate_json(payload)
                     if event.kind == "tripped":

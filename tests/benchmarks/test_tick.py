@@ -33,7 +33,9 @@ def measurements() -> list[bytes]:
     """Measurement frames of four seconds of the paper's experiment."""
     wire = WireSpec()
     endpoint = Endpoint(PlantSettings(ideal=True).build(PERIOD), wire, round(PERIOD * 1e9))
-    endpoint.claim(Claim(controller="c", session="s", period_ns=round(PERIOD * 1e9), lockstep=False, wire=wire))
+    endpoint.claim(
+        Claim(controller="c", session="s", period_ns=round(PERIOD * 1e9), lockstep=False, auto_arm=True, wire=wire)
+    )
     controller = _controller()
     frames = []
     frame = endpoint.tick(None, 0)

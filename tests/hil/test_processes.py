@@ -120,6 +120,7 @@ def parts(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
             started.append(subprocess.Popen(command, stderr=stderr))
         return started[-1]
 
+    start.rendezvous = rendezvous  # type: ignore[attr-defined]
     yield start
     for process in started:
         process.kill()
@@ -148,7 +149,7 @@ def test_parts_start_in_any_order_and_find_each_other_after_each_is_restarted(
     def times_granted() -> int:
         return sum(path.read_text().count("granted to") for path in tmp_path.glob("emulator-*.stderr"))
 
-    controller = parts("controller")
+    controller = parts("controller", "--auto-arm")
     eventually("the controller", said(tmp_path, "controller", "looks for aero"))
     emulator = parts("emulator")
     eventually("a first session", lambda: times_granted() == 1)
@@ -163,7 +164,7 @@ def test_parts_start_in_any_order_and_find_each_other_after_each_is_restarted(
     controller.kill()
     controller.wait()
     eventually("0 V", said(tmp_path, "emulator", "0 V"))
-    controller = parts("controller")
+    controller = parts("controller", "--auto-arm")
     eventually("a session with the new controller", lambda: times_granted() == 3)
 
     stop(recorder)
@@ -178,11 +179,11 @@ def test_a_second_controller_is_refused_by_name_and_a_controller_of_another_wire
     tmp_path: Path, parts: Callable[..., subprocess.Popen[bytes]]
 ) -> None:
     parts("emulator")
-    parts("controller")
+    parts("controller", "--auto-arm")
     eventually("a session", said(tmp_path, "emulator", "granted to"))
-    parts("controller")
+    parts("controller", "--auto-arm")
     eventually("refusal by name", said(tmp_path, "controller", "the plant is held by controller-"))
-    parts("controller", "--set", "wire.rate.bits=10")
+    parts("controller", "--auto-arm", "--set", "wire.rate.bits=10")
     eventually("refusal by field", said(tmp_path, "controller", "rate.bits: 8, not 10"))
 
 
@@ -193,6 +194,7 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
             f"network.rendezvous={free_rendezvous()}",
             f"recorder.path={log}",
             "controller.require_recorder=true",
+            "controller.auto_arm=true",
             "plant.truth_rate_hz=500",
         ]
     )
@@ -219,6 +221,37 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
     assert max(driven) - last_command < 200_000_000
     assert truths[-1][0] > max(driven)
     assert any(event.kind == "tripped" for event in events(log))
+
+
+def test_an_operator_arms_looks_and_stops_and_no_controller_drives_before_the_plant_is_armed_again(
+    tmp_path: Path, parts: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    parts("emulator")
+    eventually("the emulator", said(tmp_path, "emulator", "waits for a claim"))
+    rendezvous = parts.rendezvous  # type: ignore[attr-defined]  # set by the fixture
+
+    def op(verb: str) -> str:
+        command = [*AEROLOOP, "op", verb, "--set", f"network.rendezvous={rendezvous}"]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+
+    def states() -> dict[str, str]:
+        roles = aeroloop("op", "status", "--set", f"network.rendezvous={rendezvous}")["aero"]
+        return {role: status["state"] for role, status in roles.items()}
+
+    parts("controller")
+    eventually("a refusal", said(tmp_path, "controller", "`aeroloop op arm` clears it"))
+    assert states() == {"plant": "idle", "controller": "searching"}
+    op("arm")
+    eventually("a session", said(tmp_path, "emulator", "granted to"))
+    eventually("driving", lambda: states() == {"plant": "driven", "controller": "running"})
+
+    op("stop")
+    eventually("0 V", said(tmp_path, "emulator", "stopped by an operator: 0 V"))
+    parts("controller", "--auto-arm")  # even one that may arm a plant does not arm this one
+    eventually("its refusal", said(tmp_path, "controller", "stopped by an operator"))
+    eventually("still", lambda: states()["plant"] == "tripped")
+    op("arm")
+    eventually("driving again", lambda: states()["plant"] == "driven")
 
 
 def test_what_is_not_a_log_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class Notebook(Plant):
 
 
 def _claim(name: str = "a", wire: WireSpec = WIRE, changed: dict[str, object] | None = None) -> Claim:
-    claim = Claim(controller=name, session=f"of-{name}", period_ns=PERIOD_NS, lockstep=False, wire=wire)
+    claim = Claim(controller=name, session=f"of-{name}", period_ns=PERIOD_NS, lockstep=False, auto_arm=True, wire=wire)
     return claim.model_copy(update=changed)
 
 

@@ -272,7 +272,7 @@ def test_gusts_have_the_mean_deviation_and_memory_they_are_told_whatever_the_per
 
 
 def test_gusts_are_there_from_the_first_sample() -> None:
-    first = np.array([_blown(1, gust=1.0, period=PERIOD, seed=seed)[0] for seed in range(150)]) - FAN
+    first = np.array([_blown(1, gust=1.0, period=PERIOD, seed=seed)[0] for seed in range(80)]) - FAN
     # Of n samples a deviation is known to 1/√(2n); a gust that started at 0 would have a sixteenth of it.
     assert first.std() / (hypot(*FAN) / sqrt(2)) == pytest.approx(1, abs=5 / sqrt(2 * first.size))
 
@@ -285,7 +285,8 @@ def test_wind_is_a_torque_about_the_axes() -> None:
     for _ in range(100):
         plant.advance()
     # constant acceleration, level: Runge–Kutta is exact; rounding of a hundred periods
-    assert plant.truth().rate == (0.0, 0.0, pytest.approx(0.01 * 0.2 / 0.05, rel=1e-12))
+    assert plant.truth().rate[:2] == (0.0, 0.0)
+    assert plant.truth().rate[2] == pytest.approx(0.01 * 0.2 / 0.05, rel=1e-12)
 
 
 # The filtered derivative
@@ -563,9 +564,8 @@ def test_with_every_piece_off_the_plant_is_the_bare_mechanism() -> None:
 )
 def test_each_piece_that_acts_changes_where_the_plant_goes(piece: BaseModel) -> None:
     names = {RotorSettings: "rotor", FrictionSettings: "friction", WindSettings: "wind"}
-    for (before, _), (after, measured) in zip(
-        _driven(BARE), _driven(_with(**{names[type(piece)]: piece})), strict=True
-    ):
+    changed = BARE.model_copy(update={names[type(piece)]: piece})
+    for (before, _), (after, measured) in zip(_driven(BARE), _driven(changed), strict=True):
         assert after.attitude != before.attitude
         assert after.rate != before.rate
         assert after.voltages == before.voltages

@@ -316,7 +316,7 @@ def test_the_closed_loop_agrees_with_the_twins() -> None:
     aero = IDEAL_AERO
     plant = PlantSettings(ideal=True).build(PERIOD)
     endpoint = Endpoint(plant, CONTINUOUS, PERIOD_NS, lockstep=True)
-    claim = Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, wire=CONTINUOUS)
+    claim = Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, auto_arm=True, wire=CONTINUOUS)
     assert isinstance(endpoint.claim(claim), Grant)
     controller, loop = _controller(), TwinLoop(PAPER)
     body = twin.LockedBody(_body(LAW), np.vstack([np.zeros(2), aero.thrust]), np.array(aero.damping), np.zeros(4))

@@ -1,0 +1,79 @@
+"""Limits of the plant end: what it does not let any controller do to it, for whatever reason.
+
+A Guard sees what the sensors say and what is commanded, once a tick, and gives a reason to trip or None. It trusts
+nothing but its own sensors and keeps no clock: durations are counted in ticks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import acos, degrees, hypot, isfinite
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from plant_emulator.plant import Measurement
+
+
+class LimitSettings(BaseModel):
+    """Beyond any of these the plant goes to 0 V and stays there."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    max_tilt_deg: float = Field(
+        default=75.0, gt=0, le=180, description="largest angle between the body's z axis and the vertical [deg]"
+    )
+    max_rate: float = Field(default=20.0, gt=0, description="largest angular velocity [rad/s]")
+    max_saturated_s: float = Field(
+        default=3.0, gt=0, le=600, description="longest time a motor may stay at its voltage limit [s]"
+    )
+    max_invalid_s: float = Field(
+        default=0.1, gt=0, le=60, description="longest time the sensors may have no valid value [s]"
+    )
+
+
+class Guard:
+    """Watches one plant.
+
+    Args:
+        settings: The limits.
+        period_ns: Period of a tick [ns].
+        voltage_limit: Voltage at which a motor counts as saturated [V].
+    """
+
+    def __init__(self, settings: LimitSettings, period_ns: int, voltage_limit: float) -> None:
+        self._settings = settings
+        self._period_ns = period_ns
+        self._full = voltage_limit
+        self._saturated = self._invalid = 0
+
+    def reset(self) -> None:
+        """Forget what was counted, for a new session."""
+        self._saturated = self._invalid = 0
+
+    def check(self, seen: Measurement, voltages: Sequence[float]) -> str | None:
+        """A reason to trip, or None.
+
+        Args:
+            seen: What the sensors say at this tick.
+            voltages: What is commanded [V]. Shape (actuators,).
+        """
+        limits = self._settings
+        (_, x, y, _), rate = seen
+        if not isfinite(sum(seen.attitude) + sum(rate)):
+            self._invalid += 1
+            if self._seconds(self._invalid) > limits.max_invalid_s:
+                return f"the sensors have had no valid value for {self._seconds(self._invalid) * 1e3:.0f} ms"
+            return None
+        self._invalid = 0
+        tilt = degrees(acos(max(-1.0, min(1.0, 1 - 2 * (x * x + y * y)))))
+        if tilt > limits.max_tilt_deg:
+            return f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
+        if (speed := hypot(*rate)) > limits.max_rate:
+            return f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
+        self._saturated = self._saturated + 1 if max(map(abs, voltages)) >= self._full else 0
+        if self._seconds(self._saturated) > limits.max_saturated_s:
+            return f"a motor has been at its voltage limit for {self._seconds(self._saturated):.1f} s"
+        return None
+
+    def _seconds(self, ticks: int) -> float:
+        return ticks * self._period_ns * 1e-9
