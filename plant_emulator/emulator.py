@@ -18,10 +18,10 @@ from pydantic import ValidationError
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.settings import PlantSettings
 from protocol import topics
-from protocol.clock import Histogram, LoopSettings, TickGrid, prepare_process
+from protocol.clock import Histogram, LoopSettings, LoopTiming, TickGrid, prepare_process
 from protocol.frames import COUNTERS, WireSpec
 from protocol.links import Arrival, ZenohLink
-from protocol.messages import Claim, Grant, Refusal, Release, Status, Truth, summary
+from protocol.messages import Claim, Grant, Refusal, Release, Status, Truth, report, summary
 from protocol.role import Role
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
@@ -54,6 +54,7 @@ class Emulator:
         self._link: ZenohLink | None = None
         self._inbox: deque[Callable[[], None]] = deque()
         self._latency = Histogram()
+        self._timing: LoopTiming | None = None
         self._sent_at = [0] * COUNTERS
         self._sent = self._received = self._skipped = 0
         self._notes: list[str] = []
@@ -85,11 +86,13 @@ class Emulator:
             self._publish_status()
 
     def _run_real_time(self) -> None:
-        self._notes = prepare_process()
+        self._notes = prepare_process(self._loop)
+        timing = self._timing = LoopTiming()
         grid = TickGrid(self._loop.period_ns)
         while not self._role.stop.is_set():
             skipped = grid.skipped
             k = grid.wait()
+            timing.woke(grid.due_ns)
             self._take_inbox()
             arrival = self._link.take() if self._link else None
             frame = self._endpoint.tick(arrival.frame if arrival else None, k)
@@ -98,6 +101,7 @@ class Emulator:
             if self._endpoint.session:
                 self._skipped += grid.skipped - skipped
             self._account(k, arrival)
+            timing.done()
 
     def _run_lockstep(self) -> None:
         arrival = None
@@ -236,6 +240,7 @@ class Emulator:
                 refused=endpoint.refused,
                 saturated=endpoint.saturated,
                 latency_us=summary(self._latency),
+                timing=report(self._timing) if self._timing else None,
                 notes=self._notes,
             )
         )

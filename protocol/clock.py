@@ -11,8 +11,9 @@ import ctypes
 import gc
 import os
 import time
+from collections import deque
 from math import exp2, log2
-from typing import Final
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,6 +26,9 @@ FIRST_COMMAND_S: Final = 1.0
 _BINS_PER_OCTAVE: Final = 16
 _BINS: Final = 32 * _BINS_PER_OCTAVE  # 1 µs … 2^32 µs, over an hour
 _PR_SET_TIMERSLACK: Final = 29
+_SHORTEST_WINDOW_NS: Final = 900_000_000
+_MCL_CURRENT: Final = 1
+_MCL_FUTURE: Final = 2
 
 
 class LoopSettings(BaseModel):
@@ -36,6 +40,13 @@ class LoopSettings(BaseModel):
     lockstep: bool = Field(
         default=False, description="the plant waits for each answer before it steps: repeatable, and as fast as it goes"
     )
+
+    realtime: Literal["strict", "try", "off"] = Field(
+        default="try",
+        description="ask for SCHED_FIFO, locked memory, affinity; strict: refuse to run without; off: do not ask",
+    )
+    priority: int = Field(default=10, ge=1, le=99, description="SCHED_FIFO priority")
+    cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
 
     @property
     def period_ns(self) -> int:
@@ -70,6 +81,11 @@ class TickGrid:
         self.tick = -1
         self.skipped = 0
 
+    @property
+    def due_ns(self) -> int:
+        """When the last tick waited for was due, on `time.monotonic_ns()`."""
+        return self.start_ns + self.tick * self.period_ns
+
     def wait(self) -> int:
         """Sleep until the next tick is due and return its index.
 
@@ -93,45 +109,149 @@ class Histogram:
     """Durations in bins 4.4 % wide (16 an octave, from 1 µs): of fixed size, however long it runs."""
 
     def __init__(self) -> None:
-        self._bins = [0] * _BINS
+        self._bins: dict[int, int] = {}
         self.count = 0
         self.max_us = 0.0
 
     def add(self, nanoseconds: int) -> None:
-        """Count one duration [ns]; under 1 µs counts as 1 µs."""
+        """Count one duration [ns]; under 1 µs counts as 1 µs, over an hour as an hour."""
         us = nanoseconds * 1e-3
-        self._bins[min(int(log2(us) * _BINS_PER_OCTAVE), _BINS - 1) if us > 1.0 else 0] += 1
+        i = min(int(log2(us) * _BINS_PER_OCTAVE), _BINS - 1) if us > 1.0 else 0
+        self._bins[i] = self._bins.get(i, 0) + 1
         self.count += 1
         if us > self.max_us:
             self.max_us = us
+
+    def merge(self, other: Histogram) -> None:
+        """Count all that another has counted."""
+        for i, n in other._bins.items():
+            self._bins[i] = self._bins.get(i, 0) + n
+        self.count += other.count
+        self.max_us = max(self.max_us, other.max_us)
 
     def percentile(self, percent: float) -> float:
         """The middle of the bin that holds this percentile [µs]; NaN if nothing was counted."""
         wanted = self.count * percent / 100
         seen = 0
-        for i, n in enumerate(self._bins):
-            seen += n
-            if n and seen >= wanted:
+        for i in sorted(self._bins):
+            seen += self._bins[i]
+            if seen >= wanted:
                 return min(exp2((i + 0.5) / _BINS_PER_OCTAVE), self.max_us)
         return float("nan")
 
 
-def prepare_process() -> list[str]:
+class RollingHistogram:
+    """A histogram of all durations, and one of those of the last ten seconds."""
+
+    WINDOWS: Final = 10
+
+    def __init__(self) -> None:
+        self.total = Histogram()
+        self._windows: deque[Histogram] = deque([Histogram()], maxlen=self.WINDOWS)
+        self._current = self._windows[0]
+
+    def add(self, nanoseconds: int) -> None:
+        """Count one duration [ns]."""
+        self._current.add(nanoseconds)
+
+    def turn(self) -> None:
+        """End a window; called once a second by whoever reports."""
+        self.total.merge(self._current)
+        self._current = Histogram()
+        self._windows.append(self._current)
+
+    def recent(self) -> Histogram:
+        """The last ten windows."""
+        merged = Histogram()
+        for window in self._windows:
+            merged.merge(window)
+        return merged
+
+
+class LoopTiming:
+    """How well a loop keeps time: wake-up latency, time a tick takes, period between ticks.
+
+    The first second is left out: caches are cold, and code runs for the first time.
+
+    Args:
+        warm_up_ns: What counts as start-up [ns].
+    """
+
+    def __init__(self, warm_up_ns: int = 1_000_000_000) -> None:
+        self.wake = RollingHistogram()
+        self.busy = RollingHistogram()
+        self.period = RollingHistogram()
+        self._warm_at = time.monotonic_ns() + warm_up_ns
+        self._woke_at = 0
+        self._turned_at = 0
+
+    def woke(self, due_ns: int) -> None:
+        """A tick begins that was due at `due_ns` on `time.monotonic_ns()`."""
+        now = time.monotonic_ns()
+        if now >= self._warm_at:
+            self.wake.add(now - due_ns)
+            if self._woke_at:
+                self.period.add(now - self._woke_at)
+            self._woke_at = now
+
+    def done(self) -> None:
+        """The tick is over."""
+        if self._woke_at:
+            self.busy.add(time.monotonic_ns() - self._woke_at)
+
+    def pause(self) -> None:
+        """No ticks for a while: the time until the next is no period."""
+        self._woke_at = 0
+
+    def turn(self) -> None:
+        """End a one-second window; a report that comes sooner, because something happened, does not."""
+        now = time.monotonic_ns()
+        if now - self._turned_at < _SHORTEST_WINDOW_NS:
+            return
+        self._turned_at = now
+        for histogram in (self.wake, self.busy, self.period):
+            histogram.turn()
+
+
+class RealtimeError(Exception):
+    """`loop.realtime = "strict"`, and this machine refused something; one line that names it."""
+
+
+def prepare_process(settings: LoopSettings) -> list[str]:
     """Make this process fit for a timed loop, and say what was refused.
 
-    The garbage collector is switched off (the loop makes no cycles), the timer slack set to its least, SCHED_FIFO
-    asked for. Returns one line for each thing that this machine refused.
+    The garbage collector is switched off (the loop makes no cycles), the timer slack set to its least, memory locked,
+    the process bound to `cpus`, SCHED_FIFO asked for.
+
+    Returns:
+        One line for each thing that this machine refused; nothing is asked for with `realtime = "off"`.
+
+    Raises:
+        RealtimeError: Something was refused, and `realtime` is strict.
     """
-    refused = []
+    if settings.realtime == "off":
+        return []
     gc.collect()
     gc.freeze()
     gc.disable()
-    if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0):
+    refused = []
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0):
         refused.append("timer slack stays at the system's default")
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+        refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
     try:
         # Every thread: what carries the frames must not wait for other work any more than the loop itself.
         for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(10))
+            if settings.cpus:
+                os.sched_setaffinity(int(thread), settings.cpus)
     except OSError as error:
-        refused.append(f"SCHED_FIFO: {error.strerror}")
+        refused.append(f"affinity to CPUs {settings.cpus}: {error.strerror}")
+    try:
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(settings.priority))
+    except OSError as error:
+        refused.append(f"SCHED_FIFO {settings.priority}: {error.strerror} (raise LimitRTPRIO)")
+    if refused and settings.realtime == "strict":
+        raise RealtimeError(f"loop.realtime is strict, but this machine refuses: {'; '.join(refused)}")
     return refused

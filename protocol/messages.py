@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
-from protocol.clock import Histogram
+from protocol.clock import Histogram, LoopTiming
 from protocol.frames import WireSpec
 from protocol.topics import TOPICS
 
@@ -88,7 +88,19 @@ class Percentiles(Message):
     count: int
     p50: float
     p99: float
+    p999: float = Field(description="99.9th percentile")
     max: float
+
+
+class Timing(Message):
+    """How well a loop keeps time, since its start-up and over the last ten seconds."""
+
+    wake: Percentiles | None = Field(description="from when a tick was due to when it began [µs]")
+    busy: Percentiles | None = Field(description="from when it began to when it was over [µs]")
+    period: Percentiles | None = Field(description="from one beginning to the next [µs]")
+    recent_wake: Percentiles | None = Field(description="`wake`, last 10 s")
+    recent_busy: Percentiles | None = Field(description="`busy`, last 10 s")
+    recent_period: Percentiles | None = Field(description="`period`, last 10 s")
 
 
 def summary(durations: Histogram) -> Percentiles | None:
@@ -99,7 +111,21 @@ def summary(durations: Histogram) -> Percentiles | None:
         count=durations.count,
         p50=round(durations.percentile(50), 1),
         p99=round(durations.percentile(99), 1),
+        p999=round(durations.percentile(99.9), 1),
         max=round(durations.max_us, 1),
+    )
+
+
+def report(timing: LoopTiming) -> Timing:
+    """End a one-second window of a loop's timing and say how it stands."""
+    timing.turn()
+    return Timing(
+        wake=summary(timing.wake.total),
+        busy=summary(timing.busy.total),
+        period=summary(timing.period.total),
+        recent_wake=summary(timing.wake.recent()),
+        recent_busy=summary(timing.busy.recent()),
+        recent_period=summary(timing.period.recent()),
     )
 
 
@@ -121,6 +147,7 @@ class Status(Message):
     latency_us: Percentiles | None = Field(
         default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
     )
+    timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
 
 

@@ -390,6 +390,7 @@ def _with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) ->
 
 def _guard(run: Callable[[], T]) -> T:
     """Run, and turn what can go wrong into one line and an exit code."""
+    from protocol.clock import RealtimeError
     from protocol.network import NetworkError
     from service.bench import BenchError
     from service.calibrate import CalibrationError
@@ -402,6 +403,7 @@ def _guard(run: Callable[[], T]) -> T:
         return run()
     except (
         NetworkError,
+        RealtimeError,
         OperatorError,
         BenchError,
         CalibrationError,

@@ -19,10 +19,10 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from protocol import topics
-from protocol.clock import LoopSettings, prepare_process
+from protocol.clock import LoopSettings, LoopTiming, prepare_process
 from protocol.frames import WireSpec, unwrap
 from protocol.links import Arrival, ZenohLink
-from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry
+from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry, report
 from protocol.role import Role
 from service.controller import Controller
 from service.law import LawSettings
@@ -106,6 +106,7 @@ class Daemon:
         self._told = self._lost = ""
         self._sent = self._received = self._skipped = self._refused = self._saturated = 0
         self._notes: list[str] = []
+        self._timing: LoopTiming | None = None
         self._status_due = 0
         self._status_ticks = 0
         self._status_time = time.monotonic()
@@ -113,7 +114,8 @@ class Daemon:
     def run(self) -> None:
         """Run until the role is told to stop or `duration_s` of the law's time are over."""
         if not self._loop.lockstep:
-            self._notes = prepare_process()
+            self._notes = prepare_process(self._loop)
+            self._timing = LoopTiming()
         self._role.watch_tokens(self._token)
         self._role.announce()
         self._role.event("started", f"{self._role.name} looks for {self._role.vehicle}")
@@ -154,6 +156,8 @@ class Daemon:
                 if time.monotonic() - heard > self._patience_s:
                     return self._lose(f"no measurement for {(time.monotonic() - heard) * 1e3:.0f} ms")
                 continue
+            if self._timing:
+                self._timing.woke(arrival.at_ns)
             heard = time.monotonic()
             elapsed_ns = None if self._loop.lockstep or k < 0 else arrival.published_ns - published_ns
             measured = self._tick_of(arrival, k, elapsed_ns)
@@ -162,6 +166,8 @@ class Daemon:
                 link.send(command)
             self._account(command, measured, measured - k - 1)
             k, published_ns = measured, arrival.published_ns
+            if self._timing:
+                self._timing.done()
         return not stop.is_set()
 
     def _tick_of(self, arrival: Arrival, last: int, elapsed_ns: int | None) -> int:
@@ -235,6 +241,8 @@ class Daemon:
         return None
 
     def _lose(self, reason: str) -> bool:
+        if self._timing:
+            self._timing.pause()
         self._state, self._lost = DaemonState.SEARCHING, reason
         self._role.event("lost", f"{reason}: stopped commanding, looking for {self._role.vehicle}", self._session)
         return False
@@ -295,6 +303,7 @@ class Daemon:
                 sent=self._sent,
                 refused=self._refused + self._controller.refused,
                 saturated=self._saturated + self._controller.saturated,
+                timing=report(self._timing) if self._timing else None,
                 notes=self._notes,
             )
         )

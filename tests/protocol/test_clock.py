@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
+import os
 import subprocess
 import sys
 from itertools import pairwise
@@ -15,7 +18,15 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from protocol import clock
-from protocol.clock import Histogram, LoopSettings, TickGrid
+from protocol.clock import (
+    Histogram,
+    LoopSettings,
+    LoopTiming,
+    RealtimeError,
+    RollingHistogram,
+    TickGrid,
+    prepare_process,
+)
 
 START = 123_456_789_012_345
 PERIOD = 2_000_000
@@ -209,17 +220,21 @@ def test_a_histogram_is_of_fixed_size_however_long_it_runs() -> None:
     def size() -> int:
         return sum(len(kept) if isinstance(kept, (list, dict)) else 1 for kept in vars(histogram).values())
 
+    def fill() -> None:
+        for i in range(20_000):
+            histogram.add(1 << (i % 70))
+
+    fill()
     before = size()
-    for i in range(20_000):
-        histogram.add(1 << (i % 70))
-    assert histogram.count == 20_000
+    fill()
+    assert histogram.count == 40_000
     assert size() == before
 
 
 PREPARED = """
 import ctypes, gc, json, os
-from protocol.clock import prepare_process
-refused = prepare_process()
+from protocol.clock import LoopSettings, prepare_process
+refused = prepare_process(LoopSettings())
 slack = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK [ns]
 print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, os.sched_getscheduler(0) == os.SCHED_FIFO]))
 """
@@ -234,4 +249,58 @@ def test_a_prepared_process_is_as_it_says() -> None:
     told = "\n".join(refused)
     assert ("timer slack" in told) == (slack > 1)  # a real-time process may be shown 0
     assert ("SCHED_FIFO" in told) == (not realtime)
-    assert len(refused) == (slack > 1) + (not realtime)
+    assert len(refused) == (slack > 1) + (not realtime) + ("memory lock" in told)
+
+
+def test_a_rolling_histogram_keeps_all_and_forgets_what_is_ten_windows_old() -> None:
+    histogram = RollingHistogram()
+    histogram.add(500_000)
+    for _ in range(RollingHistogram.WINDOWS):
+        histogram.turn()
+        histogram.add(10_000)
+    histogram.turn()
+    assert (histogram.total.count, histogram.total.max_us) == (11, 500.0)
+    assert (histogram.recent().count, histogram.recent().max_us) == (9, 10.0)
+
+
+def test_loop_timing_measures_from_when_a_tick_was_due_and_leaves_the_start_out(fake: FakeTime) -> None:
+    timing = LoopTiming(warm_up_ns=10 * PERIOD)
+    for k in range(20):
+        fake.now = START + k * PERIOD + 30_000
+        timing.woke(START + k * PERIOD)
+        fake.now += 100_000
+        timing.done()
+    fake.now = START + 10**10
+    timing.turn()
+    # The warm-up ends at 10 periods; ticks 10…19 began after it, and between ten beginnings lie nine periods.
+    assert [h.total.count for h in (timing.wake, timing.busy, timing.period)] == [10, 10, 9]
+    assert [h.total.max_us for h in (timing.wake, timing.busy, timing.period)] == [30.0, 100.0, PERIOD / 1000]
+
+
+def test_a_pause_is_no_period(fake: FakeTime) -> None:
+    timing = LoopTiming(warm_up_ns=0)
+    timing.woke(START)
+    timing.pause()
+    fake.now = START + 1000 * PERIOD
+    timing.woke(START + 1000 * PERIOD)
+    timing.turn()
+    assert timing.period.total.count == 0
+
+
+def test_strict_names_what_is_refused_and_off_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    class Libc:
+        prctl = staticmethod(lambda *_: 0)
+        mlockall = staticmethod(lambda *_: -1)
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(gc, "disable", lambda: None)
+    monkeypatch.setattr(gc, "freeze", lambda: None)
+    assert prepare_process(LoopSettings(realtime="off")) == []
+    refused = prepare_process(LoopSettings(realtime="try"))
+    assert [line.split(":")[0] for line in refused] == ["memory lock", "SCHED_FIFO 10"]
+    with pytest.raises(RealtimeError, match="SCHED_FIFO"):
+        prepare_process(LoopSettings(realtime="strict"))

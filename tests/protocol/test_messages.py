@@ -24,11 +24,12 @@ from protocol.messages import (
     Release,
     Status,
     Telemetry,
+    Timing,
     Truth,
     summary,
 )
 
-LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, max=812.0)
+LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
 
 MESSAGES: list[Message] = [
     Claim(controller="c1", session="5f0c", period_ns=2_000_000, lockstep=False, wire=WireSpec()),
@@ -79,6 +80,7 @@ MESSAGES: list[Message] = [
         sign=-1,
     ),
     Truth(tick=0, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0, -0.5, 0.1), voltages=(0.0, 24.0, 3.0)),
+    Timing(wake=LATENCY, busy=LATENCY, period=LATENCY, recent_wake=LATENCY, recent_busy=None, recent_period=None),
     Event(role="plant", kind="tripped", text="no fresh command for 100 ms", session="5f0c"),
     Event(role="recorder", kind="started", text="η and ω, ≥ 0"),
 ]
