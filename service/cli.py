@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from protocol.role import Role
     from service.calibrate import Calibration
     from service.config import Settings
+    from service.doctor import Diagnosis
     from service.figures import Figures
     from service.operate import Statuses
     from service.tables import Tables
@@ -40,10 +41,12 @@ app = typer.Typer(
 lab = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
 log_group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
 op = typer.Typer(no_args_is_help=True, help="An operator's verbs, over the network.")
+host = typer.Typer(no_args_is_help=True, help="This machine.")
 show = typer.Typer(no_args_is_help=True, help="What would be used.")
 app.add_typer(lab, name="lab")
 app.add_typer(log_group, name="log")
 app.add_typer(op, name="op")
+app.add_typer(host, name="host")
 app.add_typer(show, name="show")
 
 _state = {"debug": False}
@@ -341,6 +344,29 @@ def stop(config: Config = None, overrides: Overrides = None) -> None:
 
     _guard(run)
     typer.echo(f"{settings.vehicle} is stopped at 0 V; `aeroloop op arm` lets it be driven again")
+
+
+@host.command()
+def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Say whether this machine will hold the configured rate, and what to change if not."""
+    settings = _settings(config, overrides)
+
+    def run() -> Diagnosis:
+        from service.display import progress_bar
+        from service.doctor import TRIAL_S, diagnose
+
+        with progress_bar("trial", TRIAL_S, hidden=json) as update:
+            return diagnose(settings.loop, update)
+
+    diagnosis = _guard(run)
+    if json:
+        typer.echo(diagnosis.model_dump_json(indent=2))
+    else:
+        from service.display import diagnosis_table
+
+        diagnosis_table(diagnosis)
+    if not diagnosis.holds:
+        raise typer.Exit(1)
 
 
 @show.command("config")

@@ -27,6 +27,7 @@ from service.figures import Figures
 if TYPE_CHECKING:
     from service.calibrate import Calibration
     from service.demo import Progress as DemoProgress
+    from service.doctor import Diagnosis
     from service.operate import Statuses
     from service.tables import Tables
 
@@ -169,6 +170,17 @@ def calibration_table(fit: Calibration) -> None:
     for name, residual in fit.residuals.items():
         Console().print(f"residual {name}: {residual:+.2%}")
     Console().print(f"{fit.runs} experiments")
+
+
+def diagnosis_table(diagnosis: Diagnosis) -> None:
+    """Print what was found on this machine."""
+    table = Table("", "looked at", "found", "to change", box=None)
+    for finding in diagnosis.findings:
+        table.add_row("✓" if finding.good else "✗", finding.what, finding.found, "" if finding.good else finding.advice)
+    Console().print(table)
+    Console().print(
+        f"this machine {'holds' if diagnosis.holds else 'does not hold'} {diagnosis.rate_hz:g} Hz", style="bold"
+    )
 
 
 def status_table(found: Statuses) -> None:
