@@ -319,6 +319,26 @@ def status(json: Json = False, config: Config = None, overrides: Overrides = Non
 
 
 @op.command()
+def top(config: Config = None, overrides: Overrides = None) -> None:
+    """Show every vehicle and role on the network, live, until ^C."""
+    settings = _settings(config, overrides)
+
+    def run() -> None:
+        import threading
+
+        from service.display import live_screen
+        from service.top import watch
+
+        stop = threading.Event()
+        signal.signal(signal.SIGINT, lambda *_: stop.set())
+        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+        with live_screen() as show:
+            watch(settings.network, show, stop)
+
+    _guard(run)
+
+
+@op.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
     """Arm the plant, so that the next controller to claim it may drive it."""
     settings = _settings(config, overrides)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from math import degrees
 from typing import TYPE_CHECKING
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress import (
     BarColumn,
@@ -170,6 +170,13 @@ def calibration_table(fit: Calibration) -> None:
     for name, residual in fit.residuals.items():
         Console().print(f"residual {name}: {residual:+.2%}")
     Console().print(f"{fit.runs} experiments")
+
+
+@contextmanager
+def live_screen() -> Iterator[Callable[[RenderableType], None]]:
+    """The whole terminal, redrawn with whatever it is given."""
+    with Live(console=Console(), auto_refresh=False, screen=Console().is_terminal) as live:
+        yield lambda drawing: live.update(drawing, refresh=True)
 
 
 def diagnosis_table(diagnosis: Diagnosis) -> None:

@@ -1,0 +1,73 @@
+"""The live view shows what roles tell of themselves, and survives what it does not understand."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from protocol.messages import Contract, Event, Message, Status, Telemetry, Truth
+from service.config import load
+from service.top import SILENT_S, Top
+
+
+def text(top: Top) -> str:
+    """What a wide terminal would show."""
+    console = Console(width=200, record=True, quiet=True)
+    console.print(top.draw())
+    return console.export_text()
+
+
+def status(role: str, state: str) -> Status:
+    return Status(role=role, state=state, uptime_s=1.0, ticks=10, rate_hz=500.0, skipped=7)
+
+
+def heard(**messages: Message) -> Top:
+    top = Top()
+    for key, message in messages.items():
+        top.hear(f"aeroloop/aero/{key.replace('__', '/')}", message.encode())
+    return top
+
+
+def test_an_empty_network_is_told_as_such() -> None:
+    assert "nobody" in text(Top())
+
+
+def test_every_role_of_every_vehicle_is_shown_with_its_state() -> None:
+    top = heard(status__plant=status("plant", "driven"), status__controller=status("controller", "running"))
+    top.hear("aeroloop/other/status/plant", status("plant", "tripped").encode())
+    shown = text(top)
+    for word in ("aero", "other", "driven", "running", "tripped", "500/s", "7"):
+        assert word in shown
+
+
+def test_attitude_error_volts_and_bits_are_shown() -> None:
+    telemetry = Telemetry(
+        session="s", tick=1, counter=1, attitude_error=(0.0, 0.0, 0.008726535), rate_error=(0.0, 0.0, 0.0),
+        desired=(1.0, 0.0, 0.0, 0.0), damping_estimate=(0.0, 0.0, 0.0), voltages=(12.5, -3.0), sign=1,
+    )  # fmt: skip
+    half = 2**-0.5
+    shown = text(
+        heard(
+            status__controller=status("controller", "running"),
+            contract__plant=Contract(role="plant", vehicle="aero", host="h", versions={}, config=load().contract()),
+            telemetry=telemetry,
+            truth=Truth(tick=1, attitude=(half, 0.0, 0.0, half), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0)),
+            event=Event(role="plant", kind="tripped", text="no fresh command for 100 ms: 0 V"),
+        )
+    )
+    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "28.0 + 8.0 kbit/s", "no fresh command for 100 ms"):
+        assert words in shown
+
+
+def test_a_role_that_fell_silent_is_shown_so() -> None:
+    top = heard(status__plant=status("plant", "driven"))
+    vehicle = top._vehicles["aero"]
+    at, last = vehicle.statuses["plant"]
+    vehicle.statuses["plant"] = at - SILENT_S - 1, last
+    assert "silent" in text(top)
+
+
+def test_what_is_not_understood_is_left_out() -> None:
+    top = heard(status__plant=status("plant", "driven"))
+    for key in ("aeroloop/aero/status/plant", "aeroloop/aero/telemetry", "aeroloop/aero/contract/plant", "elsewhere"):
+        top.hear(key, b'{"not": "a message"}')
+    assert "driven" in text(top)
