@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from plant_emulator.mechanism import Mechanism
+from plant_emulator.mechanism import Inertia, Mechanism
 from protocol.attitude import R, S, from_euler
 
 
@@ -28,11 +28,11 @@ class AeroSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    inertia: tuple[float, float, float] = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
+    inertia: Inertia = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
     centre_of_mass: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, -0.003955),
+        default=(0.0, 0.0, -0.003951),
         description="r_g, pivot to centre of mass, body frame [m]; height by `lab calibrate`, Table C.1: -0.0038",
     )
     thrust: tuple[tuple[float, float], tuple[float, float]] = Field(

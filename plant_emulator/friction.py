@@ -19,7 +19,7 @@ class FrictionSettings(BaseModel):
         default=(0.0071, 0.0220), max_length=3, description="viscous friction about the axes [N·m·s/rad]; lab material"
     )
     coulomb: tuple[float, ...] = Field(
-        default=(0.0009, 0.003056),
+        default=(0.0009, 0.003040),
         max_length=3,
         description="Coulomb friction about the axes [N·m]; pitch measured (spin-down), yaw fitted by `lab calibrate`",
     )

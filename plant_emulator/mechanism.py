@@ -7,8 +7,20 @@ a torque about each axis; friction and wind are loads, and so need to know nothi
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Annotated
 
 import casadi as ca
+from pydantic import AfterValidator
+
+
+def _positive(values: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not all(0 < value < float("inf") for value in values):
+        raise ValueError("every moment of inertia must be positive and finite")
+    return values
+
+
+Inertia = Annotated[tuple[float, float, float], AfterValidator(_positive)]
+"""The diagonal of J [kg·m²]."""
 
 
 class Mechanism(ABC):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from math import hypot
+
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from plant_emulator.mechanism import Mechanism
+from plant_emulator.mechanism import Inertia, Mechanism
 from protocol.attitude import R, S, T
 
 Triple = tuple[float, float, float]
@@ -17,7 +19,7 @@ class RigidBodySettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    inertia: Triple = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
+    inertia: Inertia = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
     centre_of_mass: Triple = Field(default=(0.0, 0.0, 0.0), description="r_g, origin to centre of mass, body frame [m]")
@@ -27,6 +29,15 @@ class RigidBodySettings(BaseModel):
     damping: Triple = Field(default=(0.01, 0.01, 0.01), description="θ about the body axes [N·m·s/rad]")
     attitude: tuple[float, float, float, float] = Field(default=(1.0, 0.0, 0.0, 0.0), description="q at the start [1]")
     rate: Triple = Field(default=(0.0, 0.0, 0.0), description="ω at the start, body frame [rad/s]")
+
+    @field_validator("attitude")
+    @classmethod
+    def _attitude_has_a_direction(
+        cls, attitude: tuple[float, float, float, float]
+    ) -> tuple[float, float, float, float]:
+        if not 0 < hypot(*attitude) < float("inf"):
+            raise ValueError("a quaternion of any finite length but zero")
+        return attitude
 
 
 class RigidBody(Mechanism):

@@ -7,7 +7,7 @@ drag helps to brake a rotor less than the motor helps to drive it. Near zero a r
 from __future__ import annotations
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class RotorSettings(BaseModel):
@@ -29,6 +29,12 @@ class RotorSettings(BaseModel):
         "quantization gives z_track 59e-4 and u_total 12087, where the paper has 35e-4 and 7980",
     )
 
+    @model_validator(mode="after")
+    def _both_lags_or_none(self) -> RotorSettings:
+        if (self.lag_up_s > 0) != (self.lag_down_s > 0):
+            raise ValueError("lag_up_s and lag_down_s are both positive, or both 0 to leave the rotors out")
+        return self
+
     @property
     def present(self) -> bool:
         """Whether there is any lag."""
@@ -37,7 +43,7 @@ class RotorSettings(BaseModel):
 
 def rotor_derivative(settings: RotorSettings, state: ca.SX, command: ca.SX) -> ca.SX:
     """V̇ of the voltages that make thrust [V/s], from those voltages and the commanded ones [V]. Shape as given."""
-    rising = ca.fabs(command) > ca.fabs(state)
+    rising = (command - state) * state >= 0  # away from zero; a rotor that reverses falls first, then rises
     return (command - state) / ca.if_else(rising, settings.lag_up_s, settings.lag_down_s)
 
 

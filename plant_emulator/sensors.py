@@ -7,7 +7,7 @@ velocity is the filtered derivative of the encoders' angles, or comes from a gyr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, exp, floor, pi, sin, sqrt
+from math import cos, exp, floor, isfinite, nan, pi, sin, sqrt
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from plant_emulator.plant import Measurement
 from protocol.attitude import Quaternion, Vector
+
+NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))
+"""What sensors say of a state that has left the numbers."""
 
 _BLOCK = 4096  # random numbers are drawn this many samples at a time
 
@@ -87,6 +90,8 @@ class Sensors:
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """What the sensors say of a true attitude q [1], rate ω [rad/s] and joint angles [rad]; once a period."""
         settings = self._settings
+        if not isfinite(sum(attitude) + sum(rate) + sum(angles)):
+            return NO_MEASUREMENT
         if settings.attitude == "perfect" and settings.rate == "perfect":
             return Measurement(attitude, rate)
         seen = [

@@ -23,7 +23,9 @@ class PlantSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    kind: Literal["aero", "rigid_body"] = Field(default="aero", description="which body is emulated")
+    kind: Literal["aero", "rigid_body"] = Field(
+        default="aero", description="the body; rotor, friction, wind and sensors act on either"
+    )
     ideal: bool = Field(
         default=False,
         description="the paper's equations and nothing else: Table C.1, damping θ = [0, 0.0071, 0.0220] about the body "

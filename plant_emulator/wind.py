@@ -2,7 +2,7 @@
 
 The gust is an Ornstein–Uhlenbeck process, the simplest noise with a memory (Dryden's longitudinal gust is the same
 filter): it forgets with time constant `gust_time_s` and keeps a standard deviation of `gust` times the steady torque.
-It is seeded, and stepped exactly, so that a run repeats whatever the period.
+It is seeded, so that a run repeats, and stepped exactly, so that gusts are of one kind whatever the period.
 """
 
 from __future__ import annotations
@@ -22,12 +22,15 @@ class WindSettings(BaseModel):
 
     blowing: bool = Field(default=False, description="whether the fan is on")
     torque: tuple[float, ...] = Field(
-        default=(-0.000841, 0.009963),
+        default=(-0.000220, 0.009858),
         max_length=3,
         description="steady torque about the axes [N·m], missing ones 0; fitted by `lab calibrate`",
     )
     gust: float = Field(
-        default=0.0, ge=0, le=10, description="standard deviation of gusts, as a part of the steady torque"
+        default=0.2,
+        ge=0,
+        le=10,
+        description="standard deviation of gusts, all axes together, as a part of the steady torque; assumed",
     )
     gust_time_s: float = Field(default=1.0, gt=0, le=1000, description="how long a gust is remembered [s]")
     seed: int = Field(default=0, ge=0, description="of the gusts' random numbers")

@@ -7,7 +7,7 @@ is random is seeded, so no test is lucky: its tolerance is five standard deviati
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import asinh, atan2, cos, exp, hypot, pi, sin, sinh, sqrt
+from math import asinh, atan2, cos, exp, hypot, inf, pi, sin, sinh, sqrt
 
 import casadi as ca
 import numpy as np
@@ -217,7 +217,7 @@ FAN = (-0.003, 0.004)
 
 def _blown(n: int, axes: int = 2, period: float = 0.1, **changed: object) -> Array:
     """n samples of wind. Shape (n, axes)."""
-    settings = WindSettings.model_validate({"blowing": True, "torque": FAN} | changed)
+    settings = WindSettings.model_validate({"blowing": True, "torque": FAN, "gust": 0.0} | changed)
     wind = Wind(settings, axes, period)
     return np.array([wind.sample() for _ in range(n)])
 
@@ -278,17 +278,17 @@ def test_gusts_are_there_from_the_first_sample() -> None:
 
 
 def test_a_gust_goes_on_from_where_it_was() -> None:
-    """What is new in a sample, x − ρ x₋₁, is normal with the deviation σ √(1 − ρ²), and never the gust starting anew."""
+    """What is new in a sample, x − ρ x₋₁, is normal with the deviation σ √(1 − ρ²), never the gust starting anew."""
     x = (_blown(20_000, gust=1.0, period=PERIOD, gust_time_s=1.0) - FAN) / (hypot(*FAN) / sqrt(2))
     rho = exp(-PERIOD)
     new = (x[1:] - rho * x[:-1]) / sqrt(1 - rho * rho)
-    assert np.abs(new).max() < 6  # of 40 000 normal numbers one in 10⁴ times has one beyond; a new start is some 16
+    assert np.abs(new).max() < 6  # of 40 000 normal numbers one in 10⁴ times has one beyond; a new start is some 22
 
 
 def test_wind_is_a_torque_about_the_axes() -> None:
     plant = _with(
         aero=WEIGHTLESS.model_copy(update={"inertia": (0.02, 0.03, 0.05)}),
-        wind=WindSettings(blowing=True, torque=(0.0, 0.01)),
+        wind=WindSettings(blowing=True, torque=(0.0, 0.01), gust=0.0),
     ).build(PERIOD)
     for _ in range(100):
         plant.advance()
@@ -642,3 +642,31 @@ def test_the_ideal_free_body_keeps_its_own_body() -> None:
             plant.advance()
     assert ideal.truth() == bare.truth()
     assert ideal.measure() == (ideal.truth().attitude, ideal.truth().rate)
+
+
+def test_a_rotor_that_reverses_falls_with_the_down_lag_before_it_rises_with_the_up_lag() -> None:
+    rotor = RotorSettings(lag_up_s=0.1, lag_down_s=0.4)
+    falling = float(rotor_derivative(rotor, ca.SX(5.0), ca.SX(-10.0)))
+    rising = float(rotor_derivative(rotor, ca.SX(-1.0), ca.SX(-10.0)))
+    from_rest = float(rotor_derivative(rotor, ca.SX(0.0), ca.SX(-10.0)))
+    assert [falling, rising, from_rest] == pytest.approx([-15 / 0.4, -9 / 0.1, -10 / 0.1], rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({"rotor": {"lag_up_s": 0.0}}, "lag_up_s and lag_down_s"),
+        ({"aero": {"inertia": [0.02, 0.0, 0.02]}}, "inertia"),
+        ({"rigid_body": {"inertia": [0.02, -0.02, 0.02]}}, "inertia"),
+        ({"rigid_body": {"attitude": [0.0, 0.0, 0.0, 0.0]}}, "quaternion"),
+    ],
+)
+def test_a_body_that_cannot_be_is_refused(settings: dict[str, object], names: str) -> None:
+    with pytest.raises(ValidationError, match=names):
+        PlantSettings.model_validate(settings)
+
+
+def test_sensors_of_a_state_that_has_left_the_numbers_have_no_valid_value() -> None:
+    sensors = Sensors(SensorSettings(), PERIOD)
+    attitude, rate = sensors.read((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, inf), (0.0, inf))
+    assert all(value != value for value in (*attitude, *rate))

@@ -111,7 +111,9 @@ def test_wind_and_friction_act_on_the_body_as_voltages_and_damping_would() -> No
     free = calm.model_copy(update={"damping": (0.0, 0.0, 0.0)})
     driven = _plant(calm)
     blown = _plant(
-        free, wind=WindSettings(blowing=True, torque=torque), friction=FrictionSettings(viscous=theta, coulomb=())
+        free,
+        wind=WindSettings(blowing=True, torque=torque, gust=0.0),
+        friction=FrictionSettings(viscous=theta, coulomb=()),
     )
     driven.actuate([t / 0.01 for t in torque])
     for _ in range(200):

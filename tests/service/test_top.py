@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from io import StringIO
+
 from rich.console import Console
 
 from protocol.messages import Contract, Event, Message, Status, Telemetry, Truth
@@ -11,9 +13,10 @@ from service.top import SILENT_S, Top
 
 def text(top: Top) -> str:
     """What a wide terminal would show."""
-    console = Console(width=200, record=True, quiet=True)
+    page = StringIO()
+    console = Console(width=200, file=page)
     console.print(top.draw())
-    return console.export_text()
+    return page.getvalue()
 
 
 def status(role: str, state: str) -> Status:
