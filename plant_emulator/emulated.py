@@ -82,7 +82,9 @@ class EmulatedPlant(Plant):
         self._wind, self._sensors, self._limit = wind, sensors, voltage_limit
         self._step = Compiled(step_function(mechanism, rotor, friction, period, substeps))
         self._x, self._u, self._load = (self._step.inputs[name] for name in ("x", "u", "wind"))
-        self._after = self._step.outputs["after"]
+        self._after, self._q, self._omega, self._angles = (
+            self._step.outputs[name] for name in ("after", "attitude", "rate", "angles")
+        )
         for i, value in enumerate(mechanism.initial):
             self._x[i] = value
         start = ca.SX(mechanism.initial)
@@ -100,14 +102,15 @@ class EmulatedPlant(Plant):
 
     def advance(self) -> None:
         """Integrate one period and let the sensors look."""
-        for i, torque in enumerate(self._wind.sample()):
-            self._load[i] = torque
+        if not self._wind.calm:
+            for i, torque in enumerate(self._wind.sample()):
+                self._load[i] = torque
         self._step()
         self._x[:] = self._after
-        outputs = self._step.outputs
-        self._attitude = tuple(outputs["attitude"])  # type: ignore[assignment]  # four elements
-        self._rate = tuple(outputs["rate"])  # type: ignore[assignment]  # three elements
-        self._measurement = self._sensors.read(self._attitude, self._rate, outputs["angles"].tolist())
+        w, x, y, z = self._q
+        a, b, c = self._omega
+        self._attitude, self._rate = (w, x, y, z), (a, b, c)
+        self._measurement = self._sensors.read(self._attitude, self._rate, self._angles)
 
     def measure(self) -> Measurement:
         """What the sensors said at the end of the last period."""

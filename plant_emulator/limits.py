@@ -7,7 +7,7 @@ nothing but its own sensors and keeps no clock: durations are counted in ticks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import acos, degrees, hypot, isfinite
+from math import acos, cos, degrees, hypot, isfinite, radians
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -44,6 +44,7 @@ class Guard:
         self._settings = settings
         self._period_ns = period_ns
         self._full = voltage_limit
+        self._least_upright = cos(radians(settings.max_tilt_deg))
         self._saturated = self._invalid = 0
 
     def reset(self) -> None:
@@ -58,19 +59,23 @@ class Guard:
             voltages: What is commanded [V]. Shape (actuators,).
         """
         limits = self._settings
-        (_, x, y, _), rate = seen
-        if not isfinite(sum(seen.attitude) + sum(rate)):
+        (w, x, y, z), (wx, wy, wz) = seen
+        if not isfinite(w + x + y + z + wx + wy + wz):
             self._invalid += 1
             if self._seconds(self._invalid) > limits.max_invalid_s:
                 return f"the sensors have had no valid value for {self._seconds(self._invalid) * 1e3:.0f} ms"
             return None
         self._invalid = 0
-        tilt = degrees(acos(max(-1.0, min(1.0, 1 - 2 * (x * x + y * y)))))
-        if tilt > limits.max_tilt_deg:
+        upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
+        if upright < self._least_upright:
+            tilt = degrees(acos(max(-1.0, upright)))
             return f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
-        if (speed := hypot(*rate)) > limits.max_rate:
+        if (speed := hypot(wx, wy, wz)) > limits.max_rate:
             return f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
-        self._saturated = self._saturated + 1 if max(map(abs, voltages)) >= self._full else 0
+        if max(voltages) < self._full and min(voltages) > -self._full:
+            self._saturated = 0
+            return None
+        self._saturated += 1
         if self._seconds(self._saturated) > limits.max_saturated_s:
             return f"a motor has been at its voltage limit for {self._seconds(self._saturated):.1f} s"
         return None

@@ -26,7 +26,7 @@ class RotorSettings(BaseModel):
         ge=0,
         le=24,
         description="no thrust below this [V]; 2–3 V measured on an Aero, but off: with 2.5 V the calm cell without "
-        "quantization gives z_track 59e-4 and u_total 12087, where the paper has 35e-4 and 7980",
+        "quantization gives z_track 58e-4 and u_total 12071, where the paper has 35e-4 and 7980",
     )
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ velocity is the filtered derivative of the encoders' angles, or comes from a gyr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, exp, floor, isfinite, nan, pi, sin, sqrt
+from math import cos, exp, floor, nan, pi, sin, sqrt
 from typing import Literal
 
 import numpy as np
@@ -81,6 +81,8 @@ class Sensors:
 
     def __init__(self, settings: SensorSettings, period: float) -> None:
         self._settings = settings
+        self._attitude, self._rate = settings.attitude, settings.rate
+        self._encoders = settings.attitude == "encoders" or settings.rate == "derivative"
         self._steps = [2 * pi / counts for counts in settings.counts]
         self._filters = [FilteredDerivative(settings.bandwidth, settings.damping_ratio, period) for _ in self._steps]
         self._random = np.random.default_rng(settings.seed)
@@ -89,23 +91,22 @@ class Sensors:
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """What the sensors say of a true attitude q [1], rate ω [rad/s] and joint angles [rad]; once a period."""
-        settings = self._settings
-        if not isfinite(sum(attitude) + sum(rate) + sum(angles)):
+        try:
+            return Measurement(*self._read(attitude, rate, angles))
+        except (OverflowError, ValueError):  # an infinite or undefined angle has no count
             return NO_MEASUREMENT
-        if settings.attitude == "perfect" and settings.rate == "perfect":
-            return Measurement(attitude, rate)
-        seen = [
-            step * floor(angle / step + zero)
-            for angle, step, zero in zip(angles, self._steps, self._zeros, strict=False)  # no joints, no encoders
-        ]
-        if settings.attitude == "encoders":
-            attitude = _attitude_of(seen)
-        if settings.rate == "gyro":
-            rate = self._gyro(rate)
-        elif settings.rate == "derivative":
-            pitch_rate, yaw_rate = (f.update(angle) for f, angle in zip(self._filters, seen, strict=True))
-            rate = (-sin(seen[0]) * yaw_rate, pitch_rate, cos(seen[0]) * yaw_rate)
-        return Measurement(attitude, rate)
+
+    def _read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> tuple[Quaternion, Vector]:
+        if self._encoders:
+            (pitch_step, yaw_step), (pitch_zero, yaw_zero) = self._steps, self._zeros
+            pitch = pitch_step * floor(angles[0] / pitch_step + pitch_zero)
+            yaw = yaw_step * floor(angles[1] / yaw_step + yaw_zero)
+            if self._attitude == "encoders":
+                attitude = _attitude_of(pitch, yaw)
+            if self._rate == "derivative":
+                pitch_rate, yaw_rate = self._filters[0].update(pitch), self._filters[1].update(yaw)
+                return attitude, (-sin(pitch) * yaw_rate, pitch_rate, cos(pitch) * yaw_rate)
+        return attitude, self._gyro(rate) if self._rate == "gyro" else rate
 
     def _gyro(self, rate: Vector) -> Vector:
         if not self._noise:
@@ -115,8 +116,7 @@ class Sensors:
         return rate[0] + error[0], rate[1] + error[1], rate[2] + error[2]
 
 
-def _attitude_of(angles: Sequence[float]) -> Quaternion:
-    """q of a body that first yaws, then pitches by joint angles [pitch, yaw] in rad."""
-    pitch, yaw = angles[0] / 2, angles[1] / 2
-    cp, sp, cy, sy = cos(pitch), sin(pitch), cos(yaw), sin(yaw)
+def _attitude_of(pitch: float, yaw: float) -> Quaternion:
+    """q of a body that first yaws, then pitches by these joint angles [rad]."""
+    cp, sp, cy, sy = cos(pitch / 2), sin(pitch / 2), cos(yaw / 2), sin(yaw / 2)
     return cy * cp, -sy * sp, cy * sp, sy * cp

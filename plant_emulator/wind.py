@@ -39,6 +39,9 @@ class WindSettings(BaseModel):
 class Wind:
     """Torque about each axis, period by period.
 
+    Attributes:
+        calm: Whether there is never any.
+
     Args:
         settings: What blows.
         axes: Number of axes.
@@ -47,6 +50,7 @@ class Wind:
 
     def __init__(self, settings: WindSettings, axes: int, period: float) -> None:
         self._steady = np.array((*settings.torque, 0.0, 0.0, 0.0)[:axes]) * settings.blowing
+        self.calm = not self._steady.any()
         self._deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
         self._keep = exp(-period / settings.gust_time_s)
         self._kick = self._deviation * sqrt(1 - self._keep**2)

@@ -17,6 +17,8 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from protocol.errors import AeroloopError
+
 WATCHDOG_S: Final = 0.1
 """0 V after this long without a fresh command [s], unless configured; as drives in the field do."""
 
@@ -213,7 +215,7 @@ class LoopTiming:
             histogram.turn()
 
 
-class RealtimeError(Exception):
+class RealtimeError(AeroloopError):
     """`loop.realtime = "strict"`, and this machine refused something; one line that names it."""
 
 

@@ -14,12 +14,14 @@ from typing import Any, Final
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
+from protocol.errors import AeroloopError
+
 _PATIENCE_S: Final = 2.0
 HANDSHAKE_MS: Final = 2000
 """A program that holds a port and says nothing is given up after this [ms]."""
 
 
-class NetworkError(Exception):
+class NetworkError(AeroloopError):
     """The network cannot be joined; one line that says why and what to do."""
 
 

@@ -8,12 +8,14 @@ session, without which a Python process would not end.
 from __future__ import annotations
 
 import logging
+import os
 import platform
 import signal
 import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import version
 from types import FrameType, TracebackType
 from typing import Any, Final, Self
@@ -31,6 +33,15 @@ def versions() -> dict[str, str]:
     """Versions of what computes the figures in a log."""
     packages = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pydantic")
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def notify_systemd(state: str) -> None:
+    """Tell the service manager, if one asked to be told (sd_notify(3)); nobody listening is no error."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if not address:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager, suppress(OSError):
+        manager.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
 class Role:
@@ -72,10 +83,12 @@ class Role:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        notify_systemd("STOPPING=1")
         self.zenoh.close()
 
     def announce(self) -> None:
         """Show the liveliness token. Declarations keep their order on a link: who sees it knows ours before it too."""
+        notify_systemd("READY=1")
         self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
 
     def stop_on_signals(self) -> None:
@@ -127,5 +140,6 @@ class Role:
 
     def status(self, status: Status) -> None:
         """Tell how the role is doing, now and to whoever asks before the next time."""
+        notify_systemd("WATCHDOG=1")
         self._status = status.encode()
         self.publish("status", status)

@@ -22,6 +22,7 @@ from typing import Final, Literal, Self
 import zenoh
 
 from protocol import topics
+from protocol.errors import AeroloopError
 from protocol.network import join
 from service.config import ENV_PREFIX, Settings
 
@@ -32,7 +33,7 @@ START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
 
 
-class BenchError(Exception):
+class BenchError(AeroloopError):
     """A process did not start or ended early; one line with what it said last."""
 
 

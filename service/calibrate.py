@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from protocol.errors import AeroloopError
 from service import paper
 from service.cells import Cell, Pool
 from service.config import Settings
@@ -43,7 +44,7 @@ class Calibration(BaseModel):
     runs: int = Field(description="experiments that it took")
 
 
-class CalibrationError(Exception):
+class CalibrationError(AeroloopError):
     """Newton's method did not arrive; one line."""
 
 

@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn, TypeVar
 
 import typer
 from typer.exceptions import TyperException
@@ -65,6 +65,7 @@ BitsOut = Annotated[
 BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say only warnings and errors on stderr.")]
+LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="What lines on stderr look like.")]
 WithParent = Annotated[bool, typer.Option("--with-parent", hidden=True)]
 
 
@@ -144,6 +145,7 @@ def controller(
     config: Config = None,
     overrides: Overrides = None,
     quiet: Quiet = False,
+    log_format: LogFormat = "text",
     with_parent: WithParent = False,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
@@ -156,12 +158,16 @@ def controller(
 
         Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller).run()
 
-    _run_role("controller", settings, run, quiet=quiet, with_parent=with_parent)
+    _run_role("controller", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
 
 @app.command()
 def emulator(
-    config: Config = None, overrides: Overrides = None, quiet: Quiet = False, with_parent: WithParent = False
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = False,
 ) -> None:
     """Run the emulated plant until SIGTERM."""
     settings = _settings(config, overrides)
@@ -171,7 +177,7 @@ def emulator(
 
         Emulator(role, settings.loop, settings.wire, settings.plant).run()
 
-    _run_role("plant", settings, run, quiet=quiet, with_parent=with_parent)
+    _run_role("plant", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
 
 @app.command()
@@ -180,6 +186,7 @@ def recorder(
     config: Config = None,
     overrides: Overrides = None,
     quiet: Quiet = False,
+    log_format: LogFormat = "text",
     with_parent: WithParent = False,
 ) -> None:
     """Record everything on the network into an MCAP log until SIGTERM."""
@@ -192,7 +199,7 @@ def recorder(
 
         Recorder(role, settings.recorder).run()
 
-    _run_role("recorder", settings, run, quiet=quiet, with_parent=with_parent)
+    _run_role("recorder", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
 
 @lab.command()
@@ -208,10 +215,13 @@ def experiment(
     settings = _with_bits(_settings(config, overrides), bits_out, bits_in)
 
     def run() -> Figures:
-        from service.display import progress_bar
         from service.experiment import run_experiment
 
-        with progress_bar("experiment", duration, hidden=json) as update:
+        if json:
+            return run_experiment(settings, duration)
+        from service.display import progress_bar
+
+        with progress_bar("experiment", duration) as update:
             return run_experiment(settings, duration, update)
 
     _print_figures(_guard(run), json)
@@ -389,6 +399,30 @@ def doctor(json: Json = False, config: Config = None, overrides: Overrides = Non
         raise typer.Exit(1)
 
 
+@host.command()
+def units(
+    install: Annotated[
+        Path | None, typer.Option("--install", help="Write them into this folder instead.", show_default=False)
+    ] = None,
+) -> None:
+    """Print systemd units for the daemons, or install them."""
+    from shutil import which
+
+    from service.units import UNITS, unit
+    from service.units import install as install_units
+
+    executable = which("aeroloop") or str(Path(sys.argv[0]).absolute())
+    if install is None:
+        for name in UNITS:
+            typer.echo(f"# aeroloop-{name}.service\n{unit(name, executable)}")
+        return
+    try:
+        for path in install_units(install, executable):
+            typer.echo(path)
+    except OSError as error:
+        _fail(f"cannot write into {install}: {error.strerror}", 1)
+
+
 @show.command("config")
 def show_config(config: Config = None, overrides: Overrides = None) -> None:
     """Print the effective configuration as TOML."""
@@ -436,28 +470,11 @@ def _with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) ->
 
 def _guard(run: Callable[[], T]) -> T:
     """Run, and turn what can go wrong into one line and an exit code."""
-    from protocol.clock import RealtimeError
-    from protocol.network import NetworkError
-    from service.bench import BenchError
-    from service.calibrate import CalibrationError
-    from service.daemon import SessionLostError
-    from service.operate import OperatorError
-    from service.recorder import RecorderError
-    from service.review import ReviewError
+    from protocol.errors import AeroloopError
 
     try:
         return run()
-    except (
-        NetworkError,
-        RealtimeError,
-        OperatorError,
-        BenchError,
-        CalibrationError,
-        RecorderError,
-        ReviewError,
-        SessionLostError,
-        ValueError,
-    ) as error:
+    except (AeroloopError, ValueError) as error:
         if _state["debug"]:
             raise
         _fail(str(error).splitlines()[0], 1)
@@ -465,11 +482,13 @@ def _guard(run: Callable[[], T]) -> T:
         raise typer.Exit(130) from None
 
 
-def _run_role(kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, with_parent: bool) -> None:
+def _run_role(
+    kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, log_format: str, with_parent: bool
+) -> None:
     """Join the network as a role and run until a signal says stop."""
-    logging.basicConfig(
-        level=logging.WARNING if quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
-    )
+    from service.logs import set_up_logging
+
+    set_up_logging(logging.WARNING if quiet else logging.INFO, as_json=log_format == "json")
     if with_parent:
         import ctypes
 

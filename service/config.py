@@ -23,18 +23,18 @@ from pydantic_settings import (
 from plant_emulator.settings import PlantSettings
 from protocol import topics
 from protocol.clock import LoopSettings
+from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
 from protocol.network import NetworkSettings
 from protocol.quantizer import MAX_BITS, MIN_BITS
-from service.daemon import ControllerSettings
 from service.law import LawSettings
-from service.recorder import RecorderSettings
 from service.reference import SinusoidSettings
+from service.settings import ControllerSettings, RecorderSettings
 
 ENV_PREFIX = "AEROLOOP_"
 
 
-class ConfigError(Exception):
+class ConfigError(AeroloopError):
     """The configuration is wrong; one line that names the key and says what it takes."""
 
 

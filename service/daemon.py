@@ -16,10 +16,11 @@ from enum import StrEnum
 from typing import Final
 
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from protocol import topics
 from protocol.clock import LoopSettings, LoopTiming, prepare_process
+from protocol.errors import AeroloopError
 from protocol.frames import WireSpec, unwrap
 from protocol.links import Arrival, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry, report
@@ -27,6 +28,7 @@ from protocol.role import Role
 from service.controller import Controller
 from service.law import LawSettings
 from service.reference import SinusoidSettings, reference_function
+from service.settings import ControllerSettings
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -37,23 +39,7 @@ LOCKSTEP_PATIENCE_S: Final = 2.0
 """In lockstep the plant takes its time; only a plant that is gone is stale."""
 
 
-class ControllerSettings(BaseModel):
-    """How the controller daemon behaves."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    stale_s: float = Field(
-        default=0.1, gt=0, le=10, description="stop commanding after this long without a measurement [s]"
-    )
-    duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
-    auto_arm: bool = Field(
-        default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
-    )
-    telemetry_rate_hz: float = Field(default=50.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
-    require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
-
-
-class SessionLostError(Exception):
+class SessionLostError(AeroloopError):
     """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
 
 

@@ -12,6 +12,7 @@ from typing import Final
 import zenoh
 
 from protocol import topics
+from protocol.errors import AeroloopError
 from protocol.messages import Status
 from protocol.network import NetworkSettings, join
 
@@ -22,7 +23,7 @@ ANSWER_S: Final = 1.0
 Statuses = dict[str, dict[str, Status]]
 
 
-class OperatorError(Exception):
+class OperatorError(AeroloopError):
     """Nobody answered, or the answer was no; one line."""
 
 

@@ -19,12 +19,14 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import zenoh
 from mcap.writer import CompressionType, Writer
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel
 
 from protocol import messages, topics
+from protocol.errors import AeroloopError
 from protocol.links import published_ns
 from protocol.messages import Contract, Status
 from protocol.role import Role, versions
+from service.settings import RecorderSettings
 
 DRAIN_WAIT_S: Final = 0.02
 FRAME_ENCODING: Final = "x-aeroloop-frame"
@@ -34,17 +36,7 @@ CHUNK_BYTES: Final = 64 * 1024
 """A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
 
 
-class RecorderSettings(BaseModel):
-    """Where the log goes, and how much of it a crash may cost."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    directory: Path = Field(default=Path("logs"), description="folder for logs that are not given a name")
-    path: Path | None = Field(default=None, description="the log's file; a new one named by the time if left out")
-    chunk_s: float = Field(default=1.0, gt=0, le=60, description="the most that a crash of the recorder costs [s]")
-
-
-class RecorderError(Exception):
+class RecorderError(AeroloopError):
     """The log cannot be written; one line that says why and what to do."""
 
 

@@ -24,6 +24,7 @@ from zstandard import ZstdError
 
 from protocol import topics
 from protocol.attitude import Quaternion, Vector
+from protocol.errors import AeroloopError
 from protocol.frames import COUNTERS, unwrap
 from protocol.messages import Contract, Event, Percentiles, Status, Telemetry
 from service.config import ConfigError, Settings, from_contract
@@ -36,7 +37,7 @@ MAX_WAITING: Final = 4096
 """Measurements kept while no telemetry has yet said which tick they are."""
 
 
-class ReviewError(Exception):
+class ReviewError(AeroloopError):
     """A log cannot be judged; one line that says why."""
 
 

@@ -1,0 +1,7 @@
+"""What a user is told when something cannot be done: one line that says what is wrong and what to do."""
+
+from __future__ import annotations
+
+
+class AeroloopError(Exception):
+    """Base of every error that is meant for a person. Its text is one line."""

@@ -1,0 +1,33 @@
+"""What the controller daemon and the recorder can be told. Light to import: every command reads the configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class ControllerSettings(BaseModel):
+    """How the controller daemon behaves."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    stale_s: float = Field(
+        default=0.1, gt=0, le=10, description="stop commanding after this long without a measurement [s]"
+    )
+    duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
+    auto_arm: bool = Field(
+        default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
+    )
+    telemetry_rate_hz: float = Field(default=50.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
+    require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
+
+
+class RecorderSettings(BaseModel):
+    """Where the log goes, and how much of it a crash may cost."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    directory: Path = Field(default=Path("logs"), description="folder for logs that are not given a name")
+    path: Path | None = Field(default=None, description="the log's file; a new one named by the time if left out")
+    chunk_s: float = Field(default=1.0, gt=0, le=60, description="the most that a crash of the recorder costs [s]")
