@@ -50,6 +50,7 @@ class Emulator:
             lockstep=loop.lockstep,
             watchdog_s=settings.watchdog_s,
             guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
+            armed=settings.armed_at_start,
         )
         self._link: ZenohLink | None = None
         self._inbox: deque[Callable[[], None]] = deque()

@@ -11,7 +11,7 @@ the watchdog trips: the session ends, and the motors have 0 V until somebody arm
    │ arm                                             │ watchdog, holder gone, invalid command, limit, operator's stop
    └────────────────────────────────── tripped ◄─────┘
 
-An idle plant that nobody has armed yet, and a tripped one, refuse claims and say why. A claim may carry its own arming
+A tripped plant, and one that starts unarmed, refuse claims and say why. A claim may carry its own arming
 (`auto_arm`), which clears anything but an operator's stop.
 """
 
@@ -56,6 +56,7 @@ class Endpoint:
         lockstep: Whether each answer is waited for; a claim must say the same.
         watchdog_s: 0 V after this long without a fresh command [s].
         guard: What else makes it trip; None for nothing.
+        armed: Whether the first claim is granted without anybody arming it.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
@@ -78,6 +79,7 @@ class Endpoint:
         lockstep: bool = False,
         watchdog_s: float = WATCHDOG_S,
         guard: Guard | None = None,
+        armed: bool = False,
     ) -> None:
         if plant.actuators != wire.actuators:
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
@@ -98,7 +100,7 @@ class Endpoint:
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
         self._guard = guard
-        self._latch: str | None = "not armed since it was started"
+        self._latch: str | None = None if armed else "not armed since it was started"
         self._operator_stop = False
         self._watchdog = max(1, round(watchdog_s * 1e9 / period_ns))
         self._first_command = max(1, round(FIRST_COMMAND_S * 1e9 / period_ns))

@@ -31,6 +31,9 @@ class PlantSettings(BaseModel):
         description="the paper's equations and nothing else: Table C.1, damping θ = [0, 0.0071, 0.0220] about the body "
         "axes, no rotor lag, no friction, no wind, perfect sensors",
     )
+    armed_at_start: bool = Field(
+        default=True, description="whether the first claim is granted without `op arm`; after a trip it never is"
+    )
     watchdog_s: float = Field(
         default=WATCHDOG_S, gt=0, le=10, description="0 V after this long without a fresh command [s]"
     )
