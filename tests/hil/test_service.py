@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from service.bench import free_rendezvous
-from service.cli import run
+from service.cli import execute as run
 from service.units import UNITS
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import run
+from service.cli import execute as run
 from service.config import load
 
 

@@ -1,0 +1,70 @@
+"""`aeroloop host`: this machine."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.commands.common import (
+    Config,
+    Json,
+    Overrides,
+    fail,
+    guarded,
+    settings_of,
+)
+
+if TYPE_CHECKING:
+    from service.doctor import Diagnosis
+
+group = typer.Typer(no_args_is_help=True, help="This machine.")
+
+
+@group.command()
+def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Say whether this machine will hold the configured rate, and what to change if not."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Diagnosis:
+        from service.display import progress_bar
+        from service.doctor import TRIAL_S, diagnose
+
+        with progress_bar("trial", TRIAL_S, hidden=json) as update:
+            return diagnose(settings.loop, update)
+
+    diagnosis = guarded(run)
+    if json:
+        typer.echo(diagnosis.model_dump_json(indent=2))
+    else:
+        from service.display import diagnosis_table
+
+        diagnosis_table(diagnosis)
+    if not diagnosis.holds:
+        raise typer.Exit(1)
+
+
+@group.command()
+def units(
+    install: Annotated[
+        Path | None, typer.Option("--install", help="Write them into this folder instead.", show_default=False)
+    ] = None,
+) -> None:
+    """Print systemd units for the daemons, or install them."""
+    from shutil import which
+
+    from service.units import UNITS, unit
+    from service.units import install as install_units
+
+    executable = which("aeroloop") or str(Path(sys.argv[0]).absolute())
+    if install is None:
+        for name in UNITS:
+            typer.echo(f"# aeroloop-{name}.service\n{unit(name, executable)}")
+        return
+    try:
+        for path in install_units(install, executable):
+            typer.echo(path)
+    except OSError as error:
+        fail(f"cannot write into {install}: {error.strerror}", 1)

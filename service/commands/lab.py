@@ -1,0 +1,105 @@
+"""`aeroloop lab`: the theory and the bench, in lockstep."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.commands.common import (
+    PAPER_DURATION_S,
+    BitsIn,
+    BitsOut,
+    Config,
+    Duration,
+    Json,
+    Overrides,
+    guarded,
+    print_figures,
+    settings_of,
+    with_bits_of,
+)
+
+if TYPE_CHECKING:
+    from service.calibrate import Calibration
+    from service.figures import Figures
+    from service.tables import Tables
+
+group = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
+
+
+@group.command()
+def experiment(
+    duration: Duration = PAPER_DURATION_S,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the closed loop in this process, in lockstep and through real frames, without a network."""
+    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+
+    def run() -> Figures:
+        from service.experiment import run_experiment
+
+        if json:
+            return run_experiment(settings, duration)
+        from service.display import progress_bar
+
+        with progress_bar("experiment", duration) as update:
+            return run_experiment(settings, duration, update)
+
+    print_figures(guarded(run), json)
+
+
+@group.command()
+def tables(
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Predict every cell of the paper's Tables C.2 to C.4, beside what was published."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Tables:
+        from service.display import count_bar
+        from service.tables import predict
+
+        with count_bar("cells", hidden=json) as update:
+            return predict(settings, seeds, update)
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    elif markdown:
+        from service.tables import markdown as as_markdown
+
+        typer.echo(as_markdown(result))
+    else:
+        from service.display import paper_tables
+
+        paper_tables(result)
+
+
+@group.command()
+def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Fit the bench to two of the paper's cells, calm and windy, and print the fitted values."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Calibration:
+        from service.calibrate import calibrate
+        from service.display import count_bar
+
+        with count_bar("experiments", hidden=json) as update:
+            return calibrate(settings, lambda runs: update(runs, None))
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from service.display import calibration_table
+
+        calibration_table(result)
