@@ -171,20 +171,50 @@ class FrameFormat:
         return values[0], codes
 
 
-def unwrap(counter: int, tick: int, elapsed_ns: int | None, period_ns: int) -> int:
-    """The tick with this counter, after `tick`, that is nearest to where the time puts it.
+class TickCounter:
+    """The tick of each measurement, from its four bits and the time it was published.
+
+    The plant's grid is absolute and its frames go out on time or late, never early. So the earliest publications mark
+    the grid, and a counter stands for the one tick that has it from 12 before to 3 after where the grid is now: a frame
+    may be held up by 12 ticks, and one judged wrongly does not mislead the next.
 
     Args:
-        counter: Counter of a measurement, 0…15.
-        tick: Tick of an earlier one.
-        elapsed_ns: Time between their publications [ns]; None in lockstep, where nothing is skipped.
         period_ns: Period of the plant's grid [ns].
+        lockstep: Whether nothing is ever skipped, so that no time is needed.
+        tick: Tick of the last measurement before the first one given; −1 at a session's start.
+
+    Attributes:
+        tick: Tick of the last measurement that was newer than all before it.
     """
-    step = (counter - tick) % COUNTERS
-    if elapsed_ns is None:
-        return tick + step
-    rounds = round((elapsed_ns / period_ns - step) / COUNTERS)
-    return tick + step + max(0, rounds) * COUNTERS
+
+    LATE: Final = 12
+
+    def __init__(self, period_ns: int, *, lockstep: bool, tick: int = -1) -> None:
+        self._period_ns = period_ns
+        self._lockstep = lockstep
+        self._origin_ns: int | None = None  # when tick 0 was due, on the plant's wall clock
+        self.tick = tick
+
+    def advance(self, counter: int, published_ns: int) -> int | None:
+        """The tick of a measurement; None if it is not newer than the last one.
+
+        Args:
+            counter: Its counter, 0…15.
+            published_ns: When it was published, on the plant's wall clock [ns].
+        """
+        if self._lockstep or self._origin_ns is None:
+            tick = self.tick + 1 + (counter - self.tick - 1) % COUNTERS
+            self._origin_ns = published_ns - tick * self._period_ns
+        else:
+            latest = round((published_ns - self._origin_ns) / self._period_ns) + COUNTERS - 1 - self.LATE
+            tick = latest - (latest - counter) % COUNTERS
+            if tick <= self.tick:
+                return None
+            # A clock that is set, or runs slower than the grid, must not leave the mark behind for good.
+            drift_ns = (tick - self.tick) * self._period_ns // 10_000
+            self._origin_ns = min(self._origin_ns + drift_ns, published_ns - tick * self._period_ns)
+        self.tick = tick
+        return tick
 
 
 def pack_measurement(spec: WireSpec, counter: int, codes: Sequence[float]) -> bytes:

@@ -21,8 +21,8 @@ from pydantic import ValidationError
 from protocol import topics
 from protocol.clock import LoopSettings, LoopTiming, prepare_process
 from protocol.errors import AeroloopError
-from protocol.frames import WireSpec, unwrap
-from protocol.links import Arrival, ZenohLink
+from protocol.frames import TickCounter, WireSpec
+from protocol.links import ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry, report
 from protocol.role import Role
 from service.controller import Controller
@@ -135,7 +135,8 @@ class Daemon:
         The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
         """
         controller, stop = self._controller, self._role.stop
-        k, published_ns, heard = -1, 0, time.monotonic()
+        ticks = TickCounter(self._loop.period_ns, lockstep=self._loop.lockstep)
+        k, heard = -1, time.monotonic()
         while not stop.is_set() and (self._last_tick is None or k < self._last_tick):
             arrival = link.wait(self._settings.stale_s)
             if arrival is None:
@@ -145,23 +146,19 @@ class Daemon:
             if self._timing:
                 self._timing.woke(arrival.at_ns)
             heard = time.monotonic()
-            elapsed_ns = None if self._loop.lockstep or k < 0 else arrival.published_ns - published_ns
-            measured = self._tick_of(arrival, k, elapsed_ns)
+            read = self._wire.measurement.unpack(arrival.frame)
+            # What is malformed counts as the measurement that was due, and is refused by the controller.
+            measured = k + 1 if read is None else ticks.advance(read[0], arrival.published_ns)
+            if measured is None:
+                continue
             command = controller.tick(arrival.frame, measured)
             if command is not None:
                 link.send(command)
-            self._account(command, measured, measured - k - 1)
-            k, published_ns = measured, arrival.published_ns
+            self._account(command, measured, max(0, measured - k - 1))
+            k = measured
             if self._timing:
                 self._timing.done()
         return not stop.is_set()
-
-    def _tick_of(self, arrival: Arrival, last: int, elapsed_ns: int | None) -> int:
-        """The tick at which a measurement was taken, by its counter; a malformed one counts as the one due."""
-        read = self._wire.measurement.unpack(arrival.frame)
-        if read is None:
-            return last + 1
-        return unwrap(read[0], last, elapsed_ns, self._loop.period_ns)
 
     def _account(self, command: bytes | None, measured: int, missed: int) -> None:
         self._received += 1

@@ -25,7 +25,7 @@ from zstandard import ZstdError
 from protocol import topics
 from protocol.attitude import Quaternion, Vector
 from protocol.errors import AeroloopError
-from protocol.frames import COUNTERS, unwrap
+from protocol.frames import COUNTERS, TickCounter
 from protocol.messages import Contract, Event, Percentiles, Status, Telemetry
 from service.config import ConfigError, Settings, from_contract
 from service.controller import Controller
@@ -80,7 +80,7 @@ class Session:
         self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
         self._commands: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
         self._measured: deque[tuple[int, Seen]] = deque()  # measurements that no command has answered yet
-        self._last: tuple[int, int] | None = None  # tick and time of the last measurement
+        self._ticks: TickCounter | None = None  # once it is known where it starts
         self.malformed = 0
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
         self.ticks: list[Tick] | None = [] if keep else None
@@ -90,13 +90,13 @@ class Session:
         counter = self._counter(seen)
         if counter is None:
             self.malformed += 1
-        elif self._last is None:
+        elif self._ticks is None:
             self._waiting.append(seen)
             self._anchor(seen.published_ns)
         else:
-            tick, published_ns = self._last
-            elapsed_ns = None if self.settings.loop.lockstep else seen.published_ns - published_ns
-            self._take(unwrap(counter, tick, elapsed_ns, self.settings.loop.period_ns), seen)
+            self._answer(seen.published_ns)
+            if (k := self._ticks.advance(counter, seen.published_ns)) is not None:
+                self._measured.append((k, seen))
 
     def command(self, seen: Seen) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
@@ -104,7 +104,7 @@ class Session:
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
         """Which tick a counter stood for; the first that can be matched tells it for the whole session."""
-        if self._last is None:
+        if self._ticks is None:
             self._anchors.append((telemetry, published_ns))
 
     def finish(self) -> None:
@@ -114,24 +114,19 @@ class Session:
 
     def _anchor(self, until_ns: int | None) -> None:
         """Match telemetry from before `until_ns` with the latest measurement before it that had its counter."""
-        while self._last is None and self._anchors and (until_ns is None or self._anchors[0][1] < until_ns):
+        while self._ticks is None and self._anchors and (until_ns is None or self._anchors[0][1] < until_ns):
             telemetry, published_ns = self._anchors.popleft()
             waiting = list(self._waiting)
             for i in reversed(range(len(waiting))):
                 if waiting[i].published_ns < published_ns and self._counter(waiting[i]) == telemetry.counter:
                     self._waiting.clear()
-                    for k, seen in self._backwards(waiting[: i + 1], telemetry.tick):
-                        self._take(k, seen)
-                    for seen in waiting[i + 1 :]:
+                    loop = self.settings.loop
+                    first = self._first_tick(waiting[: i + 1], telemetry.tick)
+                    self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep, tick=first - 1)
+                    for seen in waiting:
                         self.measurement(seen)
                     break
             # else: the measurement that it speaks of came before the log began
-
-    def _take(self, k: int, seen: Seen) -> None:
-        self._answer(seen.published_ns)
-        if self._last is None or k > self._last[0]:
-            self._last = k, seen.published_ns
-            self._measured.append((k, seen))
 
     def _answer(self, until_ns: int | None) -> None:
         """Score the commands published before `until_ns`, each with the latest measurement before it of its echo.
@@ -188,17 +183,13 @@ class Session:
         read = self._wire.measurement.unpack(seen.frame)
         return None if read is None else read[0]
 
-    def _backwards(self, frames: list[Seen], tick: int) -> list[tuple[int, Seen]]:
-        """Ticks of measurements that came before a known one, the last; counted down."""
-        known = [(tick, frames[-1])]
+    def _first_tick(self, frames: list[Seen], tick: int) -> int:
+        """The tick of the first of some measurements, the last of which is at `tick`, by counting down."""
         for seen in reversed(frames[:-1]):
             counter = self._counter(seen)
             assert counter is not None  # malformed ones never get here
-            k = known[-1][0] - ((known[-1][0] - counter) % COUNTERS or COUNTERS)
-            if k < 0:
-                break
-            known.append((k, seen))
-        return known[::-1]
+            tick -= (tick - counter) % COUNTERS or COUNTERS
+        return max(0, tick)
 
 
 class Review(NamedTuple):
