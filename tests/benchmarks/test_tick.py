@@ -19,6 +19,7 @@ from service.controller import Controller
 from service.law import LawSettings
 from service.reference import SinusoidSettings, reference_function
 from tests.service import numpy_twin as twin
+from tests.service.twin_body import body_of
 
 PERIOD = 0.002
 TICKS = 2000
@@ -60,10 +61,7 @@ def test_controller_tick(benchmark: BenchmarkFixture, measurements: list[bytes])
 def test_the_same_tick_in_plain_numpy(benchmark: BenchmarkFixture, measurements: list[bytes]) -> None:
     """The tests' NumPy twin of the law and the reference, between the project's own frames and quantizers."""
     wire, p, paper = WireSpec(), LawSettings(), SinusoidSettings()
-    body = twin.Body(
-        J=np.diag(p.inertia), m=p.mass, g=p.gravity, r_g=np.array(p.centre_of_mass), B=np.array(p.allocation),
-        C1=np.diag(p.C1), C2=np.diag(p.C2), Gamma=np.diag(p.Gamma), bound=p.damping_bound,
-    )  # fmt: skip
+    body = body_of(p)
     reference = twin.Sinusoids(np.radians(paper.amplitude), np.array(paper.frequency))
     level, quantizer = wire.attitude.quantizer().level, wire.voltage.quantizer()
     theta, last = np.array(p.damping_estimate), np.array([1.0, 0.0, 0.0, 0.0])

@@ -21,6 +21,7 @@ from service.law import LawSettings
 from service.reference import SinusoidSettings, reference_function
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
+from tests.service.twin_body import body_of
 
 PERIOD = 0.002
 PERIOD_NS = 2_000_000
@@ -57,25 +58,11 @@ def _answer(wire: WireSpec, frame: bytes | None) -> tuple[int, list[float]]:
     return read[0], [wire.voltage.quantizer().level(code) for code in read[1]]
 
 
-def _body(p: LawSettings) -> twin.Body:
-    return twin.Body(
-        J=np.diag(p.inertia),
-        m=p.mass,
-        g=p.gravity,
-        r_g=np.array(p.centre_of_mass),
-        B=np.array(p.allocation),
-        C1=np.diag(p.C1),
-        C2=np.diag(p.C2),
-        Gamma=np.diag(p.Gamma),
-        bound=p.damping_bound,
-    )
-
-
 class TwinLoop:
     """The twin of the controller between its frames: law, reference, θ̂ and the sign."""
 
     def __init__(self, reference: SinusoidSettings, law: LawSettings = LAW) -> None:
-        self.body = _body(law)
+        self.body = body_of(law)
         self.reference = twin.Sinusoids(np.radians(reference.amplitude), np.array(reference.frequency))
         self.theta: Array = np.array(law.damping_estimate)
         self.s = 0.0
@@ -148,7 +135,7 @@ def test_three_actuators_get_three_voltages() -> None:
     _, voltages = _answer(wire, controller.tick(_frame(wire, 0, attitude, rate), 0))
     _, last_two = _answer(CONTINUOUS, two.tick(_frame(CONTINUOUS, 0, attitude, rate), 0))
     u1 = twin.law(
-        _body(LAW), np.array(attitude), np.array(rate), *_desired_at_start(), np.array(LAW.damping_estimate), 1.0
+        body_of(LAW), np.array(attitude), np.array(rate), *_desired_at_start(), np.array(LAW.damping_estimate), 1.0
     ).u[0]
     assert voltages[1:] == last_two
     # rounding of some hundred operations; the row of u₁ is the fictitious identity
@@ -231,7 +218,10 @@ def test_from_a_large_attitude_the_body_turns_the_short_way() -> None:
     held = SinusoidSettings(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi / 60))  # crest at 30 s, and slow there
     aero = IDEAL_AERO
     plant = twin.LockedBody(
-        _body(LAW), np.vstack([np.zeros(2), aero.thrust]), np.array(aero.damping), np.array([0.0, radians(-170), 0, 0])
+        body_of(LAW),
+        np.vstack([np.zeros(2), aero.thrust]),
+        np.array(aero.damping),
+        np.array([0.0, radians(-170), 0, 0]),
     )
     controller = _controller(reference=held)
     yaws = []
@@ -319,7 +309,7 @@ def test_the_closed_loop_agrees_with_the_twins() -> None:
     claim = Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, auto_arm=True, wire=CONTINUOUS)
     assert isinstance(endpoint.claim(claim), Grant)
     controller, loop = _controller(), TwinLoop(PAPER)
-    body = twin.LockedBody(_body(LAW), np.vstack([np.zeros(2), aero.thrust]), np.array(aero.damping), np.zeros(4))
+    body = twin.LockedBody(body_of(LAW), np.vstack([np.zeros(2), aero.thrust]), np.array(aero.damping), np.zeros(4))
     q: Array = np.array([1.0, 0.0, 0.0, 0.0])
     measurement = endpoint.tick(None, 0)
     limited = 0

@@ -17,6 +17,7 @@ import pytest
 from service.law import Law, LawSettings, build_law, law_function, projection
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
+from tests.service.twin_body import body_of
 
 both_signs = pytest.mark.parametrize("s", [1.0, -1.0])
 both_bodies = pytest.mark.parametrize("paper", [True, False], ids=["paper's body", "random bodies"])
@@ -72,20 +73,6 @@ def _random_settings(rng: np.random.Generator) -> LawSettings:
         C2=_triple(rng.uniform(0.1, 2.0, 3)),
         Gamma=_triple(rng.uniform(0.1, 2.0, 3)),
         damping_bound=float(rng.uniform(0.1, 2.0)),
-    )
-
-
-def _body(p: LawSettings) -> twin.Body:
-    return twin.Body(
-        J=np.diag(p.inertia),
-        m=p.mass,
-        g=p.gravity,
-        r_g=np.array(p.centre_of_mass),
-        B=np.array(p.allocation),
-        C1=np.diag(p.C1),
-        C2=np.diag(p.C2),
-        Gamma=np.diag(p.Gamma),
-        bound=p.damping_bound,
     )
 
 
@@ -169,7 +156,7 @@ def test_the_law_agrees_with_the_twin_at_moving_states(paper: bool, s: float) ->
         function = loop.evaluator(law.u, law.theta_dot, law.tau, e, law.omega_e, law.z1, law.z2)
         for _ in range(100 if paper else 5):
             x = _point(rng, p.damping_bound)
-            t = twin.law(_body(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+            t = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
             expected = (t.u, t.theta_dot, t.tau, t.e, t.omega_e, t.z1, t.z2)
             assert all(_close(a, b) for a, b in zip(_values(function, x, s), expected, strict=True))
             projected += bool(np.any(t.theta_dot != t.tau))
@@ -183,7 +170,7 @@ def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -
     for _ in range(30):
         p = _random_settings(rng)
         x = _point(rng, 0.5 * p.damping_bound)  # so far inside k_θ that a period does not lead out
-        expected = twin.law(_body(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+        expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
         tick = law_function(p, period)(
             q=x.q, omega=x.omega, q_d=x.q_d, omega_d=x.omega_d, omega_d_dot=x.omega_d_dot, theta=x.theta, s=s
         )
@@ -228,7 +215,7 @@ def test_without_quantization_c46_is_the_derivative_of_the_virtual_control(s: fl
             x = _point(rng, p.damping_bound)
             value, rates = _values(function, x, s)
             rates = rates.reshape(-1, 3)  # a row for each thing that moves
-            expected = twin.law(_body(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+            expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
             # α = ω_e − z₂ rounds at the size of ω_e; α̇ at the size of its addends; 2e-16, some hundred operations
             assert np.abs(value - expected.alpha).max() <= 1e-13 * (1 + np.linalg.norm(expected.omega_e))
             assert np.abs(rates.sum(axis=0) - expected.alpha_bar).max() <= 1e-13 * np.abs(rates).sum()

@@ -21,10 +21,10 @@ from protocol.frames import SignalSpec
 from protocol.messages import Claim, Grant
 from service.config import Settings, load, with_bits
 from service.controller import Controller
-from service.law import LawSettings
 from service.reference import reference_function
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
+from tests.service.twin_body import body_of
 
 BODY = (
     "inertia=[0.03, 0.02, 0.025]",
@@ -59,20 +59,6 @@ OTHER = load(
 
 BITS = ("6", "8", "10", "cont")
 SECONDS = 60.0
-
-
-def _body(p: LawSettings) -> twin.Body:
-    return twin.Body(
-        J=np.diag(p.inertia),
-        m=p.mass,
-        g=p.gravity,
-        r_g=np.array(p.centre_of_mass),
-        B=np.array(p.allocation),
-        C1=np.diag(p.C1),
-        C2=np.diag(p.C2),
-        Gamma=np.diag(p.Gamma),
-        bound=p.damping_bound,
-    )
 
 
 @cache
@@ -335,7 +321,7 @@ def test_no_voltage_jumps_by_more_than_a_level_of_each_input_and_smooth_motion_e
 def test_every_voltage_is_the_laws_for_the_attitude_that_never_jumped(bits: str) -> None:
     """The twin decodes the frame, and takes the sign of q from the truth."""
     run = _through_full_turns(bits)
-    wire, body = run.settings.wire, _body(run.settings.law)
+    wire, body = run.settings.wire, body_of(run.settings.law)
     attitude, rate = wire.attitude.quantizer().level, wire.rate.quantizer().level
     crossed = np.flatnonzero(np.diff(np.sign(run.q[:, 0])))
     near = {int(k) for at in crossed for k in range(at - 20, at + 20)}
