@@ -1,48 +1,55 @@
 """The emulator process: an emulated plant behind an Endpoint, on the network.
 
 The loop is wait → receive → tick → send → account. In real time it waits for the grid; in lockstep it waits for the
-answer to its last measurement, so that a run repeats bit for bit. Claims, releases and lost peers come from Zenoh's
-threads and wait in a queue for the loop to take them between ticks: the endpoint is only ever touched by one thread.
+answer to its last measurement, so that a run repeats bit for bit. Faults, if any are asked for, act on the plant's
+sensors and motors, on the measurements before they are sent and on the commands after they have come.
 """
 
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-import zenoh
-from pydantic import ValidationError
-
 from plant_emulator.endpoint import Endpoint
+from plant_emulator.faults import Fault
+from plant_emulator.faulty import FaultyStream
+from plant_emulator.presence import Presence
 from plant_emulator.settings import PlantSettings
-from protocol import topics
-from protocol.clock import Histogram, LoopSettings, LoopTiming, TickGrid, prepare_process
-from protocol.frames import COUNTERS, WireSpec
-from protocol.links import Arrival, ZenohLink
-from protocol.messages import Claim, Grant, Refusal, Release, Status, Truth, report, summary
+from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
+from protocol.errors import AeroloopError
+from protocol.frames import WireSpec
+from protocol.links import Arrival
+from protocol.messages import Truth
 from protocol.role import Role
+from protocol.verbs import Advance, Answer, Inject
 
-STATUS_PERIOD_NS: Final = 1_000_000_000
 IDLE_WAIT_S: Final = 0.02
+
+
+class FaultError(AeroloopError):
+    """A fault that cannot be injected; one line that says why."""
 
 
 class Emulator:
     """The plant end as a process.
 
     Args:
-        role: Its presence on the network.
+        role: Its name on the network.
         loop: The grid.
         wire: How frames are read and written.
         settings: The plant.
+
+    Raises:
+        ValueError: A fault of a motor that the plant does not have.
     """
 
     def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
         self._role = role
         self._loop = loop
         self._settings = settings
-        self._plant = settings.build(loop.period)
+        self._emulated = settings.build(loop.period)
+        self._plant = settings.with_faults(self._emulated, loop.period)
         self._endpoint = Endpoint(
             self._plant,
             wire,
@@ -52,29 +59,19 @@ class Emulator:
             guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
             armed=settings.armed_at_start,
         )
-        self._link: ZenohLink | None = None
-        self._inbox: deque[Callable[[], None]] = deque()
-        self._latency = Histogram()
-        self._timing: LoopTiming | None = None
-        self._sent_at = [0] * COUNTERS
-        self._sent = self._received = self._skipped = 0
-        self._notes: list[str] = []
+        self._presence = Presence(role, loop, self._endpoint)
+        faults = settings.parsed_faults
+        self._measurements = FaultyStream("measurement", faults, settings.fault_seed)
+        self._commands = FaultyStream("command", faults, settings.fault_seed)
         self._k = -1
-        self._status_due = 0
-        self._status_tick = 0
-        self._status_time = time.monotonic()
-        self._truth_every = round(loop.rate_hz / settings.truth_rate_hz) if settings.truth_rate_hz else 0
+        self._steps: int | None = 0 if settings.steps_on_request else None  # that may still be taken; None: any number
+        self._truth_every = self._ticks_between_truths()
 
     def run(self) -> None:
         """Run until the role is told to stop; then 0 V and a last status."""
-        role = self._role
-        role.answer(topics.key("claim", role.vehicle), lambda q: self._inbox.append(lambda: self._claim(q)))
-        role.answer(topics.key("release", role.vehicle), lambda q: self._inbox.append(lambda: self._release(q)))
-        role.answer(topics.key("arm", role.vehicle), lambda q: self._inbox.append(lambda: self._arm(q)))
-        role.answer(topics.key("stop", role.vehicle), lambda q: self._inbox.append(lambda: self._stop(q)))
-        role.watch_tokens(self._token)
-        role.announce()
-        role.event("started", f"{role.vehicle} waits for a claim")
+        self._role.serve("inject", Inject, lambda inject: self._inject(inject.fault))
+        self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
+        self._presence.serve()
         try:
             if self._loop.lockstep:
                 self._run_lockstep()
@@ -82,168 +79,127 @@ class Emulator:
                 self._run_real_time()
         finally:
             self._plant.close()
-            self._follow_session()
-            role.event("stopped", f"{role.vehicle} stopped at 0 V")
-            self._publish_status()
+            self._presence.leave()
+
+    def reconfigure(self, settings: PlantSettings) -> None:
+        """Take over what can change between two ticks: limits, watchdog, how often the truth is told."""
+        self._settings = settings
+        guard = settings.guard(self._loop.period_ns, self._endpoint.wire.voltage.quantizer().outermost)
+        self._endpoint.protect(settings.watchdog_s, guard)
+        self._truth_every = self._ticks_between_truths()
 
     def _run_real_time(self) -> None:
-        self._notes = prepare_process(self._loop)
-        timing = self._timing = LoopTiming()
+        presence = self._presence
+        presence.notes = prepare_process(self._loop)
+        timing = presence.timing = LoopTiming()
         grid = TickGrid(self._loop.period_ns)
         while not self._role.stop.is_set():
             skipped = grid.skipped
             k = grid.wait()
             timing.woke(grid.due_ns)
-            self._take_inbox()
-            arrival = self._link.take() if self._link else None
-            frame = self._endpoint.tick(arrival.frame if arrival else None, k)
-            if frame is not None and self._link:
-                self._send(frame)
+            presence.take_inbox()
+            arrival = presence.link.take() if presence.link else None
+            self._tick(arrival, k)
             if self._endpoint.session:
-                self._skipped += grid.skipped - skipped
-            self._account(k, arrival)
+                presence.skipped += grid.skipped - skipped
             timing.done()
 
     def _run_lockstep(self) -> None:
         arrival = None
         while not self._role.stop.is_set():
-            self._take_inbox()
-            if self._link is None:
-                time.sleep(IDLE_WAIT_S)
-                self._publish_when_due()
+            self._presence.take_inbox()
+            if self._presence.link is None or self._steps == 0:
+                time.sleep(IDLE_WAIT_S if self._presence.link is None else 0)
+                self._presence.tell_when_due()
                 continue
-            frame = self._endpoint.tick(arrival.frame if arrival else None, self._k + 1)
-            arrival = None
-            if frame is not None:
-                self._send(frame)
-                arrival = self._await_answer()
-            self._account(self._k + 1, arrival)
+            if self._steps is not None:
+                self._steps -= 1
+            echo = self._tick(arrival, self._k + 1)
+            arrival = None if echo is None else self._await_answer(echo)
 
-    def _await_answer(self) -> Arrival | None:
-        """The next command, or None when the session ends before one comes."""
-        deadline = time.monotonic() + self._settings.answer_timeout_s
-        while self._link and not self._role.stop.is_set():
-            if (arrival := self._link.wait(IDLE_WAIT_S)) is not None:
-                return arrival
-            self._take_inbox()
-            if time.monotonic() > deadline:
-                self._endpoint.expire(f"no answer for {self._settings.answer_timeout_s:g} s")
-            self._follow_session()
-            self._publish_when_due()
-        return None
-
-    def _send(self, frame: bytes) -> None:
-        assert self._link is not None
-        self._sent_at[self._endpoint.counter] = time.monotonic_ns()
-        self._link.send(frame)
-        self._sent += 1
-
-    def _account(self, k: int, arrival: Arrival | None) -> None:
-        self._k = k
+    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
+        """One tick of the plant end. Returns the counter that an answer to its measurement will echo, if one will."""
+        command = None
         if arrival is not None:
-            self._received += 1
-            read = self._endpoint.wire.command.unpack(arrival.frame)
-            if read is not None and (elapsed := arrival.at_ns - self._sent_at[read[0]]) > 0:
-                self._latency.add(elapsed)
-        self._follow_session()
+            self._presence.arrived(arrival)
+            command = arrival.frame
+        if self._endpoint.session is not None:
+            self._plant.start()
+        t = self._plant.time
+        if not self._commands.idle:
+            passed = self._commands.passes(command, t)
+            command = passed[-1] if passed else None
+        frame = self._endpoint.tick(command, k)
+        frames = [frame] if frame is not None else []
+        if not self._measurements.idle:
+            frames = self._measurements.passes(frame, t)
+        echo = None
+        for frame in frames:
+            read = self._endpoint.wire.measurement.unpack(frame)
+            echo = None if read is None else read[0]
+            self._presence.send(frame, self._endpoint.counter if echo is None else echo)
+        self._k = k
+        self._presence.after_tick(k)
         if self._truth_every and k % self._truth_every == 0:
-            state = self._plant.truth()
+            state = self._emulated.truth()
             self._role.publish(
                 "truth", Truth(tick=k, attitude=state.attitude, rate=state.rate, voltages=state.voltages)
             )
-        self._publish_when_due()
+        return echo
 
-    def _publish_when_due(self) -> None:
-        if time.monotonic_ns() >= self._status_due:
-            self._publish_status()
+    def _await_answer(self, echo: int) -> Arrival | None:
+        """The command that echoes a counter, or None when the session ends before it comes."""
+        deadline = time.monotonic() + self._settings.answer_timeout_s
+        while self._presence.link and not self._role.stop.is_set():
+            arrival = self._presence.link.wait(IDLE_WAIT_S)
+            if arrival is not None and _echo(self._endpoint.wire, arrival) in (echo, None):
+                return arrival
+            self._presence.take_inbox()
+            if time.monotonic() > deadline:
+                self._endpoint.expire(f"no answer for {self._settings.answer_timeout_s:g} s")
+            self._presence.follow_session()
+            self._presence.tell_when_due()
+        return None
 
-    # ── what came from Zenoh's threads, taken between ticks ──
+    def _ticks_between_truths(self) -> int:
+        rate = self._settings.truth_rate_hz
+        return max(1, round(self._loop.rate_hz / rate)) if rate else 0
 
-    def _token(self, name: str, came: bool) -> None:
-        if not came:
-            self._inbox.append(lambda: self._endpoint.lost(name))
+    # ── for tests: what goes wrong, and when ──
 
-    def _take_inbox(self) -> None:
-        while self._inbox:
-            self._inbox.popleft()()
-            self._follow_session()
-
-    def _claim(self, query: zenoh.Query) -> None:
-        answer: Grant | Refusal
+    def _inject(self, text: str | None) -> Callable[[], Answer]:
         try:
-            claim = Claim.model_validate_json(query.payload.to_bytes() if query.payload else b"")
-        except ValidationError as error:
-            answer = Refusal(reason=f"not a claim: {error.errors()[0]['msg']}")
-        else:
-            answer = self._endpoint.claim(claim)
-            if isinstance(answer, Grant):
-                self._open_link(claim.session)
-            else:
-                self._role.event("refused", f"{claim.controller} refused: {answer.reason}", claim.session)
-        query.reply(query.key_expr, answer.encode())
-        query.drop()
+            fault = Fault.parse(text) if text is not None else None
+        except ValueError as error:
+            raise FaultError(str(error)) from None
 
-    def _release(self, query: zenoh.Query) -> None:
-        try:
-            release = Release.model_validate_json(query.payload.to_bytes() if query.payload else b"")
-        except ValidationError:
-            released = False
-        else:
-            released = self._endpoint.release(release.session)
-        query.reply(query.key_expr, b"true" if released else b"false")
-        query.drop()
+        def inject() -> Answer:
+            if fault is None:
+                self._plant.clear()
+                self._measurements.clear()
+                self._commands.clear()
+                return self._told("no faults any more")
+            try:
+                self._plant.inject(fault)
+            except ValueError as error:
+                raise FaultError(str(error)) from None
+            self._measurements.inject(fault, self._plant.time)
+            self._commands.inject(fault, self._plant.time)
+            return self._told(f"fault injected: {fault}")
 
-    def _arm(self, query: zenoh.Query) -> None:
-        query.reply(query.key_expr, b"true" if self._endpoint.arm() else b"false")
-        query.drop()
+        return inject
 
-    def _stop(self, query: zenoh.Query) -> None:
-        self._endpoint.stop()
-        query.reply(query.key_expr, b"true")
-        query.drop()
+    def _told(self, text: str) -> Answer:
+        self._role.event("fault", text, self._endpoint.session)
+        return Answer(done=True, text=text)
 
-    def _open_link(self, session: str) -> None:
-        """Listen for commands before the grant goes out, so that the first one finds somebody."""
-        vehicle = self._role.vehicle
-        self._link = ZenohLink(
-            self._role.zenoh,
-            send_key=topics.key("measurement", vehicle, session=session),
-            receive_key=topics.key("command", vehicle, session=session),
-            lossless=self._loop.lockstep,
-        )
+    def _advance(self, seconds: float) -> Answer:
+        if self._steps is None:
+            return Answer(done=False, text="this plant steps by itself: set plant.steps_on_request and loop.lockstep")
+        self._steps += self._loop.ticks(seconds)
+        return Answer(done=True, text=f"goes on for {seconds:g} s")
 
-    def _follow_session(self) -> None:
-        """Tell what happened, and close the link of a session that ended."""
-        if self._endpoint.session is None and self._link is not None:
-            self._link.close()
-            self._link = None
-        if self._endpoint.notices:
-            for notice in self._endpoint.notices:
-                self._role.event(*notice)
-            self._endpoint.notices.clear()
-            self._status_due = 0
 
-    def _publish_status(self) -> None:
-        now = time.monotonic()
-        endpoint = self._endpoint
-        self._role.status(
-            Status(
-                role=self._role.role,
-                state=endpoint.state,
-                session=endpoint.session,
-                cause=endpoint.cause,
-                uptime_s=self._role.uptime_s,
-                ticks=self._k + 1,
-                rate_hz=max(0.0, (self._k - self._status_tick) / (now - self._status_time)),
-                skipped=self._skipped,
-                received=self._received,
-                sent=self._sent,
-                refused=endpoint.refused,
-                saturated=endpoint.saturated,
-                latency_us=summary(self._latency),
-                timing=report(self._timing) if self._timing else None,
-                notes=self._notes,
-            )
-        )
-        self._status_tick, self._status_time = self._k, now
-        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
+def _echo(wire: WireSpec, arrival: Arrival) -> int | None:
+    read = wire.command.unpack(arrival.frame)
+    return None if read is None else read[0]

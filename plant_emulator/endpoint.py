@@ -17,7 +17,6 @@ A tripped plant, and one that starts unarmed, refuse claims and say why. A claim
 
 from __future__ import annotations
 
-from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
@@ -27,15 +26,7 @@ from protocol.attitude import sent_vector
 from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
 from protocol.frames import COUNTERS, WireSpec
 from protocol.messages import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal
-
-
-class PlantState(StrEnum):
-    """What the plant end is doing."""
-
-    IDLE = "idle"
-    GRANTED = "granted"
-    DRIVEN = "driven"
-    TRIPPED = "tripped"
+from protocol.states import PLANT_TABLE, Machine, PlantState, PlantTrigger
 
 
 class Notice(NamedTuple):
@@ -62,7 +53,6 @@ class Endpoint:
         ValueError: The wire commands another number of actuators than the plant has.
 
     Attributes:
-        state: What it is doing.
         session: Name of the session it is in, or None.
         holder: Controller that holds it, or None.
         notices: What happened since the owner last emptied this list.
@@ -87,7 +77,7 @@ class Endpoint:
         self.wire = wire
         self.period_ns = period_ns
         self.lockstep = lockstep
-        self.state = PlantState.IDLE
+        self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self.session: str | None = None
         self.holder: str | None = None
         self.notices: list[Notice] = []
@@ -99,16 +89,26 @@ class Endpoint:
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
-        self._guard = guard
         self._latch: str | None = None if armed else "not armed since it was started"
         self._operator_stop = False
-        self._watchdog = max(1, round(watchdog_s * 1e9 / period_ns))
+        self.protect(watchdog_s, guard)
         self._first_command = max(1, round(FIRST_COMMAND_S * 1e9 / period_ns))
         self._tick = -1
         self._session_tick = 0  # tick of the session's first measurement
         self._fresh_tick = 0  # tick of the last fresh command, or of the grant
+        self._unmeasured = [False] * COUNTERS  # whether the last measurement of each counter had no valid value
         self._echo = -1  # the last fresh command's echo
         self._answered = -1  # and the tick of the measurement that it answered
+
+    def protect(self, watchdog_s: float, guard: Guard | None) -> None:
+        """Use another watchdog time [s] and other limits from now on."""
+        self._watchdog = max(1, round(watchdog_s * 1e9 / self.period_ns))
+        self._guard = guard
+
+    @property
+    def state(self) -> PlantState:
+        """What it is doing."""
+        return self._machine.state
 
     @property
     def cause(self) -> str | None:
@@ -134,12 +134,13 @@ class Endpoint:
         if self.session is not None:
             return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
         if claim.auto_arm and not self._operator_stop:
-            self._latch = None
+            self._clear()
         if self._latch is not None:
             return Refusal(reason=f"{self._latch}; `aeroloop op arm` clears it")
         if self._guard is not None:
             self._guard.reset()
-        self.session, self.holder, self.state = claim.session, claim.controller, PlantState.GRANTED
+        self._machine.fire(PlantTrigger.GRANT)
+        self.session, self.holder = claim.session, claim.controller
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
         self._echo = self._answered = -1
@@ -150,31 +151,32 @@ class Endpoint:
         """End a session at its holder's wish: 0 V. False if it is not the session that runs."""
         if session != self.session:
             return False
-        self._end(PlantState.IDLE, "released", f"released by {self.holder}")
+        self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}")
         return True
 
     def arm(self) -> bool:
         """Clear what holds claims back; the next one is granted. False while a controller holds the plant."""
         if self.session is not None:
             return False
-        self._latch, self._operator_stop, self.state = None, False, PlantState.IDLE
+        self._operator_stop = False
+        self._clear()
         self._notice("armed", "armed by an operator: the next claim is granted")
         return True
 
     def stop(self) -> None:
         """An operator's stop, from any state: 0 V, and no claim is granted before `arm`."""
-        self._end(PlantState.TRIPPED, "tripped", "stopped by an operator: 0 V")
+        self._trip("stopped by an operator")
         self._operator_stop = True
 
     def lost(self, controller: str) -> None:
         """A controller's liveliness token went; if it held the plant, its session ends: 0 V."""
         if controller == self.holder:
-            self._end(PlantState.TRIPPED, "tripped", f"{controller} is gone: 0 V")
+            self._trip(f"{controller} is gone")
 
     def expire(self, reason: str) -> None:
         """End a session for a reason that only its owner can see, such as no answer in lockstep: 0 V."""
         if self.session is not None:
-            self._end(PlantState.TRIPPED, "tripped", f"{reason}: 0 V")
+            self._trip(reason)
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Let the time since the last tick pass under the newest command, and measure.
@@ -198,10 +200,12 @@ class Endpoint:
             return None
         seen = self.plant.measure()
         if self._guard is not None and (reason := self._guard.check(seen, self._voltages)) is not None:
-            self._end(PlantState.TRIPPED, "tripped", f"{reason}: 0 V")
+            self._trip(reason)
             self.plant.actuate(self._voltages)
             return None
-        return self.wire.measurement.pack(self.counter, self._encoded(seen))
+        codes = self._encoded(seen)
+        self._unmeasured[self.counter] = codes is self._no_measurement
+        return self.wire.measurement.pack(self.counter, codes)
 
     @property
     def counter(self) -> int:
@@ -231,12 +235,15 @@ class Endpoint:
             return
         voltages = tuple(self._level(code) for code in codes)
         if not isfinite(sum(voltages)):
-            self._end(PlantState.TRIPPED, "tripped", f"{self.holder} commands 'no valid value': 0 V")
-            return
+            if self._unmeasured[echo]:
+                voltages = self._off  # the right answer; how long it may go on is the guard's to say
+            else:
+                self._trip(f"{self.holder} commands 'no valid value'")
+                return
         self._voltages = voltages
         self._echo, self._answered = echo, answered
         self._fresh_tick = self._tick
-        self.state = PlantState.DRIVEN
+        self._machine.fire(PlantTrigger.COMMAND)
         self.accepted += 1
 
     def _watch(self, tick: int) -> None:
@@ -245,18 +252,25 @@ class Endpoint:
             return
         waited = tick - 1 - self._fresh_tick
         if self.state is PlantState.DRIVEN and waited >= self._watchdog:
-            text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms: 0 V"
+            text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms"
         elif self.state is PlantState.GRANTED and waited >= self._first_command:
-            text = f"no first command within {FIRST_COMMAND_S:g} s: 0 V"
+            text = f"no first command within {FIRST_COMMAND_S:g} s"
         else:
             return
-        self._end(PlantState.TRIPPED, "tripped", text)
+        self._trip(text)
 
-    def _end(self, state: PlantState, kind: EventKind, text: str) -> None:
+    def _trip(self, reason: str) -> None:
+        self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V")
+        self._latch = f"{reason}: 0 V"
+
+    def _clear(self) -> None:
+        self._latch = None
+        self._machine.fire(PlantTrigger.ARM)
+
+    def _end(self, trigger: PlantTrigger, kind: EventKind, text: str) -> None:
         self._notice(kind, text)
-        if kind == "tripped":
-            self._latch = text
-        self.state, self.session, self.holder = state, None, None
+        self._machine.fire(trigger)
+        self.session = self.holder = None
         self._voltages = self._off
 
     def _notice(self, kind: EventKind, text: str) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from plant_emulator.aero import Aero, AeroSettings
 from plant_emulator.emulated import EmulatedPlant
+from plant_emulator.faults import Fault
+from plant_emulator.faulty import FaultyPlant
 from plant_emulator.friction import FrictionSettings
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.mechanism import Mechanism
+from plant_emulator.plant import Plant
 from plant_emulator.rigid_body import RigidBody, RigidBodySettings
 from plant_emulator.rotor import RotorSettings
 from plant_emulator.sensors import Sensors, SensorSettings
@@ -43,6 +46,14 @@ class PlantSettings(BaseModel):
     truth_rate_hz: float = Field(default=50.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
+    faults: list[str] = Field(
+        default=[],
+        description="what shall go wrong: signal:kind[=value][@start[..end]], in s since the first claim was granted",
+    )
+    fault_seed: int = Field(default=0, ge=0, description="of the faults' random numbers")
+    steps_on_request: bool = Field(
+        default=False, description="lockstep only: step only as far as it is asked to over the network, for tests"
+    )
     limits: LimitSettings = LimitSettings()
     aero: AeroSettings = AeroSettings()
     rigid_body: RigidBodySettings = RigidBodySettings()
@@ -50,6 +61,16 @@ class PlantSettings(BaseModel):
     friction: FrictionSettings = FrictionSettings()
     wind: WindSettings = WindSettings()
     sensors: SensorSettings = SensorSettings()
+
+    @field_validator("faults")
+    @classmethod
+    def _faults_are_faults(cls, faults: list[str]) -> list[str]:
+        return [str(Fault.parse(text)) for text in faults]
+
+    @property
+    def parsed_faults(self) -> list[Fault]:
+        """What shall go wrong."""
+        return [Fault.parse(text) for text in self.faults]
 
     @model_validator(mode="after")
     def _sensors_fit_the_body(self) -> PlantSettings:
@@ -79,6 +100,11 @@ class PlantSettings(BaseModel):
             voltage_limit=self.voltage_limit,
             substeps=self.substeps,
         )
+
+    def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
+        """The plant, with the faults of its sensors and motors. Raises ValueError for a motor that is not there."""
+        limit = self.voltage_limit
+        return FaultyPlant(plant, self.parsed_faults, period, voltage_limit=limit, seed=self.fault_seed)
 
     def guard(self, period_ns: int, commanded_limit: float) -> Guard:
         """The plant's limits; a motor is saturated at the supply's limit or at the outermost level commanded [V]."""

@@ -7,25 +7,19 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
+from protocol import verbs
 from protocol.clock import Histogram, LoopTiming
 from protocol.frames import WireSpec
-from protocol.topics import TOPICS
+from protocol.topics import TOPICS, Topic
+from protocol.verbs import Message
 
 PROTOCOL_VERSION: Final = 1
 
-EventKind = Literal["armed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"]
-
-
-class Message(BaseModel):
-    """A message; unknown fields are refused, so that two versions that differ do not half understand each other."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def encode(self) -> bytes:
-        """The message as JSON."""
-        return self.model_dump_json().encode()
+EventKind = Literal[
+    "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
+]
 
 
 def _no_other_topics_key(session: str) -> str:
@@ -136,6 +130,7 @@ class Status(Message):
     state: str
     session: str | None = None
     cause: str | None = Field(default=None, description="plant: why it may not be driven, where that is so")
+    since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
     uptime_s: float
     ticks: int = Field(description="ticks since start")
     rate_hz: float = Field(description="ticks a second since the last status")
@@ -181,3 +176,9 @@ class Event(Message):
     kind: EventKind
     text: str = Field(description="one line for a person: what, why, and since when if that is known")
     session: str | None = None
+
+
+def model_of(topic: Topic) -> type[Message]:
+    """The model of what a topic of messages carries. Raises KeyError for a topic of frames."""
+    model: type[Message] = globals().get(topic.model) or vars(verbs)[topic.model]
+    return model

@@ -14,19 +14,29 @@ import signal
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
 from types import FrameType, TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import zenoh
+from pydantic import ValidationError
 
 from protocol import topics
-from protocol.messages import Contract, Event, EventKind, Message, Status
+from protocol.clock import Throttle
+from protocol.errors import AeroloopError
+from protocol.messages import Contract, Event, EventKind, Status
 from protocol.network import NetworkSettings, join
+from protocol.verbs import Answer, Message
 
 log: Final = logging.getLogger("aeroloop")
+
+
+M = TypeVar("M", bound=Message)
+Action = Callable[[], object]
+"""Something to do between two ticks."""
 
 
 def versions() -> dict[str, str]:
@@ -68,12 +78,12 @@ class Role:
         self.zenoh = join(network)
         self._status = b""
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._inbox: deque[Action] = deque()
+        self._throttle = Throttle()
         self._started = time.monotonic()
-        contract = Contract(
-            role=role, vehicle=vehicle, host=socket.gethostname(), versions=versions(), config=config
-        ).encode()
+        self.configured(config)
         key = topics.key("contract", vehicle, role=role)
-        self.answer(key, lambda query: query.reply(key, contract))
+        self.answer(key, lambda query: query.reply(key, self._contract))
         status = topics.key("status", vehicle, role=role)
         self.answer(status, lambda query: query.reply(status, self._status) if self._status else None)
 
@@ -100,6 +110,26 @@ class Role:
         signal.signal(signal.SIGTERM, ask_to_stop)
         signal.signal(signal.SIGINT, ask_to_stop)
 
+    def on_hangup(self, reload: Callable[[], Action]) -> None:
+        """On SIGHUP, call `reload` in a thread of its own, and what it returns between two ticks.
+
+        What `reload` raises as an AeroloopError is told, and nothing changes.
+        """
+
+        def prepare() -> None:
+            try:
+                self._inbox.append(reload())
+            except AeroloopError as error:
+                self.event("fault", f"not reloaded: {error}")
+
+        signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
+
+    def configured(self, config: dict[str, Any]) -> None:
+        """Answer questions for the contract with this configuration from now on."""
+        self._contract = Contract(
+            role=self.role, vehicle=self.vehicle, host=socket.gethostname(), versions=versions(), config=config
+        ).encode()
+
     @property
     def uptime_s(self) -> float:
         """Seconds since the role joined."""
@@ -108,6 +138,51 @@ class Role:
     def answer(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
         """Answer queries on a key for as long as the role lives. The callback runs in a thread of Zenoh's."""
         self.zenoh.declare_queryable(key, callback, complete=True)
+
+    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
+        """Answer a topic's queries between ticks, when the owner calls `take_inbox`.
+
+        Args:
+            topic: Name of a query in the table.
+            model: What is asked; anything else is answered by an Answer that says so.
+            prepare: Called in a thread of Zenoh's with what was asked, to do what takes time; what it returns is
+                called between ticks and gives the reply. An AeroloopError from either is the reply.
+        """
+
+        def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
+            try:
+                reply = act()
+            except AeroloopError as error:
+                reply = Answer(done=False, text=str(error))
+            query.reply(query.key_expr, reply.encode())
+            query.drop()
+
+        def asked(query: zenoh.Query) -> None:
+            try:
+                action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
+            except ValidationError as error:
+                text = f"not a {model.__name__}: {error.errors()[0]['msg']}"
+                guarded(query, lambda: Answer(done=False, text=text))
+            except AeroloopError as error:
+                refusal = Answer(done=False, text=str(error))
+                guarded(query, lambda: refusal)
+            else:
+                self._inbox.append(lambda: guarded(query, action))
+
+        self.answer(topics.key(topic, self.vehicle), asked)
+
+    def later(self, action: Action) -> None:
+        """Let the owner do something between two ticks; may be called from any thread."""
+        self._inbox.append(action)
+
+    def take_inbox(self) -> bool:
+        """Do what has come for the time between two ticks. Whether anything had."""
+        inbox = self._inbox
+        if not inbox:
+            return False
+        while inbox:
+            inbox.popleft()()
+        return True
 
     def watch_tokens(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with the name of every liveliness token of any role, and whether it came (True) or went (False).
@@ -137,6 +212,13 @@ class Role:
         """Tell, on the network and on stderr, something that happened."""
         log.log(logging.WARNING if kind in ("tripped", "lost", "fault") else logging.INFO, "%s: %s", self.role, text)
         self.publish("event", Event(role=self.role, kind=kind, text=text, session=session))
+
+    def warn(self, about: str, kind: EventKind, text: str, session: str | None = None) -> None:
+        """Tell of something that may go on for long: at most once in ten seconds for each thing it is about."""
+        held_back = self._throttle.let_pass(about)
+        if held_back is not None:
+            more = f" ({held_back} more like it in the last {self._throttle.period_s:g} s)" if held_back else ""
+            self.event(kind, text + more, session)
 
     def status(self, status: Status) -> None:
         """Tell how the role is doing, now and to whoever asks before the next time."""

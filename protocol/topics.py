@@ -39,25 +39,31 @@ class Topic:
     model: str
 
 
-# fmt: off
 TOPICS: Final = {
     topic.name: topic
     for topic in (
         Topic("claim", "claim", "query", "controller", "once a session", "Claim"),
         Topic("release", "release", "query", "controller", "once a session", "Release"),
-        Topic("arm",         "arm",                   "query", "operator",      "when needed",             ""),
-        Topic("stop",        "stop",                  "query", "operator",      "when needed",             ""),
+        Topic("arm", "arm", "query", "operator", "when needed", ""),
+        Topic("stop", "stop", "query", "operator", "when needed", ""),
+        Topic("stand_down", "stand-down", "query", "operator", "when needed", ""),
+        Topic("recall", "recall", "query", "operator", "when needed", ""),
+        Topic("set_gains", "set-gains", "query", "operator", "when needed", "Gains"),
+        Topic("track", "track", "query", "operator", "when needed", "Track"),
+        Topic("inject", "inject", "query", "operator", "when needed", "Inject"),
+        Topic("advance", "advance", "query", "operator", "when needed", "Advance"),
         Topic("contract", "contract/{role}", "query", "every role", "when asked", "Contract"),
         Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", "Measurement"),
         Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),
         Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", "Telemetry"),
+        Topic("change", "change", "json", "controller", "when something changes", "Change"),
+        Topic("reference", "reference", "json", "operator", "as it streams", "Setpoint"),
         Topic("truth", "truth", "json", "plant", "truth_rate", "Truth"),
         Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", "Status"),
         Topic("event", "event", "json", "every role", "when it happens", "Event"),
         Topic("alive", "alive/{role}", "token", "every role", "while it lives", ""),
     )
 }
-# fmt: on
 
 _PATTERNS: Final = [
     (

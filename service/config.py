@@ -27,8 +27,8 @@ from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
 from protocol.network import NetworkSettings
 from protocol.quantizer import MAX_BITS, MIN_BITS
+from protocol.verbs import Reference, Sinusoid
 from service.law import LawSettings
-from service.reference import SinusoidSettings
 from service.settings import ControllerSettings, RecorderSettings
 
 ENV_PREFIX = "AEROLOOP_"
@@ -50,7 +50,7 @@ class Settings(BaseSettings):
     )
     loop: LoopSettings = LoopSettings()
     wire: WireSpec = WireSpec()
-    reference: SinusoidSettings = SinusoidSettings()
+    reference: Reference = Sinusoid()
     law: LawSettings = LawSettings()
     controller: ControllerSettings = ControllerSettings()
     plant: PlantSettings = PlantSettings()

@@ -9,12 +9,12 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 
-import casadi as ca
-
 from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
 from protocol.frames import WireSpec
 from protocol.symbolic import Compiled
+from protocol.verbs import Change, Gains, Reference
 from service.law import LawSettings, law_function
+from service.reference import Motion, Plan
 
 
 class Controller:
@@ -23,22 +23,23 @@ class Controller:
     Args:
         wire: How frames are read and written.
         law: Parameters and gains.
-        reference: t ↦ q_d, ω_d, ω̇_d, as `reference_function` makes it.
+        reference: What the body shall do from tick 0 on.
         period: Time between ticks [s].
 
     Attributes:
         tick_index: k of the last measurement answered; −1 before the first.
         counter: Its counter.
         voltages: The last u before quantization [V]. Shape (actuators,).
-        sign: ±1, the equilibrium that is approached; 0 before the first measurement.
+        motion: What it follows; may be told to follow something else between two ticks.
         refused: Malformed measurement frames so far.
+        failed: Whether the law has given no number.
         invalid: Measurements that said "no valid value" so far.
 
     Raises:
         ValueError: The law's B cannot be inverted.
     """
 
-    def __init__(self, wire: WireSpec, law: LawSettings, reference: ca.Function, period: float) -> None:
+    def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float) -> None:
         self.wire = wire
         self.period = period
         self.tick_index = -1
@@ -46,15 +47,16 @@ class Controller:
         self.voltages: list[float] = [0.0] * wire.actuators
         self.refused = 0
         self.invalid = 0
+        self.failed = False
         self._law = Compiled(law_function(law, period))
         inputs, outputs = self._law.inputs, self._law.outputs
         desired = {name: inputs[name] for name in ("q_d", "omega_d", "omega_d_dot")}
-        self._reference = Compiled(reference, shared=desired)
-        self._time = self._reference.inputs["t"]
+        self.motion = Motion(reference, shared=desired)
         self._q, self._omega, self._sign = inputs["q"], inputs["omega"], inputs["s"]
         self._theta, self._theta_next = inputs["theta"], outputs["theta_next"]
         self._u, self._eta_e, self._eps_e = outputs["u"], outputs["eta_e"], outputs["eps_e"]
         self._theta[:] = memoryview(array("d", law.damping_estimate))
+        self.set_gains(Gains(C1=law.C1, C2=law.C2, Gamma=law.Gamma))
         self._attitude: Quaternion = IDENTITY
         self._first_motor = 3 - wire.actuators
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
@@ -91,8 +93,7 @@ class Controller:
         self._attitude = received_quaternion(x, y, z, self._attitude)
         self._q[0], self._q[1], self._q[2], self._q[3] = self._attitude
         self._omega[0], self._omega[1], self._omega[2] = wx, wy, wz
-        self._time[0] = k * self.period
-        self._reference()
+        self.motion.at(k * self.period)
         if self.tick_index < 0:
             self._choose_sign()
         self._law()
@@ -100,9 +101,28 @@ class Controller:
         self.tick_index, self.counter = k, counter
         voltages: list[float] = self._u.tolist()[self._first_motor :]  # type: ignore[assignment]  # doubles
         if (total := sum(voltages)) != total:
+            self.failed = True
             return self._write(counter, self._no_command)
         self.voltages = voltages
         return self._write(counter, [encode(u) for encode, u in zip(self._encode, voltages, strict=True)])
+
+    def set_gains(self, gains: Gains) -> None:
+        """Use other gains from the next tick on; what is None stays as it is."""
+        for name in ("C1", "C2", "Gamma"):
+            if (diagonal := getattr(gains, name)) is not None:
+                self._law.inputs[name][:] = memoryview(array("d", diagonal))
+
+    def apply(self, change: Change) -> None:
+        """Follow a change as it was told; the next tick must be its first, or later."""
+        if change.gains is not None:
+            self.set_gains(change.gains)
+        if change.reference is not None:
+            self.motion.follow(Plan.of(change.reference), change.tick * self.period, change.within_s)
+
+    @property
+    def gains(self) -> Gains:
+        """The gains now."""
+        return Gains.model_validate({name: tuple(self._law.inputs[name]) for name in ("C1", "C2", "Gamma")})
 
     def _choose_sign(self) -> None:
         """z₁₊ or z₁₋ by the sign of η̃ at the first measurement, for good (Assumption 3)."""

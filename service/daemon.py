@@ -1,55 +1,52 @@
 """The controller process: claim a vehicle, then wait → tick → send → account, until told to stop.
 
-The plant's clock leads: a tick is due when its measurement arrives. In lockstep the very same loop runs as fast as the
-plant asks. Whenever the daemon has no session it claims again, four times a second, so either end may start first and
-either may be restarted. When measurements stop coming for longer than `stale_s` it gives the session up and says
-nothing more; the plant's watchdog does the rest.
+A tick is due when its measurement arrives, so that the plant's clock leads; or, with `pace = "clock"`, on a grid of its
+own, which takes the newest measurement. In lockstep the very same loop runs as fast as the plant asks. Whenever the
+daemon has no session it claims again, four times a second, so either end may start first and either may be restarted.
+When measurements stop coming for longer than `stale_s` it gives the session up and says nothing more; the plant's
+watchdog does the rest.
 """
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 import uuid
-from enum import StrEnum
+from collections.abc import Callable
 from typing import Final
 
 import zenoh
 from pydantic import ValidationError
 
 from protocol import topics
-from protocol.clock import LoopSettings, LoopTiming, prepare_process
+from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
 from protocol.errors import AeroloopError
 from protocol.frames import TickCounter, WireSpec
-from protocol.links import ZenohLink
-from protocol.messages import Claim, Grant, Refusal, Release, Status, Telemetry, report
+from protocol.links import Arrival, ZenohLink
+from protocol.messages import Status, Telemetry, report
 from protocol.role import Role
+from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
+from protocol.verbs import Answer, Ask, Reference
+from service.claimant import Claimant
 from service.controller import Controller
 from service.law import LawSettings
-from service.reference import SinusoidSettings, reference_function
+from service.live import Live
 from service.settings import ControllerSettings
-
-log: Final = logging.getLogger("aeroloop")
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 CLAIM_PERIOD_S: Final = 0.25
-ANSWER_WAIT_S: Final = 1.0
 LOCKSTEP_PATIENCE_S: Final = 2.0
-"""In lockstep the plant takes its time; only a plant that is gone is stale."""
+"""In lockstep a plant may take its time, but not to begin."""
+WAIT_S: Final = 0.02
+"""How often to look whether the session still stands while nothing comes [s]."""
+STALL_TICKS: Final = 10
+"""So many ticks missed in a row are worth a warning."""
+
+State, Trigger = ControllerState, ControllerTrigger
 
 
 class SessionLostError(AeroloopError):
     """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
-
-
-class DaemonState(StrEnum):
-    """What the daemon is doing."""
-
-    SEARCHING = "searching"
-    CLAIMED = "claimed"
-    RUNNING = "running"
-    HOLDING = "holding"
 
 
 class Daemon:
@@ -73,60 +70,69 @@ class Daemon:
         loop: LoopSettings,
         wire: WireSpec,
         law: LawSettings,
-        reference: SinusoidSettings,
+        reference: Reference,
         settings: ControllerSettings,
     ) -> None:
         self._role = role
         self._loop = loop
         self._wire = wire
-        self._law = law
-        self._reference = reference_function(reference)
         self._settings = settings
+        self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
-        self._patience_s = max(LOCKSTEP_PATIENCE_S, settings.stale_s) if loop.lockstep else settings.stale_s
+        self._claimant = Claimant(role, loop, wire, auto_arm=settings.auto_arm)
+        self._live = Live(role, law, reference, settings, rolls=wire.actuators == 3)
+        self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
+        self._grid: TickGrid | None = None
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
-        self._telemetry_every = max(1, round(loop.rate_hz / settings.telemetry_rate_hz))
-        self._state = DaemonState.SEARCHING
-        self._session: str | None = None
         self._recorders = 0
-        self._told = self._lost = ""
+        self._plant: Status | None = None
+        self._granted = False  # whether the plant's status has ever named this session
+        self._lost = ""
         self._sent = self._received = self._skipped = self._refused = self._saturated = 0
         self._notes: list[str] = []
         self._timing: LoopTiming | None = None
         self._status_due = 0
         self._status_ticks = 0
         self._status_time = time.monotonic()
+        self._take(settings)
 
     def run(self) -> None:
         """Run until the role is told to stop or `duration_s` of the law's time are over."""
         if not self._loop.lockstep:
             self._notes = prepare_process(self._loop)
             self._timing = LoopTiming()
-        self._role.watch_tokens(self._token)
-        self._role.announce()
-        self._role.event("started", f"{self._role.name} looks for {self._role.vehicle}")
+            if self._settings.pace == "clock":
+                self._grid = TickGrid(self._loop.period_ns)
+        role = self._role
+        self._live.serve()
+        role.serve("stand_down", Ask, lambda _: self._stand_down)
+        role.serve("recall", Ask, lambda _: self._recall)
+        role.watch_tokens(self._token)
+        role.zenoh.declare_subscriber(topics.key("status", role.vehicle, role="plant"), self._hear_plant)
+        role.announce()
+        role.event("started", f"{role.name} looks for {role.vehicle}")
         try:
             finished = False
-            while not finished and not self._role.stop.is_set():
+            while not finished and not role.stop.is_set():
                 ready = self._recorders or not self._settings.require_recorder
-                link = self._claim() if ready else None
+                link = self._claim() if ready and self._machine.state is State.SEARCHING else None
                 if link is None:
                     self._publish_when_due()
-                    self._role.stop.wait(CLAIM_PERIOD_S)
+                    role.stop.wait(CLAIM_PERIOD_S)
+                    role.take_inbox()
                     continue
                 try:
                     finished = self._run(link)
                 finally:
-                    self._release()
-                    link.close()
-                if not finished and self._last_tick is not None and not self._role.stop.is_set():
+                    self._end(link)
+                if not finished and self._last_tick is not None and not role.stop.is_set():
                     raise SessionLostError(
-                        f"{self._lost} after {self._controller.tick_index + 1} ticks, so the run is over; "
-                        "a machine too busy for real time can still run it in lockstep"
+                        f"{self._lost} after {self._controller.tick_index + 1} ticks, so the run is over"
+                        + ("" if self._loop.lockstep else "; a machine too busy for real time can run it in lockstep")
                     )
         finally:
-            self._state = DaemonState.HOLDING
-            self._role.event("stopped", f"{self._role.name} stopped commanding")
+            self._machine.fire(Trigger.STAND_DOWN)
+            role.event("stopped", f"{role.name} stopped commanding")
             self._publish_status()
 
     def _run(self, link: ZenohLink) -> bool:
@@ -134,128 +140,169 @@ class Daemon:
 
         The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
         """
-        controller, stop = self._controller, self._role.stop
+        controller, live, timing = self._controller, self._live, self._timing
         ticks = TickCounter(self._loop.period_ns, lockstep=self._loop.lockstep)
         k, heard = -1, time.monotonic()
-        while not stop.is_set() and (self._last_tick is None or k < self._last_tick):
-            arrival = link.wait(self._settings.stale_s)
+        while self._may_go_on() and (self._last_tick is None or k < self._last_tick):
+            arrival = self._next(link)
             if arrival is None:
-                if time.monotonic() - heard > self._patience_s:
-                    return self._lose(f"no measurement for {(time.monotonic() - heard) * 1e3:.0f} ms")
+                if (reason := self._is_lost(time.monotonic() - heard)) is not None:
+                    return self._lose(reason)
                 continue
-            if self._timing:
-                self._timing.woke(arrival.at_ns)
+            if timing:
+                timing.woke(self._grid.due_ns if self._grid else arrival.at_ns)
             heard = time.monotonic()
             read = self._wire.measurement.unpack(arrival.frame)
             # What is malformed counts as the measurement that was due, and is refused by the controller.
             measured = k + 1 if read is None else ticks.advance(read[0], arrival.published_ns)
             if measured is None:
                 continue
+            live.before_tick(measured)
+            if not self._may_go_on():
+                break
             command = controller.tick(arrival.frame, measured)
             if command is not None:
                 link.send(command)
             self._account(command, measured, max(0, measured - k - 1))
             k = measured
-            if self._timing:
-                self._timing.done()
-        return not stop.is_set()
+            if timing:
+                timing.done()
+        return self._may_go_on()
+
+    def _may_go_on(self) -> bool:
+        return not self._role.stop.is_set() and self._machine.state not in (State.HOLDING, State.FAULTED)
+
+    def _next(self, link: ZenohLink) -> Arrival | None:
+        """The measurement of the next tick, or None if none has come by then."""
+        if self._grid is None:
+            return link.wait(min(WAIT_S, self._stale_s))
+        self._grid.wait()
+        return link.take()
 
     def _account(self, command: bytes | None, measured: int, missed: int) -> None:
         self._received += 1
         self._skipped += missed
+        if missed >= STALL_TICKS:
+            self._role.warn("stall", "fault", f"{missed} ticks missed at once", self._claimant.session)
         if command is not None:
             self._sent += 1
-        if self._controller.tick_index == measured:  # it used the measurement
-            if self._state is not DaemonState.RUNNING:
-                self._state = DaemonState.RUNNING
-                self._publish_telemetry()
-                self._role.event("claimed", f"{self._role.name} has {self._role.vehicle}", self._session)
-            elif measured % self._telemetry_every == 0:
-                self._publish_telemetry()
+            self._follow(measured)
+        if self._controller.tick_index == measured and measured % self._telemetry_every == 0:
+            self._publish_telemetry()
         self._publish_when_due()
+
+    def _follow(self, measured: int) -> None:
+        """Move the state machine after an answer."""
+        before, session, role = self._machine.state, self._claimant.session, self._role
+        if self._controller.failed:
+            self._machine.fire(Trigger.FAULT)
+            self._lost = "the law gave no number"
+            role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session)
+        elif self._controller.tick_index != measured:
+            if before is not State.READY:
+                self._machine.fire(Trigger.INVALID)
+                role.warn("invalid", "fault", "no valid measurement: commands no valid value", session)
+        elif before is not State.RUNNING:
+            self._machine.fire(Trigger.ANSWERED)
+            self._publish_telemetry()  # tells a log's reader which tick the first counter was
+            if before is State.CLAIMED:
+                role.event("claimed", f"{role.name} has {role.vehicle}", session)
+        if self._machine.state is not before:
+            self._status_due = 0
 
     # ── the session ──
 
-    def _new_controller(self) -> Controller:
-        return Controller(self._wire, self._law, self._reference, self._loop.period)
-
     def _claim(self) -> ZenohLink | None:
-        """Ask for the vehicle. The link is there before the question, so that the first measurement is not lost."""
-        role = self._role
-        claim = Claim(
-            controller=role.name,
-            session=uuid.uuid4().hex[:8],
-            period_ns=self._loop.period_ns,
-            lockstep=self._loop.lockstep,
-            auto_arm=self._settings.auto_arm,
-            wire=self._wire,
-        )
-        link = ZenohLink(
-            role.zenoh,
-            send_key=topics.key("command", role.vehicle, session=claim.session),
-            receive_key=topics.key("measurement", role.vehicle, session=claim.session),
-            lossless=self._loop.lockstep,
-        )
-        answer = self._ask(claim)
-        if isinstance(answer, Grant):
+        if self._controller.tick_index >= 0:  # made before the claim: once granted, every tick counts
             self._refused += self._controller.refused
             self._saturated += self._controller.saturated
             self._controller = self._new_controller()
-            self._session, self._state, self._told = claim.session, DaemonState.CLAIMED, ""
-            return link
-        link.close()
-        if answer is not None and answer.reason != self._told:
-            self._told = answer.reason
-            role.event("refused", f"{role.vehicle} refuses: {answer.reason}", claim.session)
-        return None
+        link = self._claimant.claim()
+        if link is None:
+            return None
+        self._granted = self._plant is not None and self._plant.session == self._claimant.session
+        self._machine.fire(Trigger.GRANT)
+        assert self._claimant.session is not None
+        self._live.begin(self._controller, self._claimant.session)
+        return link
 
-    def _ask(self, claim: Claim) -> Grant | Refusal | None:
-        """The plant's answer, or None if there is no plant, or none that answers in time."""
-        key = topics.key("claim", self._role.vehicle)
-        for reply in self._role.zenoh.get(key, payload=claim.encode(), timeout=ANSWER_WAIT_S):
-            if reply.ok is None:
-                continue
-            payload = reply.ok.payload.to_bytes()
-            for model in (Grant, Refusal):
-                try:
-                    return model.model_validate_json(payload)
-                except ValidationError:
-                    continue
+    def _is_lost(self, silent_s: float) -> str | None:
+        """Why the session is over, if it is: the plant says so, or is gone, or has been silent for too long."""
+        plant = self._plant
+        if plant is not None and self._granted and plant.session != self._claimant.session:
+            return f"the plant ended the session{': ' + plant.cause if plant.cause else ''}"
+        # In lockstep a plant may rest between two steps; it is lost once its session is, or it never had one.
+        patience = LOCKSTEP_PATIENCE_S if self._loop.lockstep and not self._granted else self._stale_s
+        if silent_s > patience and not (self._loop.lockstep and self._granted and plant is not None):
+            return f"no measurement for {silent_s * 1e3:.0f} ms"
         return None
 
     def _lose(self, reason: str) -> bool:
-        if self._timing:
-            self._timing.pause()
-        self._state, self._lost = DaemonState.SEARCHING, reason
-        self._role.event("lost", f"{reason}: stopped commanding, looking for {self._role.vehicle}", self._session)
+        self._machine.fire(Trigger.LOST)
+        self._lost = reason
+        text = f"{reason}: stopped commanding, looking for {self._role.vehicle}"
+        self._role.event("lost", text, self._claimant.session)
         return False
 
-    def _release(self) -> None:
-        """Give the session back, whether or not the plant still is there to take it."""
-        if self._session is None:
-            return
-        release = Release(session=self._session)
-        key = topics.key("release", self._role.vehicle)
-        try:
-            for _ in self._role.zenoh.get(key, payload=release.encode(), timeout=ANSWER_WAIT_S):
-                pass
-        except zenoh.ZError as error:
-            log.warning("controller: could not release the session: %s", error)
-        self._session = None
+    def _end(self, link: ZenohLink) -> None:
+        if self._timing:
+            self._timing.pause()
+        self._live.end()
+        self._claimant.release()
+        link.close()
+        self._status_due = 0
 
     def _token(self, name: str, came: bool) -> None:
         if name == "recorder":
             self._recorders = max(0, self._recorders + (1 if came else -1))
+        elif name == "plant" and not came:
+            self._plant = None
+
+    def _hear_plant(self, sample: zenoh.Sample) -> None:
+        try:
+            self._plant = plant = Status.model_validate_json(sample.payload.to_bytes())
+        except ValidationError:
+            self._role.warn("plant's status", "fault", "the plant's status is not one: is it of another version?")
+        else:
+            self._granted = self._granted or plant.session == self._claimant.session is not None
+
+    # ── an operator's words, taken between ticks ──
+
+    def _stand_down(self) -> Answer:
+        name, vehicle = self._role.name, self._role.vehicle
+        if self._claimant.session is None:
+            return Answer(done=False, text=f"{name} does not have {vehicle}")
+        self._machine.fire(Trigger.STAND_DOWN)
+        self._lost = "released by an operator"
+        self._role.event("released", f"{self._lost}: {name} holds until `aeroloop op arm`", self._claimant.session)
+        return Answer(done=True, text=f"{name} gives {vehicle} back and holds until `aeroloop op arm`")
+
+    def _recall(self) -> Answer:
+        if self._machine.state not in (State.HOLDING, State.FAULTED):
+            return Answer(done=False, text=f"{self._role.name} is {self._machine.state}")
+        self._machine.fire(Trigger.RECALL)
+        return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
+
+    def reconfigure(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> None:
+        """Take over gains, reference and settings between two ticks."""
+        self._live.configure(settings)
+        self._live.adopt(law, reference)
+        self._take(settings)
+
+    def _take(self, settings: ControllerSettings) -> None:
+        self._stale_s = settings.stale_s
+        self._claimant.auto_arm = settings.auto_arm
+        self._telemetry_every = max(1, round(self._loop.rate_hz / settings.telemetry_rate_hz))
 
     # ── what it tells ──
 
     def _publish_telemetry(self) -> None:
         controller = self._controller
-        assert self._session is not None
+        assert self._claimant.session is not None
         self._role.publish(
             "telemetry",
             Telemetry(
-                session=self._session,
+                session=self._claimant.session,
                 tick=controller.tick_index,
                 counter=controller.counter,
                 attitude_error=controller.attitude_error,
@@ -276,15 +323,15 @@ class Daemon:
         self._role.status(
             Status(
                 role=self._role.role,
-                state=self._state,
-                session=self._session,
+                state=self._machine.state,
+                session=self._claimant.session,
                 uptime_s=self._role.uptime_s,
                 ticks=self._received,
                 rate_hz=(self._received - self._status_ticks) / (now - self._status_time),
                 skipped=self._skipped,
                 received=self._received,
                 sent=self._sent,
-                refused=self._refused + self._controller.refused,
+                refused=self._refused + self._controller.refused + self._live.refused,
                 saturated=self._saturated + self._controller.saturated,
                 timing=report(self._timing) if self._timing else None,
                 notes=self._notes,

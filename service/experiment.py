@@ -10,11 +10,11 @@ import gc
 from collections.abc import Callable, Iterator
 
 from plant_emulator.endpoint import Endpoint
+from plant_emulator.plant import Plant
 from protocol.messages import Claim, Refusal
 from service.config import Settings
 from service.controller import Controller
 from service.figures import Figures, Score
-from service.reference import reference_function
 
 NO_CLOCK = "lockstep without a network has no latency"
 
@@ -31,8 +31,8 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
         ValueError: The configuration does not make a loop, such as a law that commands 3 motors of a plant with 2.
     """
     loop, wire = settings.loop, settings.wire
-    plant = settings.plant.build(loop.period)
-    controller = Controller(wire, settings.law, reference_function(settings.reference), loop.period)
+    plant = _plant(settings)
+    controller = Controller(wire, settings.law, settings.reference, loop.period)
     guard = settings.plant.guard(loop.period_ns, wire.voltage.quantizer().outermost)
     endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, guard=guard)
     score = Score(wire, loop.period, settings.plant.watchdog_s)
@@ -56,6 +56,19 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
     return score.figures(reasons={"latency_us": NO_CLOCK, "log": "nothing crossed a network"})
+
+
+def _plant(settings: Settings) -> Plant:
+    """The plant, with the faults that were asked for; frames cannot fail where they cross no network."""
+    plant: Plant = settings.plant.build(settings.loop.period)
+    if not settings.plant.faults:
+        return plant
+    for fault in settings.plant.parsed_faults:
+        if fault.signal in ("measurement", "command"):
+            raise ValueError(f"fault {fault} acts on frames that cross a network: use `aeroloop demo --lockstep`")
+    faulty = settings.plant.with_faults(plant, settings.loop.period)
+    faulty.start()
+    return faulty
 
 
 def _undisturbed(ticks: int) -> Iterator[int]:

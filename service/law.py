@@ -8,6 +8,8 @@
     ω̇_d      omega_d_dot    its derivative                                 rad/s²      3
     θ̂        theta          estimate of the damping θ                      N·m·s/rad   3
     ±        s              sign of η̃(t0): +1 for z₁₊, −1 for z₁₋          1           1
+    C₁ C₂ Γ  C1, C2, Gamma  gains, diagonal; symbols, so that they may     see below   3
+                            change while the loop runs
     e^Q      eta_e, eps_e   tracking error, scalar and vector part         1           1, 3
     ω_e^Q    omega_e        angular velocity error                         rad/s       3
     u        u              command before quantization                    V           3
@@ -29,6 +31,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from protocol.attitude import R, S
+from protocol.verbs import Gain
 
 
 def _positive(gains: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -56,9 +59,9 @@ class LawSettings(BaseModel):
         default=((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, -0.0014, 0.00176)),
         description="B, control allocation, invertible [N·m/V]; the Aero's first row is fictitious",
     )
-    C1: Diagonal = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
-    C2: Diagonal = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
-    Gamma: Diagonal = Field(default=(0.02, 0.02, 0.02), description="adaptation gain [N·m·s²/rad² per s]")
+    C1: Gain = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
+    C2: Gain = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
+    Gamma: Gain = Field(default=(0.02, 0.02, 0.02), description="adaptation gain [N·m·s²/rad² per s]")
     damping_estimate: tuple[float, float, float] = Field(
         default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
     )
@@ -82,6 +85,9 @@ class Law:
     omega_d_dot: ca.SX
     theta: ca.SX
     s: ca.SX
+    C1: ca.SX
+    C2: ca.SX
+    Gamma: ca.SX
     eta_e: ca.SX
     eps_e: ca.SX
     omega_e: ca.SX
@@ -93,7 +99,7 @@ class Law:
 
 
 def build_law(p: LawSettings) -> Law:
-    """The law for these parameters, as CasADi expressions.
+    """The law for these parameters, as CasADi expressions; the gains are symbols among them.
 
     Raises:
         ValueError: B cannot be inverted.
@@ -101,7 +107,8 @@ def build_law(p: LawSettings) -> Law:
     if np.linalg.cond(np.array(p.allocation)) > 1e12:
         raise ValueError("law.allocation (B) has no inverse: every axis needs a motor that acts on it")
     J, B = ca.diag(ca.SX(p.inertia)), ca.SX(np.array(p.allocation))
-    C1, C2, Gamma = (ca.diag(ca.SX(gains)) for gains in (p.C1, p.C2, p.Gamma))
+    gains = ca.SX.sym("C1", 3), ca.SX.sym("C2", 3), ca.SX.sym("Gamma", 3)
+    C1, C2, Gamma = (ca.diag(gain) for gain in gains)
     r_g = ca.SX(p.centre_of_mass)
     f_g = ca.vertcat(0, 0, -p.mass * p.gravity)
     I = ca.SX.eye(3)  # noqa: E741  # the paper's identity matrix
@@ -132,7 +139,7 @@ def build_law(p: LawSettings) -> Law:
     tau = Gamma @ Phi @ z2  # (C.23)
     theta_dot = projection(tau, theta, Gamma, p.damping_bound)  # (C.38)
 
-    return Law(q, omega, q_d, omega_d, omega_d_dot, theta, s, eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot)
+    return Law(q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains, eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot)
 
 
 def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
@@ -157,7 +164,7 @@ def law_function(p: LawSettings, period: float) -> ca.Function:
     """The law as the loop evaluates it: one tick, with θ̂ carried over a period by Euler's rule.
 
     Args:
-        p: Parameters and gains.
+        p: Parameters; the gains are inputs.
         period: Time between ticks [s].
 
     Raises:
@@ -169,8 +176,8 @@ def law_function(p: LawSettings, period: float) -> ca.Function:
     theta_next *= ca.fmin(1, p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
     return ca.Function(
         "law",
-        [law.q, law.omega, law.q_d, law.omega_d, law.omega_d_dot, law.theta, law.s],
+        [law.q, law.omega, law.q_d, law.omega_d, law.omega_d_dot, law.theta, law.s, law.C1, law.C2, law.Gamma],
         [law.u, theta_next, law.eta_e, law.eps_e, law.omega_e],
-        ["q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s"],
+        ["q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s", "C1", "C2", "Gamma"],
         ["u", "theta_next", "eta_e", "eps_e", "omega_e"],
     )

@@ -1,20 +1,24 @@
-"""An operator's verbs: look at every role on the network, arm a plant, stop it.
+"""An operator's verbs: look at every role on the network, arm a plant, stop it, change what a controller follows.
 
 Each is a question over Zenoh, answered by the role it is put to. Status is answered by the role's network thread from
-what it last said, so asking never stalls a loop; arm and stop are taken by the plant between two ticks.
+what it last said, so asking never stalls a loop; the other verbs are taken between two ticks.
 """
 
 from __future__ import annotations
 
+import csv
 import time
+from pathlib import Path
 from typing import Final
 
 import zenoh
+from pydantic import ValidationError
 
 from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.messages import Status
 from protocol.network import NetworkSettings, join
+from protocol.verbs import Answer, Ask, Gains, Message, Points, Track
 
 GATHER_S: Final = 1.0
 """How long to look for roles. Gossip links a newcomer to all of them in some 50 ms."""
@@ -30,6 +34,8 @@ class OperatorError(AeroloopError):
 def gather(network: NetworkSettings) -> Statuses:
     """Status of every role of every vehicle on the network, by vehicle and role.
 
+    Of several controllers of one vehicle it is the one that has it, if any does.
+
     Raises:
         NetworkError: The network cannot be joined.
         OperatorError: Nobody is there.
@@ -38,52 +44,116 @@ def gather(network: NetworkSettings) -> Statuses:
         found: Statuses = {}
         deadline = time.monotonic() + GATHER_S
         while time.monotonic() < deadline:
-            for reply in session.get(topics.key("status", "*"), timeout=ANSWER_S):
+            now: Statuses = {}
+            for reply in session.get(topics.key("status", "*"), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL):
                 if reply.ok is None or (address := topics.read_key(str(reply.ok.key_expr))) is None:
                     continue
                 if address.role is not None:
                     status = Status.model_validate_json(reply.ok.payload.to_bytes())
-                    found.setdefault(address.vehicle, {})[address.role] = status
+                    roles = now.setdefault(address.vehicle, {})
+                    if address.role not in roles or status.session:
+                        roles[address.role] = status
+            for vehicle, roles in now.items():
+                found.setdefault(vehicle, {}).update(roles)
             time.sleep(0.1)
     if not found:
         raise OperatorError(f"nobody answers at {network.rendezvous}; is an emulator or a controller running?")
     return found
 
 
-def arm(network: NetworkSettings, vehicle: str) -> None:
-    """Arm a plant, so that the next claim is granted.
+def arm(network: NetworkSettings, vehicle: str) -> str:
+    """Arm a plant, so that the next claim is granted, and recall controllers that hold or are faulted.
+
+    Returns:
+        What was done, in a line.
 
     Raises:
         NetworkError: The network cannot be joined.
         OperatorError: No plant answers, or a controller holds it.
     """
-    if not _ask(network, "arm", vehicle):
-        raise OperatorError(f"{vehicle} is held by a controller, so there is nothing to arm")
+    with join(network) as session:
+        text = _ask(session, network, vehicle, "arm", Ask())
+        recalled = [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
+        return "; ".join([text, *recalled])
 
 
-def stop(network: NetworkSettings, vehicle: str) -> None:
-    """Stop a plant: 0 V at its next tick, and no claim until it is armed.
+def stop(network: NetworkSettings, vehicle: str) -> str:
+    """Stop a plant: 0 V at its next tick, and no claim until it is armed. Raises as `arm` does."""
+    return _tell(network, vehicle, "stop", Ask())
+
+
+def release(network: NetworkSettings, vehicle: str) -> str:
+    """Let the controller that has a vehicle give it back and hold until `arm`. Raises as `arm` does."""
+    return _tell(network, vehicle, "stand_down", Ask())
+
+
+def set_gains(network: NetworkSettings, vehicle: str, gains: Gains) -> str:
+    """Let the controller that has a vehicle use other gains from its next tick on. Raises as `arm` does."""
+    return _tell(network, vehicle, "set_gains", gains)
+
+
+def track(network: NetworkSettings, vehicle: str, track: Track) -> str:
+    """Let the controller that has a vehicle follow another reference. Raises as `arm` does."""
+    return _tell(network, vehicle, "track", track)
+
+
+def read_points(path: Path) -> Points:
+    """Attitudes over time out of a CSV file: columns time [s], roll, pitch, yaw [deg], with or without a heading.
 
     Raises:
-        NetworkError: The network cannot be joined.
-        OperatorError: No plant answers.
+        OperatorError: It cannot be read, or is no such table; names the line.
     """
-    _ask(network, "stop", vehicle)
+    times: list[float] = []
+    attitudes: list[tuple[float, float, float]] = []
+    try:
+        with path.open(newline="") as file:
+            for number, row in enumerate(csv.reader(file), start=1):
+                if not row or (number == 1 and not _is_number(row[0])):
+                    continue
+                if len(row) != 4 or not all(_is_number(cell) for cell in row):
+                    raise OperatorError(
+                        f"{path}, line {number}: expected four numbers (time [s], roll, pitch, yaw [deg]), not "
+                        f"{','.join(row)!r}"
+                    )
+                time_s, roll, pitch, yaw = (float(cell) for cell in row)
+                times.append(time_s)
+                attitudes.append((roll, pitch, yaw))
+        return Points(times=times, attitudes=attitudes)
+    except (OSError, UnicodeDecodeError) as error:
+        raise OperatorError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    except ValidationError as error:
+        raise OperatorError(f"{path}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
 
 
-def _ask(network: NetworkSettings, verb: str, vehicle: str) -> bool:
-    """Put a question to a plant until it answers; a newcomer's links take a moment."""
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _tell(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
     with join(network) as session:
-        deadline = time.monotonic() + ANSWER_S
-        while time.monotonic() < deadline:
-            if (answer := _answer(session, topics.key(verb, vehicle))) is not None:
-                return answer == b"true"
-            time.sleep(0.02)
-    raise OperatorError(f"no plant called {vehicle} answers at {network.rendezvous}")
+        return _ask(session, network, vehicle, topic, message)
 
 
-def _answer(session: zenoh.Session, key: str) -> bytes | None:
-    for reply in session.get(key, timeout=ANSWER_S):
-        if reply.ok is not None:
-            return reply.ok.payload.to_bytes()
-    return None
+def _ask(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+    """Put a question until somebody answers, since a newcomer's links take a moment; one yes is enough."""
+    deadline = time.monotonic() + ANSWER_S
+    while time.monotonic() < deadline:
+        if answers := _answers(session, topic, vehicle, message):
+            for answer in answers:
+                if answer.done:
+                    return answer.text
+            raise OperatorError("; ".join(answer.text for answer in answers))
+        time.sleep(0.02)
+    who = "plant" if topic in ("arm", "stop") else "controller"
+    raise OperatorError(f"no {who} of {vehicle} answers at {network.rendezvous}")
+
+
+def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:
+    replies = session.get(
+        topics.key(topic, vehicle), payload=message.encode(), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL
+    )
+    return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]

@@ -15,16 +15,15 @@ import time
 from collections import deque
 from datetime import datetime
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import zenoh
 from mcap.writer import CompressionType, Writer
-from pydantic import BaseModel
 
-from protocol import messages, topics
+from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.links import published_ns
-from protocol.messages import Contract, Status
+from protocol.messages import Contract, Status, model_of
 from protocol.role import Role, versions
 from service.settings import RecorderSettings
 
@@ -70,7 +69,7 @@ class LogFile:
             ) from None
         self.path = path
         self.written = 0
-        self._chunk_ns = round(chunk_s * 1e9)
+        self.chunk_s = chunk_s
         self._flushed = time.monotonic_ns()
         self._channels: dict[str, tuple[int, list[int]]] = {}
         self._schemas: dict[str, int] = {}
@@ -101,7 +100,7 @@ class LogFile:
 
     def flush_when_due(self) -> None:
         """Close the chunk if it has been open for `chunk_s`."""
-        if time.monotonic_ns() - self._flushed >= self._chunk_ns:
+        if time.monotonic_ns() - self._flushed >= self.chunk_s * 1e9:
             self._flushed = time.monotonic_ns()
             self._writer.flush()
             self._file.flush()
@@ -114,27 +113,21 @@ class LogFile:
     def _channel(self, key: str) -> int:
         address = topics.read_key(key)
         carries = address.topic.carries if address else "unknown"
-        model = address.topic.model if address else ""
-        schema = self._schema(model, carries)
+        schema = self._schema(address.topic) if address else 0
         encoding = {"frame": FRAME_ENCODING, "unknown": "application/octet-stream"}.get(carries, "json")
         return self._writer.register_channel(topic=key, message_encoding=encoding, schema_id=schema)
 
-    def _schema(self, model: str, carries: str) -> int:
-        if carries == "unknown":
-            return 0
-        if model not in self._schemas:
-            if carries == "frame":
-                text = f"{model} frame: bits as in protocol/SPEC.md, by the wire spec in the plant's contract"
-                self._schemas[model] = self._writer.register_schema(f"aeroloop.{model}", FRAME_ENCODING, text.encode())
+    def _schema(self, topic: topics.Topic) -> int:
+        if topic.model not in self._schemas:
+            if topic.carries == "frame":
+                encoding = FRAME_ENCODING
+                text = f"{topic.model} frame: bits as in protocol/SPEC.md, by the wire spec in the plant's contract"
             else:
-                schema = _json_schema(getattr(messages, model))
-                self._schemas[model] = self._writer.register_schema(f"aeroloop.{model}", "jsonschema", schema)
-        return self._schemas[model]
-
-
-def _json_schema(model: type[BaseModel]) -> bytes:
-    schema: dict[str, Any] = model.model_json_schema()
-    return json.dumps(schema).encode()
+                encoding, text = "jsonschema", json.dumps(model_of(topic).model_json_schema())
+            self._schemas[topic.model] = self._writer.register_schema(
+                f"aeroloop.{topic.model}", encoding, text.encode()
+            )
+        return self._schemas[topic.model]
 
 
 class Recorder:
@@ -171,6 +164,7 @@ class Recorder:
             while not self._role.stop.is_set():
                 self._role.stop.wait(DRAIN_WAIT_S)
                 self._drain()
+                self._role.take_inbox()
                 self._fetch_contracts()
                 self._publish_status_when_due()
                 self._log.flush_when_due()
@@ -180,6 +174,10 @@ class Recorder:
             subscriber.undeclare()
             self._drain()
             self._log.close()
+
+    def reconfigure(self, settings: RecorderSettings) -> None:
+        """Take over what can change while recording: how often a chunk is closed."""
+        self._log.chunk_s = settings.chunk_s
 
     def _take(self, sample: zenoh.Sample) -> None:
         now = time.time_ns()

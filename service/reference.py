@@ -1,45 +1,280 @@
-"""What the body shall do: Euler angles as expressions of time, and what the law needs of them.
+"""What the body shall do: Euler angles over time, and what the law needs of them.
 
-A reference says roll, pitch and yaw as a CasADi expression of t. The desired quaternion, the angular velocity of (C.12)
-in the inertial frame and its derivative follow by CasADi's own derivatives, so they are exact and agree.
+Every reference is a row of pieces, and every piece a quintic plus a sinusoid, of which either may be zero. One CasADi
+function evaluates any piece: the desired quaternion, the angular velocity of (C.12) in the inertial frame and its
+derivative follow by CasADi's own derivatives, so they are exact and agree. Another reference is joined to the one
+before by a quintic piece: angle, rate and acceleration never jump, however often somebody changes his mind.
 """
 
 from __future__ import annotations
 
-from math import pi
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import acos, degrees, pi
+from typing import Final, NamedTuple
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from numpy.typing import NDArray
 
 from protocol.attitude import conjugate, from_euler, product
+from protocol.errors import AeroloopError
+from protocol.symbolic import Buffer, Compiled
+from protocol.verbs import Hold, Points, Reference, Sinusoid
 
-Triple = tuple[float, float, float]
-Frequency = Annotated[float, Field(ge=0, le=100)]
+Floats = NDArray[np.float64]
+
+POWERS: Final = 6
+_SAMPLES: Final = 65
+"""Of a quintic, whose rate is a polynomial of degree 4: the largest of so many is within 0.1 % of the maximum."""
+_LONGEST_LOOK_S: Final = 600.0
+_SLOWER: Final = 1.05
+_TRIES: Final = 8
 
 
-class SinusoidSettings(BaseModel):
-    """amplitude · sin(frequency · t) on each of roll, pitch and yaw. The default is the paper's experiment, C.5."""
+class FollowError(AeroloopError):
+    """A reference that the vehicle must not follow; one line that says what would do."""
 
-    model_config = ConfigDict(extra="forbid")
 
-    kind: Literal["sinusoid"] = "sinusoid"
-    amplitude: Triple = Field(default=(0.0, 40.0, 100.0), description="of roll, pitch, yaw [deg]")
-    frequency: tuple[Frequency, Frequency, Frequency] = Field(
-        default=(0.0, 0.1 * pi, 0.05 * pi), description="of roll, pitch, yaw [rad/s]"
+class Limits(NamedTuple):
+    """How far a reference may go.
+
+    Attributes:
+        rate: Largest angular velocity [rad/s].
+        tilt: Largest angle between the body's z axis and the vertical [rad].
+        rolls: Whether the vehicle can roll; a 2-DOF bench cannot.
+    """
+
+    rate: float
+    tilt: float
+    rolls: bool
+
+
+class Angles(NamedTuple):
+    """Roll, pitch, yaw [rad], their rates [rad/s] and accelerations [rad/s²]; each of shape (…, 3)."""
+
+    angle: Floats
+    rate: Floats
+    acceleration: Floats
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Pieces in a row, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last goes on for ever.
+
+    Attributes:
+        starts: When each begins [s], rising. Shape (n,).
+        quintic: c₀…c₅ of roll, pitch, yaw [rad/sᵖ]. Shape (n, 6, 3).
+        amplitude: Of roll, pitch, yaw [rad]. Shape (n, 3).
+        frequency: Of roll, pitch, yaw [rad/s]. Shape (n, 3).
+    """
+
+    starts: Floats
+    quintic: Floats
+    amplitude: Floats
+    frequency: Floats
+
+    @classmethod
+    def of(cls, reference: Reference) -> Plan:
+        """The plan of a reference whose time begins at 0. A stream holds 0 until it is told more."""
+        if isinstance(reference, Points):
+            return cls._through(np.array(reference.times), np.radians(np.array(reference.attitudes)))
+        still = cls._polynomial(np.zeros(1), np.zeros((1, POWERS, 3)))
+        if isinstance(reference, Sinusoid):
+            amplitude = np.array([[a * (pi / 180) for a in reference.amplitude]])
+            return replace(still, amplitude=amplitude, frequency=np.array([reference.frequency]))
+        if isinstance(reference, Hold) and reference.attitude is not None:
+            still.quintic[0, 0] = np.radians(reference.attitude)
+        return still
+
+    @classmethod
+    def _polynomial(cls, starts: Floats, quintic: Floats) -> Plan:
+        return cls(starts, quintic, np.zeros((len(starts), 3)), np.zeros((len(starts), 3)))
+
+    @classmethod
+    def _through(cls, times: Floats, angles: Floats) -> Plan:
+        """Through points, with the rates and accelerations of their differences; at rest at both ends."""
+        rates = np.gradient(angles, times, axis=0)
+        rates[0] = rates[-1] = 0.0
+        accelerations = np.gradient(rates, times, axis=0)
+        accelerations[0] = accelerations[-1] = 0.0
+        here = Angles(angles[:-1], rates[:-1], accelerations[:-1])
+        there = Angles(angles[1:], rates[1:], accelerations[1:])
+        last = np.zeros((1, POWERS, 3))
+        last[0, 0] = angles[-1]
+        return cls._polynomial(times, np.concatenate([join(here, there, np.diff(times)), last]))
+
+    def joined(self, here: Angles, t: float, within_s: float) -> Plan:
+        """This plan from t + within_s on, reached by a quintic from where one is at t. Shapes of `here`: (1, 3)."""
+        later = replace(self, starts=self.starts + (t + within_s))
+        if not within_s:
+            return later
+        first = Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
+        approach = self._polynomial(np.array([t]), join(here, first, np.array([within_s])))
+        return Plan(*(np.concatenate([getattr(p, name) for p in (approach, later)]) for name in self.__annotations__))
+
+    def piece(self, t: float) -> int:
+        """Which piece time t [s] lies in."""
+        return max(0, int(np.searchsorted(self.starts, t, side="right")) - 1)
+
+    def at(self, tau: Floats) -> Angles:
+        """Angles of every piece at times τ since its start [s]. Shape of τ: (n, m), of the angles (n, m, 3)."""
+        tau = tau[:, :, None]
+        angle, rate, acceleration = np.zeros((3, *tau.shape[:2], 3))
+        for power in reversed(range(POWERS)):  # Horner's rule, for the polynomial and its derivatives at once
+            acceleration = acceleration * tau + 2 * rate
+            rate = rate * tau + angle
+            angle = angle * tau + self.quintic[:, None, power]
+        amplitude, f = self.amplitude[:, None], self.frequency[:, None]
+        return Angles(
+            angle + amplitude * np.sin(f * tau),
+            rate + amplitude * f * np.cos(f * tau),
+            acceleration - amplitude * f * f * np.sin(f * tau),
+        )
+
+    def samples(self) -> Angles:
+        """Every piece at enough times to know its extremes."""
+        slowest = min((f for f in self.frequency[-1] if f > 0), default=0.0)
+        last = min(2 * pi / slowest, _LONGEST_LOOK_S) if slowest else 0.0
+        lengths = np.append(np.diff(self.starts), last)
+        return self.at(lengths[:, None] * np.linspace(0, 1, _SAMPLES))
+
+    def fastest(self) -> float:
+        """The largest angular velocity [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ."""
+        angles = self.samples()
+        square = (angles.rate**2).sum(axis=2)
+        square -= 2 * angles.rate[..., 0] * angles.rate[..., 2] * np.sin(angles.angle[..., 1])
+        return float(np.sqrt(max(0.0, square.max())))
+
+    def check(self, limits: Limits) -> None:
+        """Raise FollowError if it goes beyond the limits."""
+        if (fastest := self.fastest()) > limits.rate:
+            raise FollowError(
+                f"that would turn at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
+                f"{limits.rate:g} rad/s; allow more time, or ask for less"
+            )
+        angle = self.samples().angle
+        tilt = acos(max(-1.0, float((np.cos(angle[..., 0]) * np.cos(angle[..., 1])).min())))
+        if tilt > limits.tilt:
+            raise FollowError(
+                f"that would tilt by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
+                f"{degrees(limits.tilt):g}°"
+            )
+        if not limits.rolls and np.abs(angle[..., 0]).max() > 0:
+            raise FollowError("this vehicle has no motor that rolls it: give it a roll of 0")
+
+
+def join(here: Angles, there: Angles, length: Floats) -> Floats:
+    """The quintics that lead from states to states, of shape (n, 3), in `length` seconds, of shape (n,).
+
+    Returns:
+        Their coefficients. Shape (n, 6, 3).
+    """
+    (p, v, a), T = here, length[:, None]
+    angle = there.angle - (p + v * T + a * T * T / 2)
+    rate = (there.rate - (v + a * T)) * T
+    acceleration = (there.acceleration - a) * T * T
+    return np.stack(
+        [
+            p,
+            v,
+            a / 2,
+            (10 * angle - 4 * rate + acceleration / 2) / T**3,
+            (-15 * angle + 7 * rate - acceleration) / T**4,
+            (6 * angle - 3 * rate + acceleration / 2) / T**5,
+        ],
+        axis=1,
     )
 
-    def angles(self, t: ca.SX) -> ca.SX:
-        """[roll, pitch, yaw] at time t [s], in rad. Shape (3,)."""
-        amplitude = ca.SX(self.amplitude) * (pi / 180)
-        return amplitude * ca.sin(ca.SX(self.frequency) * t)
 
+def reference_function() -> ca.Function:
+    """A piece at time t ↦ q_d, ω_d, ω̇_d: desired attitude [1], angular velocity [rad/s], acceleration [rad/s²].
 
-def reference_function(settings: SinusoidSettings) -> ca.Function:
-    """t ↦ q_d, ω_d, ω̇_d: desired attitude [1], angular velocity [rad/s] and acceleration [rad/s²], both inertial."""
-    t = ca.SX.sym("t")
-    q_d = from_euler(settings.angles(t))
+    The latter two are inertial. Inputs: t, start, quintic (3 × 6, a column a power), amplitude, frequency.
+    """
+    t, start, quintic = ca.SX.sym("t"), ca.SX.sym("start"), ca.SX.sym("quintic", 3, POWERS)
+    amplitude, frequency = ca.SX.sym("amplitude", 3), ca.SX.sym("frequency", 3)
+    tau = t - start
+    angles = ca.SX.zeros(3)
+    for n in reversed(range(POWERS)):
+        angles = angles * tau + quintic[:, n]
+    q_d = from_euler(angles + amplitude * ca.sin(frequency * tau))
     q_d_dot = ca.jacobian(q_d, t)
     omega_d = 2 * product(q_d_dot, conjugate(q_d))[1:4]  # (C.12), solved for ω_d
     omega_d_dot = ca.jacobian(omega_d, t)
-    return ca.Function("reference", [t], [q_d, omega_d, omega_d_dot], ["t"], ["q_d", "omega_d", "omega_d_dot"])
+    return ca.Function(
+        "reference",
+        [t, start, quintic, amplitude, frequency],
+        [q_d, omega_d, omega_d_dot],
+        ["t", "start", "quintic", "amplitude", "frequency"],
+        ["q_d", "omega_d", "omega_d_dot"],
+    )
+
+
+class Motion:
+    """A reference as the loop follows it.
+
+    Args:
+        reference: What to follow from t = 0 on.
+        shared: Memory for q_d, omega_d and omega_d_dot, where whoever uses them reads them.
+    """
+
+    def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
+        self._function = Compiled(reference_function(), shared)
+        self._time = self._function.inputs["t"]
+        self._plan = Plan.of(reference)
+        self._load(0)
+
+    def at(self, t: float) -> None:
+        """Write what is desired at time t [s]; t does not fall from one call to the next."""
+        if t >= self._until:
+            self._load(self._plan.piece(t))
+        self._time[0] = t
+        self._function()
+
+    def follow(self, target: Plan, t: float, within_s: float, limits: Limits | None = None) -> None:
+        """Follow another plan, reached from the present one within some time; its own time begins then.
+
+        Args:
+            target: What to follow.
+            t: The time now [s].
+            within_s: When to have reached it [s]; 0 jumps.
+            limits: How far the way there may go; None for no limits.
+
+        Raises:
+            FollowError: It goes further; nothing has changed then.
+        """
+        plan = target.joined(self._here(t), t, within_s)
+        if limits is not None and within_s:
+            replace(plan, **{name: getattr(plan, name)[:2] for name in plan.__annotations__}).check(limits)
+        self._plan = plan
+        self._load(plan.piece(t))
+
+    def rest(self, t: float, within_s: float) -> Hold:
+        """Where one comes to rest within some time, braking evenly."""
+        here = self._here(t)
+        roll, pitch, yaw = (degrees(float(angle)) for angle in here.angle[0] + here.rate[0] * within_s / 2)
+        return Hold(attitude=(roll, pitch, yaw))
+
+    def time_to_reach(self, target: Plan, t: float, within_s: float, limits: Limits) -> float:
+        """The time in which a set-point is reached within the rate limit, at least `within_s` [s]."""
+        for _ in range(_TRIES):
+            fastest = target.joined(self._here(t), t, within_s).fastest()
+            if fastest <= limits.rate:
+                break
+            within_s *= _SLOWER * fastest / limits.rate
+        return within_s
+
+    def _here(self, t: float) -> Angles:
+        i = self._plan.piece(t)
+        tau = np.zeros((len(self._plan.starts), 1))
+        tau[i] = t - self._plan.starts[i]
+        return Angles(*(part[i] for part in self._plan.at(tau)))
+
+    def _load(self, i: int) -> None:
+        plan, inputs = self._plan, self._function.inputs
+        self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else float("inf")
+        inputs["start"][0] = plan.starts[i]
+        inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # a row a power here is a column a power there
+        inputs["amplitude"][:] = memoryview(plan.amplitude[i].copy())
+        inputs["frequency"][:] = memoryview(plan.frequency[i].copy())

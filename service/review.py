@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -27,11 +27,11 @@ from protocol.attitude import Quaternion, Vector
 from protocol.errors import AeroloopError
 from protocol.frames import COUNTERS, TickCounter
 from protocol.messages import Contract, Event, Percentiles, Status, Telemetry
+from protocol.verbs import Change
 from service.config import ConfigError, Settings, from_contract
 from service.controller import Controller
 from service.figures import Figures, Score
 from service.recorder import CONTRACT_METADATA, read_contract
-from service.reference import reference_function
 
 MAX_WAITING: Final = 4096
 """Measurements kept while no telemetry has yet said which tick they are."""
@@ -66,15 +66,15 @@ class Session:
 
     Args:
         settings: The configuration of its controller.
+        changes: What its controller followed from which tick on, in order.
         keep: Whether to keep every tick, for figures.
     """
 
-    def __init__(self, settings: Settings, *, keep: bool = False) -> None:
+    def __init__(self, settings: Settings, changes: Sequence[Change] = (), *, keep: bool = False) -> None:
         self.settings = settings
+        self._changes = deque(changes)
         self._wire = settings.wire
-        self._controller = Controller(
-            settings.wire, settings.law, reference_function(settings.reference), settings.loop.period
-        )
+        self._controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._level = settings.wire.voltage.quantizer().level
         self._waiting: deque[Seen] = deque(maxlen=MAX_WAITING)  # measurements whose tick is not known yet
         self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
@@ -159,6 +159,8 @@ class Session:
 
     def _score(self, k: int, seen: Seen, voltages: list[float]) -> None:
         controller = self._controller
+        while self._changes and self._changes[0].tick <= k:
+            controller.apply(self._changes.popleft())
         controller.tick(seen.frame, k)
         if controller.tick_index != k:
             return  # a measurement without a valid value
@@ -221,11 +223,12 @@ def read(path: Path, *, keep: bool = False) -> Review:
         with path.open("rb") as file:
             reader = make_reader(file)
             settings = _settings(reader, path)
+            changes = _changes(reader)
             for address, payload, published_ns in _messages(reader):
                 if address.session is not None:
                     which = address.vehicle, address.session
                     if which not in sessions:
-                        sessions[which] = Session(settings, keep=keep)
+                        sessions[which] = Session(settings, changes.get(which, ()), keep=keep)
                     seen = Seen(payload, published_ns)
                     if address.topic.name == "measurement":
                         sessions[which].measurement(seen)
@@ -266,6 +269,19 @@ def _messages(reader: McapReader) -> Iterator[tuple[topics.Address, bytes, int]]
         address = addresses[key]
         if address is not None:
             yield address, message.data, message.publish_time
+
+
+def _changes(reader: McapReader) -> dict[tuple[str, str], list[Change]]:
+    """What controllers followed, by vehicle and session: read first, since a command may overtake its own change."""
+    changes: dict[tuple[str, str], list[Change]] = {}
+    summary = reader.get_summary()
+    keys = [channel.topic for channel in summary.channels.values()] if summary else []
+    addresses = {key: address for key in keys if (address := topics.read_key(key)) and address.topic.name == "change"}
+    if addresses:
+        for _, channel, message in reader.iter_messages(topics=list(addresses)):
+            change = Change.model_validate_json(message.data)
+            changes.setdefault((addresses[channel.topic].vehicle, change.session), []).append(change)
+    return changes
 
 
 def _settings(reader: McapReader, path: Path) -> Settings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,11 +16,22 @@ class ControllerSettings(BaseModel):
     stale_s: float = Field(
         default=0.1, gt=0, le=10, description="stop commanding after this long without a measurement [s]"
     )
+    pace: Literal["measurement", "clock"] = Field(
+        default="measurement",
+        description="tick when a measurement arrives, so that the plant's clock leads, or on a grid of one's own, "
+        "which takes the newest measurement; lockstep always goes by measurements",
+    )
     duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
     auto_arm: bool = Field(
         default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
     )
     telemetry_rate_hz: float = Field(default=50.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
+    max_reference_rate: float = Field(
+        default=1.0, gt=0, le=100, description="fastest turn that an operator's reference may ask for [rad/s]"
+    )
+    max_reference_tilt_deg: float = Field(
+        default=60.0, gt=0, le=180, description="largest tilt that an operator's reference may ask for [deg]"
+    )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
 
 

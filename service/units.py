@@ -25,6 +25,7 @@ Wants=network-online.target
 [Service]
 Type=notify
 ExecStart={executable} {command} --config /etc/aeroloop/aeroloop.toml --log-format json
+ExecReload=/bin/kill -HUP $MAINPID
 Restart=on-failure
 RestartSec=1
 WatchdogSec=5

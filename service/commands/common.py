@@ -31,7 +31,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.", show_default=False),
 ]
-Duration = Annotated[float, typer.Option("--duration", min=0.01, help="Length of the experiment [s].")]
+Duration = Annotated[float, typer.Option("--duration", min=0.01, help="Length of the experiment, in s.")]
 BitsOut = Annotated[
     str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
 ]
@@ -60,6 +60,17 @@ def settings_of(config: Path | None, overrides: list[str] | None) -> Settings:
         fail(str(error), 2)
 
 
+def reloadable(config: Path | None, overrides: list[str]) -> tuple[Settings, Callable[[], Settings]]:
+    """The effective configuration, and what reads it again."""
+
+    def load() -> Settings:
+        from service import config as configuration
+
+        return configuration.load(config, overrides)
+
+    return settings_of(config, overrides), load
+
+
 def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
     """The settings with the bits given on the command line."""
     from service.config import ConfigError, with_bits
@@ -84,6 +95,22 @@ def guarded(run: Callable[[], T]) -> T:
         fail(str(error).splitlines()[0], 1)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
+
+
+def checked(make: Callable[[], T]) -> T:
+    """Make something of what the user gave; what is wrong with it is his to put right."""
+    from pydantic import ValidationError
+
+    from protocol.errors import AeroloopError
+
+    try:
+        return make()
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        fail(f"{where}: {first['msg'].removeprefix('Value error, ')}, not {first['input']!r}", 2)
+    except AeroloopError as error:
+        fail(str(error), 2)
 
 
 def run_role(

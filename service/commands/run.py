@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,7 @@ from service.commands.common import (
     WithParent,
     guarded,
     print_figures,
+    reloadable,
     run_role,
     settings_of,
     with_bits_of,
@@ -68,7 +70,7 @@ def demo(
 @group.command()
 def controller(
     duration: Annotated[
-        float | None, typer.Option("--duration", min=0.01, help="End after this long [s].", show_default=False)
+        float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.", show_default=False)
     ] = None,
     auto_arm: Annotated[
         bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
@@ -82,18 +84,30 @@ def controller(
     """Run the controller daemon until SIGTERM."""
     options = [f"controller.duration_s={duration}"] if duration is not None else []
     options += ["controller.auto_arm=true"] if auto_arm else []
-    settings = settings_of(config, [*(overrides or []), *options])
+    settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
         from service.daemon import Daemon
+        from service.reload import reload_on_hangup
 
-        Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller).run()
+        daemon = Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller)
+        reload_on_hangup(role, settings, load, lambda new: daemon.reconfigure(new.law, new.reference, new.controller))
+        daemon.run()
 
     run_role("controller", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
 
 @group.command()
 def emulator(
+    faults: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="SIGNAL:KIND@T",
+            help="What shall go wrong, such as rate:off@5 or command:drop=0.05; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     config: Config = None,
     overrides: Overrides = None,
     quiet: Quiet = False,
@@ -101,12 +115,16 @@ def emulator(
     with_parent: WithParent = False,
 ) -> None:
     """Run the emulated plant until SIGTERM."""
-    settings = settings_of(config, overrides)
+    options = [f"plant.faults={dumps(faults)}"] if faults else []
+    settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
         from plant_emulator.emulator import Emulator
+        from service.reload import reload_on_hangup
 
-        Emulator(role, settings.loop, settings.wire, settings.plant).run()
+        emulator = Emulator(role, settings.loop, settings.wire, settings.plant)
+        reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
+        emulator.run()
 
     run_role("plant", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
@@ -121,13 +139,15 @@ def recorder(
     with_parent: WithParent = False,
 ) -> None:
     """Record everything on the network into an MCAP log until SIGTERM."""
-    settings = settings_of(config, overrides)
-    if log is not None:
-        settings.recorder.path = log
+    options = [f"recorder.path={dumps(str(log))}"] if log is not None else []
+    settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
         from service.recorder import Recorder
+        from service.reload import reload_on_hangup
 
-        Recorder(role, settings.recorder).run()
+        recorder = Recorder(role, settings.recorder)
+        reload_on_hangup(role, settings, load, lambda new: recorder.reconfigure(new.recorder))
+        recorder.run()
 
     run_role("recorder", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)

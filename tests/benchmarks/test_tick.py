@@ -15,9 +15,9 @@ from plant_emulator.endpoint import Endpoint
 from plant_emulator.settings import PlantSettings
 from protocol.frames import WireSpec
 from protocol.messages import Claim
+from protocol.verbs import Sinusoid
 from service.controller import Controller
 from service.law import LawSettings
-from service.reference import SinusoidSettings, reference_function
 from tests.service import numpy_twin as twin
 from tests.service.twin_body import body_of
 
@@ -26,7 +26,7 @@ TICKS = 2000
 
 
 def _controller() -> Controller:
-    return Controller(WireSpec(), LawSettings(), reference_function(SinusoidSettings()), PERIOD)
+    return Controller(WireSpec(), LawSettings(), Sinusoid(), PERIOD)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_controller_tick(benchmark: BenchmarkFixture, measurements: list[bytes])
 
 def test_the_same_tick_in_plain_numpy(benchmark: BenchmarkFixture, measurements: list[bytes]) -> None:
     """The tests' NumPy twin of the law and the reference, between the project's own frames and quantizers."""
-    wire, p, paper = WireSpec(), LawSettings(), SinusoidSettings()
+    wire, p, paper = WireSpec(), LawSettings(), Sinusoid()
     body = body_of(p)
     reference = twin.Sinusoids(np.radians(paper.amplitude), np.array(paper.frequency))
     level, quantizer = wire.attitude.quantizer().level, wire.voltage.quantizer()

@@ -89,7 +89,8 @@ def test_a_demo_in_real_time_tracks_and_two_run_beside_each_other(tmp_path: Path
         out, _ = process.communicate(timeout=120)
         assert process.returncode == 0
         figures = json.loads(out)
-        assert figures["duration_s"] == 4.0
+        # 16 ticks short if the last frame was sent over 24 ms late: its four bits then stand for a later tick.
+        assert 4.0 - 16 * 0.002 <= figures["duration_s"] <= 4.0
         # Two demos want six processes on two cores, so a share of the ticks may be late. The plant holds its last
         # command meanwhile; the error stays that of the reference's start plus quantization, some 2.5 degrees. Half
         # the ticks and 10 degrees tell a loop that works from one that does not.

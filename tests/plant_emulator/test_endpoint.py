@@ -11,11 +11,12 @@ from math import inf, isnan, nan
 
 import pytest
 
-from plant_emulator.endpoint import Endpoint, PlantState
+from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Vector
 from protocol.frames import COUNTERS, SignalSpec, WireSpec
 from protocol.messages import Claim, Grant, Refusal
+from protocol.states import PlantState
 
 WIRE = WireSpec()
 CONTINUOUS = WireSpec().with_bits(None, None)

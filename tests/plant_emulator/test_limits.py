@@ -9,12 +9,13 @@ import pytest
 from hypothesis import settings, strategies
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from plant_emulator.endpoint import Endpoint, PlantState
+from plant_emulator.endpoint import Endpoint
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY
 from protocol.frames import COUNTERS, WireSpec
 from protocol.messages import Claim, Grant, Refusal
+from protocol.states import PlantState
 
 WIRE = WireSpec()
 PERIOD_NS = 2_000_000

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from enum import StrEnum
+from itertools import takewhile
 from math import isnan
 from pathlib import Path
 from typing import Final
@@ -13,6 +16,7 @@ import protocol
 from protocol.frames import FrameFormat, WireSpec
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
+from protocol.states import CONTROLLER_TABLE, PLANT_TABLE
 from protocol.topics import TOPICS
 
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
@@ -136,6 +140,14 @@ def test_the_table_of_topics_is_that_of_the_code() -> None:
     start = next(i for i, row in enumerate(told) if row[0] == "topic")
     table = {name: key for name, key in told[start + 1 :] if not set(name) <= set("-: ")}
     assert table == {topic.name: topic.key for topic in TOPICS.values()}
+
+
+@pytest.mark.parametrize(("end", "table"), [("plant", PLANT_TABLE), ("controller", CONTROLLER_TABLE)])
+def test_the_tables_of_states_are_those_of_the_code(end: str, table: Mapping[tuple[StrEnum, StrEnum], StrEnum]) -> None:
+    lines = SPEC.read_text(encoding="utf-8").splitlines()
+    start = lines.index(f"| {end} is | what happens | {end} is then |") + 2
+    told = list(takewhile(lambda line: line.startswith("|"), lines[start:]))
+    assert [tuple(cells(line)) for line in told] == [(str(a), str(b), str(c)) for (a, b), c in table.items()]
 
 
 def test_the_text_is_of_the_version_that_a_claim_carries() -> None:

@@ -10,8 +10,9 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import messages
+from protocol.messages import model_of
 from protocol.topics import EVERYTHING, NAME, TOPICS, Address, Topic, key, read_key
+from protocol.verbs import Message
 
 every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS))
 
@@ -60,12 +61,12 @@ def test_every_topic_is_called_what_the_table_calls_it_and_has_a_key_of_its_own(
     "topic", [t for t in TOPICS.values() if t.carries in ("json", "query") and t.model], ids=lambda topic: topic.name
 )
 def test_the_model_of_every_json_topic_is_a_message(topic: Topic) -> None:
-    assert issubclass(getattr(messages, topic.model), messages.Message)
+    assert issubclass(model_of(topic), Message)
 
 
 def test_an_unknown_topic_has_no_key() -> None:
     with pytest.raises(KeyError):
-        key("reference", "aero")
+        key("references", "aero")
 
 
 @pytest.mark.parametrize(

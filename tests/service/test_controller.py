@@ -16,9 +16,9 @@ from plant_emulator.settings import IDEAL_AERO, PlantSettings
 from protocol.attitude import Quaternion, Vector, sent_vector
 from protocol.frames import COUNTERS, WireSpec
 from protocol.messages import Claim, Grant
+from protocol.verbs import Sinusoid
 from service.controller import Controller
 from service.law import LawSettings
-from service.reference import SinusoidSettings, reference_function
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of
@@ -26,8 +26,8 @@ from tests.service.twin_body import body_of
 PERIOD = 0.002
 PERIOD_NS = 2_000_000
 LAW = LawSettings()
-PAPER = SinusoidSettings()
-LEVEL = SinusoidSettings(amplitude=(0.0, 0.0, 0.0))
+PAPER = Sinusoid()
+LEVEL = Sinusoid(amplitude=(0.0, 0.0, 0.0))
 """Hold q_d = [1, 0, 0, 0]."""
 
 QUANTIZED = WireSpec()
@@ -35,8 +35,8 @@ CONTINUOUS = WireSpec().with_bits(None, None)
 AT_REST: Vector = (0.0, 0.0, 0.0)
 
 
-def _controller(wire: WireSpec = CONTINUOUS, reference: SinusoidSettings = PAPER, law: LawSettings = LAW) -> Controller:
-    return Controller(wire, law, reference_function(reference), PERIOD)
+def _controller(wire: WireSpec = CONTINUOUS, reference: Sinusoid = PAPER, law: LawSettings = LAW) -> Controller:
+    return Controller(wire, law, reference, PERIOD)
 
 
 def _yawed(angle: float) -> Quaternion:
@@ -61,7 +61,7 @@ def _answer(wire: WireSpec, frame: bytes | None) -> tuple[int, list[float]]:
 class TwinLoop:
     """The twin of the controller between its frames: law, reference, θ̂ and the sign."""
 
-    def __init__(self, reference: SinusoidSettings, law: LawSettings = LAW) -> None:
+    def __init__(self, reference: Sinusoid, law: LawSettings = LAW) -> None:
         self.body = body_of(law)
         self.reference = twin.Sinusoids(np.radians(reference.amplitude), np.array(reference.frequency))
         self.theta: Array = np.array(law.damping_estimate)
@@ -186,7 +186,7 @@ def test_what_it_tells_is_what_the_law_computed() -> None:
 
 # The sign of z₁, Assumption 3
 
-AHEAD = SinusoidSettings(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi))
+AHEAD = Sinusoid(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi))
 """Yaw is at its crest of 170° at t = 0.5 s, tick 250."""
 
 
@@ -215,7 +215,7 @@ def test_a_measurement_without_a_valid_value_does_not_choose_the_sign() -> None:
 
 def test_from_a_large_attitude_the_body_turns_the_short_way() -> None:
     """Yaw −170° to a desired 170°: with z₁₋ it turns by −20°, through the back, and not by +340°."""
-    held = SinusoidSettings(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi / 60))  # crest at 30 s, and slow there
+    held = Sinusoid(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi / 60))  # crest at 30 s, and slow there
     aero = IDEAL_AERO
     plant = twin.LockedBody(
         body_of(LAW),

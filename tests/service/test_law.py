@@ -88,6 +88,7 @@ class ClosedLoop:
     """
 
     def __init__(self, p: LawSettings) -> None:
+        self._p = p
         self.law = law = build_law(p)
         self.true_theta = ca.SX.sym("true_theta", 3)
         self._moves = [
@@ -106,7 +107,9 @@ class ClosedLoop:
         """A function of a point's fields and the sign."""
         law = self.law
         symbols = [law.q, law.omega, law.q_d, law.omega_d, law.omega_d_dot, law.theta, self.true_theta, law.s]
-        return ca.Function("values", symbols, list(expressions))
+        gains = [law.C1, law.C2, law.Gamma]
+        values = [ca.SX(gain) for gain in (self._p.C1, self._p.C2, self._p.Gamma)]
+        return ca.Function("values", symbols, ca.substitute(list(expressions), gains, values))
 
 
 def _product(p: ca.SX, q: ca.SX) -> ca.SX:
@@ -172,7 +175,16 @@ def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -
         x = _point(rng, 0.5 * p.damping_bound)  # so far inside k_θ that a period does not lead out
         expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
         tick = law_function(p, period)(
-            q=x.q, omega=x.omega, q_d=x.q_d, omega_d=x.omega_d, omega_d_dot=x.omega_d_dot, theta=x.theta, s=s
+            q=x.q,
+            omega=x.omega,
+            q_d=x.q_d,
+            omega_d=x.omega_d,
+            omega_d_dot=x.omega_d_dot,
+            theta=x.theta,
+            s=s,
+            C1=p.C1,
+            C2=p.C2,
+            Gamma=p.Gamma,
         )
         assert _close(_array(tick["u"]), expected.u)
         assert _close(_array(tick["theta_next"]), x.theta + period * expected.theta_dot)
@@ -305,7 +317,7 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
     for k in range(3000):
         if k % 300 == 0:
             x = _point(rng, p.damping_bound)  # another drive, kept long enough to press against the bound
-        theta = _array(tick(x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, theta, 1.0)[1])
+        theta = _array(tick(x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, theta, 1.0, p.C1, p.C2, p.Gamma)[1])
         pressed += bool(np.linalg.norm(theta) > 0.95 * p.damping_bound)
         # scaling to a length of k_θ rounds in the last place
         assert np.linalg.norm(theta) <= p.damping_bound * (1 + 1e-15)

@@ -12,7 +12,6 @@ from protocol.messages import Claim, Telemetry
 from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Figures
-from service.reference import reference_function
 from service.review import Seen, Session
 
 PERIOD_NS = 2_000_000
@@ -35,7 +34,7 @@ def run() -> list[tuple[int, bytes, bytes, Telemetry]]:
     endpoint.claim(
         Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, auto_arm=True, wire=wire)
     )
-    controller = Controller(wire, config.law, reference_function(config.reference), period)
+    controller = Controller(wire, config.law, config.reference, period)
     ticks = []
     measurement = endpoint.tick(None, 0)
     for k in range(TICKS):

@@ -19,9 +19,9 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from protocol.frames import SignalSpec
 from protocol.messages import Claim, Grant
+from protocol.verbs import Sinusoid
 from service.config import Settings, load, with_bits
 from service.controller import Controller
-from service.reference import reference_function
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of
@@ -64,6 +64,7 @@ SECONDS = 60.0
 @cache
 def _desired(k: int) -> tuple[Array, Array, Array]:
     """q_d, ω_d and ω̇_d at tick k, by the twin; every run here follows the same reference."""
+    assert isinstance(OTHER.reference, Sinusoid)
     reference = twin.Sinusoids(np.radians(OTHER.reference.amplitude), np.array(OTHER.reference.frequency))
     return reference.desired(k * OTHER.loop.period)
 
@@ -102,7 +103,7 @@ def _run(settings: Settings, first_tick: int, seconds: float) -> Run:
     loop, wire = settings.loop, settings.wire
     plant = settings.plant.build(loop.period)
     endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True)
-    controller = Controller(wire, settings.law, reference_function(settings.reference), loop.period)
+    controller = Controller(wire, settings.law, settings.reference, loop.period)
     claim = Claim(controller="test", session="loop", period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
     assert isinstance(endpoint.claim(claim), Grant)
     frames: list[bytes] = []

@@ -6,7 +6,8 @@ from io import StringIO
 
 from rich.console import Console
 
-from protocol.messages import Contract, Event, Message, Status, Telemetry, Truth
+from protocol.messages import Contract, Event, Status, Telemetry, Truth
+from protocol.verbs import Message
 from service.config import load
 from service.top import SILENT_S, Top
 

@@ -1,0 +1,217 @@
+"""What can go wrong, on purpose: the vocabulary. `plant_emulator.faulty` applies it.
+
+A fault is written `signal:kind[=value][@start[..end]]`, in seconds of the plant's time. Without a start it acts at
+once, without an end for ever:
+
+    attitude:off@5    rate.y:bias=0.1@2..4    motor2:stuck@3    command:drop=0.05    measurement:delay=0.02@0..10
+
+            sensors (attitude, rate)             motors                        streams (measurement, command)
+off         no valid value                       0 V                           nothing passes
+stuck       the last value before the fault      the last voltage before it    the last frame before, for each new one
+bias=v      v is added [rad], [rad/s]            v is added [V]
+noise=σ     Gaussian noise [rad], [rad/s]        Gaussian noise [V]
+delay=s     what was true s seconds ago          what was commanded then       frames come s seconds later, in order
+drop=p      no valid value                       0 V for a period              a frame is lost
+garble=p    a random value                       a random voltage              one random bit of a frame is flipped
+duplicate=p                                                                    a frame passes again a tick later
+reorder=p                                                                      a frame passes after the next one
+
+p is the probability that it happens to a sample, a period or a frame. `attitude` and `rate` take an axis of the body,
+`.x .y .z`; bias and noise of the attitude are rotations about the body's axes. Motors are counted from 1 in the order
+in which they are commanded, and `motors` are all of them at the same times.
+"""
+
+from __future__ import annotations
+
+from math import inf, isfinite, ulp
+from typing import Final, Literal, NamedTuple, TypeAlias, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+
+Kind: TypeAlias = Literal["off", "stuck", "bias", "noise", "delay", "drop", "garble", "duplicate", "reorder"]
+Whole: TypeAlias = Literal["attitude", "rate", "motors", "measurement", "command"]
+
+MAX_DELAY_S: Final = 10.0
+MAX_MOTORS: Final = 3
+
+
+class Signal(NamedTuple):
+    """Something that a fault can act on.
+
+    Attributes:
+        whole: What it is, or is a part of.
+        part: Which part of it: axis 0…2, or motor from 0; None for all of it.
+        kinds: What can go wrong with it.
+    """
+
+    whole: Whole
+    part: int | None
+    kinds: tuple[Kind, ...]
+
+
+_ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
+_OF_VALUES = _ALL_KINDS[:7]
+_OF_FRAMES: tuple[Kind, ...] = ("off", "stuck", "delay", "drop", "garble", "duplicate", "reorder")
+# A unit quaternion has no one axis that could be old or random while the others are right.
+_OF_ROTATIONS: tuple[Kind, ...] = ("off", "bias", "noise", "drop")
+
+SIGNALS: Final[dict[str, Signal]] = {
+    "attitude": Signal("attitude", None, _OF_VALUES),
+    **{f"attitude.{axis}": Signal("attitude", i, _OF_ROTATIONS) for i, axis in enumerate("xyz")},
+    "rate": Signal("rate", None, _OF_VALUES),
+    **{f"rate.{axis}": Signal("rate", i, _OF_VALUES) for i, axis in enumerate("xyz")},
+    "motors": Signal("motors", None, _OF_VALUES),
+    **{f"motor{i + 1}": Signal("motors", i, _OF_VALUES) for i in range(MAX_MOTORS)},
+    "measurement": Signal("measurement", None, _OF_FRAMES),
+    "command": Signal("command", None, _OF_FRAMES),
+}
+"""Every signal by the name it has in a fault."""
+
+_PROBABILITY = (ulp(0.0), 1.0, "a probability above 0 and up to 1")
+_VALUES: Final[dict[Kind, tuple[float, float, str]]] = {
+    "bias": (-inf, inf, "a finite number"),
+    "noise": (0.0, inf, "a finite number from 0 up"),
+    "delay": (0.0, MAX_DELAY_S, f"0 to {MAX_DELAY_S:g} s"),
+    "drop": _PROBABILITY,
+    "garble": _PROBABILITY,
+    "duplicate": _PROBABILITY,
+    "reorder": _PROBABILITY,
+}
+"""The range of each kind's value, in numbers and in words. What is not here takes none."""
+
+
+class Fault(BaseModel):
+    """One thing that goes wrong with one signal for a while.
+
+    Raises:
+        ValidationError: A ValueError; each of its messages is one line. `parse` raises a ValueError of one line.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    signal: str = Field(description="what it acts on: a sensor, a motor or a stream")
+    kind: Kind = Field(description="what goes wrong")
+    value: float | None = Field(default=None, validate_default=True, description="how much [signal's unit, s or 1]")
+    start_s: float = Field(default=0.0, description="when it begins, in the plant's time [s]")
+    end_s: float | None = Field(default=None, description="when it is over [s]; never if left out")
+
+    @classmethod
+    def parse(cls, text: str) -> Fault:
+        """The fault that is written `signal:kind[=value][@start[..end]]`.
+
+        Raises:
+            ValueError: In one line, the text and what is wrong with it.
+        """
+        try:
+            return cls._parse(text.strip())
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        except ValueError as error:
+            reason = str(error)
+        raise ValueError(f"fault {text!r}: {reason}")
+
+    @classmethod
+    def _parse(cls, text: str) -> Fault:
+        what, at, when = text.partition("@")
+        signal, colon, doing = what.partition(":")
+        if not colon:
+            raise ValueError("it is written signal:kind[=value][@start[..end]], such as attitude:off@5")
+        kind, equals, value = doing.partition("=")
+        start, dots, end = when.partition("..")
+        return cls(
+            signal=signal,
+            kind=kind,  # type: ignore[arg-type]  # a text until it is validated
+            value=_number(value) if equals else None,
+            start_s=_number(start) if at else 0.0,
+            end_s=_number(end) if dots else None,
+        )
+
+    def __str__(self) -> str:
+        value = "" if self.value is None else f"={_text(self.value)}"
+        start = f"@{_text(self.start_s)}" if self.start_s or self.end_s is not None else ""
+        end = "" if self.end_s is None else f"..{_text(self.end_s)}"
+        return f"{self.signal}:{self.kind}{value}{start}{end}"
+
+    @property
+    def target(self) -> Signal:
+        """What it acts on."""
+        return SIGNALS[self.signal]
+
+    def active(self, t: float) -> bool:
+        """Whether it acts at time t [s]: start ≤ t < end."""
+        return self.start_s <= t and not self.over(t)
+
+    def over(self, t: float) -> bool:
+        """Whether it has ended by time t [s]."""
+        return self.end_s is not None and t >= self.end_s
+
+    def later(self, by: float) -> Fault:
+        """The same fault, `by` [s] later; on whole nanoseconds, as ticks are."""
+        end = None if self.end_s is None else round(self.end_s + by, 9)
+        return self.model_copy(update={"start_s": round(self.start_s + by, 9), "end_s": end})
+
+    @field_validator("signal")
+    @classmethod
+    def _is_a_signal(cls, signal: str) -> str:
+        if signal not in SIGNALS:
+            raise ValueError(f"there is no signal {signal!r}; there are {_listed(SIGNALS)}")
+        return signal
+
+    @field_validator("kind", mode="before")
+    @classmethod
+    def _happens_to_the_signal(cls, kind: object, info: ValidationInfo) -> object:
+        if (name := info.data.get("signal")) is None:
+            return kind
+        signal = SIGNALS[name]
+        if kind not in signal.kinds:
+            as_a_whole = f"; {signal.whole} as a whole does" if kind in SIGNALS[signal.whole].kinds else ""
+            raise ValueError(f"{name} takes no {kind!r}, but {_listed(signal.kinds)}{as_a_whole}")
+        return kind
+
+    @field_validator("value")
+    @classmethod
+    def _is_what_the_kind_takes(cls, value: float | None, info: ValidationInfo) -> float | None:
+        if (kind := info.data.get("kind")) is None:
+            return value
+        if kind not in _VALUES:
+            if value is not None:
+                raise ValueError(f"{kind} takes no value, but was given {_text(value)}: write {kind} alone")
+            return value
+        low, high, words = _VALUES[kind]
+        if value is None:
+            raise ValueError(f"{kind} takes {words}: write {kind}=0.1, say")
+        if not (isfinite(value) and low <= value <= high):
+            raise ValueError(f"{kind} takes {words}, not {_text(value)}")
+        return value
+
+    @field_validator("start_s")
+    @classmethod
+    def _starts_in_time(cls, start: float) -> float:
+        if not (isfinite(start) and start >= 0):
+            raise ValueError(f"it must begin at 0 s or later, not at {_text(start)} s")
+        return start
+
+    @field_validator("end_s")
+    @classmethod
+    def _ends_after_its_start(cls, end: float | None, info: ValidationInfo) -> float | None:
+        start = info.data.get("start_s")
+        if end is not None and start is not None and not (isfinite(end) and end > start):
+            raise ValueError(f"it must end after it begins at {_text(start)} s, not at {_text(end)} s")
+        return end
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a number") from None
+
+
+def _text(value: float) -> str:
+    """The shortest text that reads back as the same float."""
+    return repr(value).removesuffix(".0")
+
+
+def _listed(words: dict[str, Signal] | tuple[Kind, ...]) -> str:
+    *most, last = words
+    return f"{', '.join(most)} and {last}"

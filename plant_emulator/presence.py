@@ -1,0 +1,188 @@
+"""What controllers and operators see of a plant: whoever stands at the plant end stands on the network through this.
+
+It answers claims and operators' verbs, opens and closes the session's link, tells status and events, and keeps count of
+the frames. Claims, verbs and lost peers come from Zenoh's threads and wait for the owner to take them between ticks:
+the endpoint is only ever touched by one thread.
+"""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+from typing import Final
+
+from plant_emulator.endpoint import Endpoint
+from protocol import topics
+from protocol.clock import Histogram, LoopSettings, LoopTiming
+from protocol.frames import COUNTERS
+from protocol.links import Arrival, ZenohLink
+from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
+from protocol.role import Role
+from protocol.verbs import Answer, Ask
+
+STATUS_PERIOD_NS: Final = 1_000_000_000
+
+
+class Presence:
+    """A plant end on the network.
+
+    Args:
+        role: Its name there.
+        loop: The grid.
+        endpoint: Who grants, refuses and trips.
+
+    Attributes:
+        link: The session's frames; None while there is no session.
+        timing: How well the owner's loop keeps time, if it keeps any.
+        skipped: Ticks of sessions that the owner missed.
+        notes: What the machine refused.
+    """
+
+    def __init__(self, role: Role, loop: LoopSettings, endpoint: Endpoint) -> None:
+        self._role = role
+        self._loop = loop
+        self._endpoint = endpoint
+        self.link: ZenohLink | None = None
+        self.timing: LoopTiming | None = None
+        self.skipped = 0
+        self.notes: list[str] = []
+        self._latency = Histogram()
+        self._sent_at = [0] * COUNTERS
+        self._sent = self._received = 0
+        self._since = _now() if endpoint.cause else None
+        self._k = self._status_tick = -1
+        self._status_due = 0
+        self._status_time = time.monotonic()
+
+    def serve(self) -> None:
+        """Answer claims and operators from now on."""
+        role = self._role
+        role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
+        role.serve("release", Release, lambda release: lambda: self._release(release))
+        role.serve("arm", Ask, lambda _: self._arm)
+        role.serve("stop", Ask, lambda _: self._stop)
+        role.watch_tokens(self._token)
+        role.announce()
+        role.event("started", f"{role.vehicle} waits for a claim")
+
+    def take_inbox(self) -> None:
+        """Between ticks: do what has come from controllers and operators."""
+        if self._role.take_inbox():
+            self.follow_session()
+
+    def send(self, frame: bytes, counter: int) -> None:
+        """Send a measurement frame of the session."""
+        if self.link is not None:
+            self._sent_at[counter] = time.monotonic_ns()
+            self.link.send(frame)
+            self._sent += 1
+
+    def arrived(self, arrival: Arrival) -> None:
+        """Keep count of a command frame, and of how long it took."""
+        self._received += 1
+        read = self._endpoint.wire.command.unpack(arrival.frame)
+        if read is not None and (elapsed := arrival.at_ns - self._sent_at[read[0]]) > 0:
+            self._latency.add(elapsed)
+
+    def after_tick(self, k: int) -> None:
+        """Tell what happened at tick k, and the status once a second."""
+        self._k = k
+        self.follow_session()
+        self.tell_when_due()
+
+    def follow_session(self) -> None:
+        """Tell what happened, and close the link of a session that ended."""
+        endpoint = self._endpoint
+        if endpoint.session is None and self.link is not None:
+            self.link.close()
+            self.link = None
+        if not endpoint.notices:
+            return
+        if endpoint.cause is None:
+            self._since = None
+        elif any(notice.kind == "tripped" for notice in endpoint.notices):
+            self._since = _now()
+        for notice in endpoint.notices:
+            self._role.event(*notice)
+        endpoint.notices.clear()
+        self._status_due = 0
+
+    def tell_when_due(self) -> None:
+        """Tell the status if a second is over, or something has happened."""
+        if time.monotonic_ns() >= self._status_due:
+            self._publish_status()
+
+    def leave(self) -> None:
+        """Tell that the plant is at 0 V and goes."""
+        self.follow_session()
+        self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
+        self._publish_status()
+
+    # ── what came from Zenoh's threads, taken between ticks ──
+
+    def _token(self, name: str, came: bool) -> None:
+        if not came:
+            self._role.later(lambda: self._endpoint.lost(name))
+
+    def _claim(self, claim: Claim) -> Grant | Refusal:
+        answer = self._endpoint.claim(claim)
+        if isinstance(answer, Grant):
+            self._open_link(claim.session)
+        else:
+            text = f"{claim.controller} refused: {answer.reason}"
+            self._role.warn(text, "refused", text, claim.session)
+        return answer
+
+    def _release(self, release: Release) -> Answer:
+        done = self._endpoint.release(release.session)
+        return Answer(done=done, text="released" if done else f"no session {release.session} runs here")
+
+    def _arm(self) -> Answer:
+        vehicle = self._role.vehicle
+        if self._endpoint.arm():
+            return Answer(done=True, text=f"{vehicle} is armed: the next controller to claim it may drive it")
+        return Answer(done=False, text=f"{vehicle} is held by {self._endpoint.holder}, so there is nothing to arm")
+
+    def _stop(self) -> Answer:
+        self._endpoint.stop()
+        return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
+
+    def _open_link(self, session: str) -> None:
+        """Listen for commands before the grant goes out, so that the first one finds somebody."""
+        vehicle = self._role.vehicle
+        self.link = ZenohLink(
+            self._role.zenoh,
+            send_key=topics.key("measurement", vehicle, session=session),
+            receive_key=topics.key("command", vehicle, session=session),
+            lossless=self._loop.lockstep,
+        )
+
+    def _publish_status(self) -> None:
+        now = time.monotonic()
+        endpoint = self._endpoint
+        self._role.status(
+            Status(
+                role=self._role.role,
+                state=endpoint.state,
+                session=endpoint.session,
+                cause=endpoint.cause,
+                since=self._since,
+                uptime_s=self._role.uptime_s,
+                ticks=self._k + 1,
+                rate_hz=max(0.0, (self._k - self._status_tick) / (now - self._status_time)),
+                skipped=self.skipped,
+                received=self._received,
+                sent=self._sent,
+                refused=endpoint.refused,
+                saturated=endpoint.saturated,
+                latency_us=summary(self._latency),
+                timing=report(self.timing) if self.timing else None,
+                notes=self.notes,
+            )
+        )
+        self._status_tick, self._status_time = self._k, now
+        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,131 @@
+"""The two state machines: what each end may be doing, and the one table each of what leads where.
+
+A state says what an end does; a trigger, what happened. What a table does not list cannot happen, and raises. SPEC.md
+draws both tables; the tests compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Final, Generic, TypeVar
+
+
+class PlantState(StrEnum):
+    """What the plant end is doing."""
+
+    IDLE = "idle"
+    GRANTED = "granted"
+    DRIVEN = "driven"
+    TRIPPED = "tripped"
+
+
+class PlantTrigger(StrEnum):
+    """What happens to a plant end."""
+
+    GRANT = "claim granted"
+    COMMAND = "fresh command"
+    RELEASE = "release"
+    TRIP = "trip"
+    ARM = "arm"
+
+
+class ControllerState(StrEnum):
+    """What the controller is doing."""
+
+    SEARCHING = "searching"
+    CLAIMED = "claimed"
+    READY = "ready"
+    RUNNING = "running"
+    HOLDING = "holding"
+    FAULTED = "faulted"
+
+
+class ControllerTrigger(StrEnum):
+    """What happens to a controller."""
+
+    GRANT = "claim granted"
+    INVALID = "measurement without a valid value"
+    ANSWERED = "valid measurement answered"
+    LOST = "session lost"
+    STAND_DOWN = "told to release or to stop"
+    FAULT = "law gives no number"
+    RECALL = "recalled"
+
+
+_P, _PT = PlantState, PlantTrigger
+_C, _CT = ControllerState, ControllerTrigger
+
+# fmt: off
+PLANT_TABLE: Final[Mapping[tuple[PlantState, PlantTrigger], PlantState]] = {
+    (_P.IDLE,    _PT.GRANT):   _P.GRANTED,
+    (_P.IDLE,    _PT.TRIP):    _P.TRIPPED,
+    (_P.IDLE,    _PT.ARM):     _P.IDLE,
+    (_P.GRANTED, _PT.COMMAND): _P.DRIVEN,
+    (_P.GRANTED, _PT.RELEASE): _P.IDLE,
+    (_P.GRANTED, _PT.TRIP):    _P.TRIPPED,
+    (_P.DRIVEN,  _PT.COMMAND): _P.DRIVEN,
+    (_P.DRIVEN,  _PT.RELEASE): _P.IDLE,
+    (_P.DRIVEN,  _PT.TRIP):    _P.TRIPPED,
+    (_P.TRIPPED, _PT.TRIP):    _P.TRIPPED,
+    (_P.TRIPPED, _PT.ARM):     _P.IDLE,
+}
+"""The plant end. A claim that carries its own arming arms first and is granted then."""
+
+CONTROLLER_TABLE: Final[Mapping[tuple[ControllerState, ControllerTrigger], ControllerState]] = {
+    (_C.SEARCHING, _CT.GRANT):      _C.CLAIMED,
+    (_C.SEARCHING, _CT.STAND_DOWN): _C.HOLDING,
+    (_C.CLAIMED,   _CT.INVALID):    _C.READY,
+    (_C.CLAIMED,   _CT.ANSWERED):   _C.RUNNING,
+    (_C.CLAIMED,   _CT.LOST):       _C.SEARCHING,
+    (_C.CLAIMED,   _CT.FAULT):      _C.FAULTED,
+    (_C.CLAIMED,   _CT.STAND_DOWN): _C.HOLDING,
+    (_C.READY,     _CT.INVALID):    _C.READY,
+    (_C.READY,     _CT.ANSWERED):   _C.RUNNING,
+    (_C.READY,     _CT.LOST):       _C.SEARCHING,
+    (_C.READY,     _CT.FAULT):      _C.FAULTED,
+    (_C.READY,     _CT.STAND_DOWN): _C.HOLDING,
+    (_C.RUNNING,   _CT.ANSWERED):   _C.RUNNING,
+    (_C.RUNNING,   _CT.INVALID):    _C.READY,
+    (_C.RUNNING,   _CT.LOST):       _C.SEARCHING,
+    (_C.RUNNING,   _CT.FAULT):      _C.FAULTED,
+    (_C.RUNNING,   _CT.STAND_DOWN): _C.HOLDING,
+    (_C.HOLDING,   _CT.STAND_DOWN): _C.HOLDING,
+    (_C.HOLDING,   _CT.RECALL):     _C.SEARCHING,
+    (_C.FAULTED,   _CT.STAND_DOWN): _C.HOLDING,
+    (_C.FAULTED,   _CT.RECALL):     _C.SEARCHING,
+}
+"""The controller. Ready: it has the vehicle but no valid measurement, and commands "no valid value". Holding and
+faulted: it has no vehicle and wants none until it is recalled."""
+# fmt: on
+
+State = TypeVar("State", bound=StrEnum)
+Trigger = TypeVar("Trigger", bound=StrEnum)
+
+
+class Machine(Generic[State, Trigger]):
+    """A state, and the table that moves it.
+
+    Args:
+        start: The first state.
+        table: What leads where.
+
+    Attributes:
+        state: The state now.
+    """
+
+    def __init__(self, start: State, table: Mapping[tuple[State, Trigger], State]) -> None:
+        self.state = start
+        self._table = table
+
+    def fire(self, trigger: Trigger) -> State:
+        """Let something happen, and return the state that follows.
+
+        Raises:
+            ValueError: It cannot happen in this state.
+        """
+        after = self._table.get((self.state, trigger))
+        if after is None:
+            raise ValueError(f"a state machine that is {self.state} cannot take {trigger!r}")
+        self.state = after
+        return after
