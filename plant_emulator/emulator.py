@@ -116,6 +116,8 @@ class Emulator:
                 self._steps -= 1
             echo = self._tick(arrival, self._k + 1)
             arrival = None if echo is None else self._await_answer(echo)
+            if self._steps == 0:
+                self._presence.tell()
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """One tick of the plant end. Returns the counter that an answer to its measurement will echo, if one will."""

@@ -110,13 +110,13 @@ class Presence:
     def tell_when_due(self) -> None:
         """Tell the status if a second is over, or something has happened."""
         if time.monotonic_ns() >= self._status_due:
-            self._publish_status()
+            self.tell()
 
     def leave(self) -> None:
         """Tell that the plant is at 0 V and goes."""
         self.follow_session()
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
-        self._publish_status()
+        self.tell()
 
     # ── what came from Zenoh's threads, taken between ticks ──
 
@@ -157,7 +157,8 @@ class Presence:
             lossless=self._loop.lockstep,
         )
 
-    def _publish_status(self) -> None:
+    def tell(self) -> None:
+        """Tell the status."""
         now = time.monotonic()
         endpoint = self._endpoint
         self._role.status(

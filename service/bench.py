@@ -61,6 +61,7 @@ class Bench:
         self._config.write_text(settings.toml())
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._alive: set[str] = set()
+        self._killed: set[str] = set()  # on purpose
         self._changed = threading.Condition()
         self.zenoh = join(settings.network)
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
@@ -81,7 +82,7 @@ class Bench:
         """Start a role; it is not yet on the network when this returns."""
         environment = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
         command = [sys.executable, "-m", "service.cli", role, "--config", str(self._config), "--with-parent", "--quiet"]
-        with self._log(role).open("wb") as stderr:
+        with self._log(role).open("ab") as stderr:
             child = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -91,6 +92,7 @@ class Bench:
                 start_new_session=True,
             )
         self._children[role] = child
+        self._killed.discard(role)
         return child
 
     def await_role(self, role: RoleName, timeout_s: float = START_WAIT_S) -> None:
@@ -113,14 +115,24 @@ class Bench:
 
     def stop(self, role: RoleName, how: signal.Signals = signal.SIGTERM) -> int:
         """Stop a role and wait for it; killed if it does not end by itself. Returns its exit code."""
+        self._killed.add(role)
         child = self._children[role]
         if child.poll() is None:
             child.send_signal(how)
+            child.send_signal(signal.SIGCONT)  # a process that stands still ends no other way
         try:
             return child.wait(STOP_WAIT_S)
         except subprocess.TimeoutExpired:
             child.kill()
             return child.wait()
+
+    def signal(self, role: RoleName, which: signal.Signals) -> None:
+        """Send a signal to a role that was started."""
+        self._children[role].send_signal(which)
+
+    def pid(self, role: RoleName) -> int:
+        """Process id of a role that was started."""
+        return self._children[role].pid
 
     def check(self) -> None:
         """Raise if any process has failed.
@@ -133,7 +145,7 @@ class Bench:
 
     def _check(self, role: str) -> None:
         code = self._children[role].poll()
-        if code:
+        if code and role not in self._killed:
             said = self._log(role).read_text(errors="replace").strip().splitlines()
             raise BenchError(f"the {role} ended with exit code {code}" + (f": {said[-1]}" if said else ""))
 

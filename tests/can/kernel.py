@@ -157,7 +157,6 @@ def _run_in_uml(command: Sequence[str], cwd: Path, timeout_s: float) -> subproce
             *("--", "-I", "-S", f'"{Path(__file__).resolve()}"', "uml", f'"{exchange}"'),
         ]
         env = {"PATH": os.defpath, "HOME": name, "TMPDIR": str(_memory_folder())}
-        console = ""
         try:
             with _on_one_cpu():
                 done = _run(kernel, exchange, BOOT_S + timeout_s, env)
@@ -165,6 +164,7 @@ def _run_in_uml(command: Sequence[str], cwd: Path, timeout_s: float) -> subproce
         except subprocess.TimeoutExpired as error:
             if not (exchange / "started").exists():
                 raise NoSocketCan(f"user-mode Linux did not boot within {error.timeout:g} s") from None
+            console = f"it did not halt within {error.timeout:g} s"
         started, said = (exchange / "started").exists(), exchange / "result.json"
         result: dict[str, Any] = json.loads(said.read_text()) if said.exists() else {"error": _last_line(console)}
     if "error" in result:
