@@ -13,7 +13,7 @@ from typing import Final
 
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.faults import Fault
-from plant_emulator.faulty import FaultyStream
+from plant_emulator.faulty_stream import FaultyStream
 from plant_emulator.presence import Presence
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
@@ -59,7 +59,7 @@ class Emulator:
             guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
             armed=settings.armed_at_start,
         )
-        self._presence = Presence(role, loop, self._endpoint)
+        self._presence = Presence(role, loop, self._endpoint, latest_s=settings.watchdog_s)
         faults = settings.parsed_faults
         self._measurements = FaultyStream("measurement", faults, settings.fault_seed)
         self._commands = FaultyStream("command", faults, settings.fault_seed)
@@ -122,15 +122,13 @@ class Emulator:
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """One tick of the plant end. Returns the counter that an answer to its measurement will echo, if one will."""
         command = None
-        if arrival is not None:
-            self._presence.arrived(arrival)
-            command = arrival.frame
         if self._endpoint.session is not None:
             self._plant.start()
         t = self._plant.time
         if not self._commands.idle:
-            passed = self._commands.passes(command, t)
-            command = passed[-1] if passed else None
+            arrival = self._disturbed(arrival, t)
+        if arrival is not None and self._presence.arrived(arrival):
+            command = arrival.frame
         frame = self._endpoint.tick(command, k)
         frames = [frame] if frame is not None else []
         if not self._measurements.idle:
@@ -148,6 +146,12 @@ class Emulator:
                 "truth", Truth(tick=k, attitude=state.attitude, rate=state.rate, voltages=state.voltages)
             )
         return echo
+
+    def _disturbed(self, arrival: Arrival | None, t: float) -> Arrival | None:
+        """What is left of a command after its faults; one that comes late was still sent when it was."""
+        frame, sent_ns = (arrival.frame, arrival.published_ns) if arrival else (None, 0)
+        passed = self._commands.passes(frame, t, sent_ns)
+        return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns) if passed else None
 
     def _await_answer(self, echo: int) -> Arrival | None:
         """The command that echoes a counter, or None when the session ends before it comes."""

@@ -1,4 +1,4 @@
-"""What can go wrong, on purpose: the vocabulary. `plant_emulator.faulty` applies it.
+"""What can go wrong, on purpose: the vocabulary. `faulty` and `faulty_stream` apply it.
 
 A fault is written `signal:kind[=value][@start[..end]]`, in seconds of the plant's time. Without a start it acts at
 once, without an end for ever:

@@ -1,9 +1,9 @@
-"""Faults at work: a plant and streams of frames that fail as they are told, and repeat from a seed.
+"""Faults at work on a plant: its sensors and motors fail as they are told, and repeat from a seed.
 
 A FaultyPlant stands between the endpoint and any plant. Voltages pass its motor faults on their way in, as of the
-period's beginning; samples pass its sensor faults on their way out, as of the period's end. A FaultyStream stands where
-frames pass in one direction. Faults on one signal act one after another, in the order in which they came, each with its
-own random numbers: one more fault leaves the noise of the others as it was. Those that have ended are forgotten.
+period's beginning; samples pass its sensor faults on their way out, as of the period's end. Faults on one signal act
+one after another, in the order in which they came, each with its own random numbers: one more fault leaves the noise of
+the others as it was. Those that have ended are forgotten.
 
 Instants are rounded to the nanosecond, so that a fault begins at the tick that a person means.
 """
@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from math import cos, hypot, inf, nan, sin
-from typing import Final, Literal, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -290,7 +290,7 @@ class FaultyPlant(Plant):
 
     def _attach(self, fault: Fault) -> None:
         whole, seen = fault.target.whole, self._seen
-        random = _generator(self._seed, self._attached, fault)
+        random = generator(self._seed, self._attached, fault)
         if whole == "motors":
             self._motors.append(MotorFault(fault, random, self._applied, self._limit))
         elif whole == "attitude":
@@ -300,145 +300,6 @@ class FaultyPlant(Plant):
         self._attached += 1
 
 
-class StreamFault:
-    """A fault at work on frames.
-
-    Args:
-        fault: What goes wrong and when.
-        random: Where its random numbers come from.
-        last: The frame that passed last, if there was one.
-
-    Attributes:
-        fault: What goes wrong and when.
-    """
-
-    def __init__(self, fault: Fault, random: np.random.Generator, last: bytes | None) -> None:
-        self.fault = fault
-        self._value = 0.0 if fault.value is None else fault.value
-        self._random, self._last = random, last
-        self._held: deque[tuple[float, bytes]] = deque()  # when each is due, and what
-
-    def apply(self, frames: list[bytes], t: float) -> list[bytes]:
-        """What passes at time t [s], of these frames and of those held back. Call it once a tick."""
-        match self.fault.kind:
-            case "delay":
-                return self._delayed(frames, t)
-            case "duplicate":
-                return self._duplicated(frames, t)
-            case "reorder":
-                return self._reordered(frames, t)
-            case "stuck":
-                return self._stuck(frames, t)
-            case "garble":
-                return [self._flipped(frame) if frame and self._happens(t) else frame for frame in frames]
-            case "drop":
-                return [frame for frame in frames if not self._happens(t)]
-            case _:
-                return [] if self.fault.active(t) else frames
-
-    def done(self, t: float) -> bool:
-        """Whether it has ended by time t [s] and holds nothing back."""
-        return self.fault.over(t) and not self._held
-
-    def _happens(self, t: float) -> bool:
-        return self.fault.active(t) and bool(self._random.random() < self._value)
-
-    def _delayed(self, frames: list[bytes], t: float) -> list[bytes]:
-        """When the fault ends, what is on its way comes at once, ahead of what is not late any more."""
-        active = self.fault.active(t)
-        self._held.extend((round(t + self._value, 9), frame) for frame in frames)
-        passed = []
-        while self._held and (not active or self._held[0][0] <= t):
-            passed.append(self._held.popleft()[1])
-        return passed
-
-    def _duplicated(self, frames: list[bytes], t: float) -> list[bytes]:
-        again = [frame for _, frame in self._held]
-        self._held = deque((t, frame) for frame in frames if self._happens(t))
-        return again + frames
-
-    def _reordered(self, frames: list[bytes], t: float) -> list[bytes]:
-        passed = []
-        for frame in frames:
-            if self._held:
-                passed += [frame, self._held.popleft()[1]]
-            elif self._happens(t):
-                self._held.append((t, frame))
-            else:
-                passed.append(frame)
-        return passed
-
-    def _stuck(self, frames: list[bytes], t: float) -> list[bytes]:
-        if not frames:
-            return []
-        if not self.fault.active(t):
-            self._last = frames[-1]
-            return frames
-        if self._last is None:
-            self._last = frames[0]
-        return [self._last] * len(frames)
-
-    def _flipped(self, frame: bytes) -> bytes:
-        bit = int(self._random.integers(8 * len(frame)))
-        flipped = bytearray(frame)
-        flipped[bit // 8] ^= 0x80 >> bit % 8
-        return bytes(flipped)
-
-
-class FaultyStream:
-    """Frames of one direction, with faults.
-
-    Args:
-        signal: Which direction it is.
-        faults: What goes wrong; those of other signals are left to others.
-        seed: Of all random numbers, from 0 up.
-    """
-
-    def __init__(self, signal: Literal["measurement", "command"], faults: Sequence[Fault], seed: int = 0) -> None:
-        self._signal, self._seed = signal, seed
-        self._attached = 0
-        self._last: bytes | None = None
-        self._faults: list[StreamFault] = []
-        for fault in faults:
-            self.inject(fault, 0.0)
-
-    @property
-    def idle(self) -> bool:
-        """Whether frames pass as they are: no fault is there, and none holds a frame back."""
-        return not self._faults
-
-    def passes(self, frame: bytes | None, t: float) -> list[bytes]:
-        """Take in the frame of a tick, and say what comes out.
-
-        Args:
-            frame: The frame, or None.
-            t: The plant's time [s], rising.
-
-        Returns:
-            What passes at this tick, in the order in which it does.
-        """
-        frames = [] if frame is None else [frame]
-        if self._faults:
-            t = round(t, 9)
-            for fault in self._faults:
-                frames = fault.apply(frames, t)
-            self._faults = [fault for fault in self._faults if not fault.done(t)]
-        if frames:
-            self._last = frames[-1]
-        return frames
-
-    def inject(self, fault: Fault, now: float) -> None:
-        """Add a fault whose start and end are counted from `now` [s], if it is one of this signal."""
-        if fault.signal == self._signal:
-            random = _generator(self._seed, self._attached, fault)
-            self._faults.append(StreamFault(fault.later(now), random, self._last))
-            self._attached += 1
-
-    def clear(self) -> None:
-        """No faults any more; a frame that one held back is lost."""
-        self._faults = []
-
-
-def _generator(seed: int, number: int, fault: Fault) -> np.random.Generator:
+def generator(seed: int, number: int, fault: Fault) -> np.random.Generator:
     """Random numbers of one fault: others for each signal, or both streams would lose the same ticks."""
     return np.random.default_rng([seed, number, *fault.signal.encode()])

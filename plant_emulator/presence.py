@@ -13,7 +13,7 @@ from typing import Final
 
 from plant_emulator.endpoint import Endpoint
 from protocol import topics
-from protocol.clock import Histogram, LoopSettings, LoopTiming
+from protocol.clock import LoopSettings, LoopTiming, RollingHistogram
 from protocol.frames import COUNTERS
 from protocol.links import Arrival, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
@@ -30,25 +30,29 @@ class Presence:
         role: Its name there.
         loop: The grid.
         endpoint: Who grants, refuses and trips.
+        latest_s: A command is acted upon for so long after it was sent, and no longer [s].
 
     Attributes:
         link: The session's frames; None while there is no session.
         timing: How well the owner's loop keeps time, if it keeps any.
         skipped: Ticks of sessions that the owner missed.
+        late: Commands that came too late to be acted upon.
         notes: What the machine refused.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, endpoint: Endpoint) -> None:
+    def __init__(self, role: Role, loop: LoopSettings, endpoint: Endpoint, latest_s: float) -> None:
         self._role = role
         self._loop = loop
         self._endpoint = endpoint
+        self._latest_ns = round(latest_s * 1e9)
         self.link: ZenohLink | None = None
         self.timing: LoopTiming | None = None
-        self.skipped = 0
+        self.skipped = self.late = 0
         self.notes: list[str] = []
-        self._latency = Histogram()
+        self._latency = RollingHistogram()
         self._sent_at = [0] * COUNTERS
         self._sent = self._received = 0
+        self._told_state = endpoint.state
         self._since = _now() if endpoint.cause else None
         self._k = self._status_tick = -1
         self._status_due = 0
@@ -77,12 +81,24 @@ class Presence:
             self.link.send(frame)
             self._sent += 1
 
-    def arrived(self, arrival: Arrival) -> None:
-        """Keep count of a command frame, and of how long it took."""
+    def arrived(self, arrival: Arrival) -> bool:
+        """Keep count of a command frame, and of how long it took. Whether it came in time to be acted upon.
+
+        The four bits of its echo repeat every 16 ticks, so they cannot tell a stream that is late for good; its time of
+        publication can. That is never before the publication of the measurement it answers, on the plant's own clock,
+        whatever the controller's clock says (hybrid logical clocks), so nothing that is in time is taken for late.
+        """
         self._received += 1
+        late_ns = time.time_ns() - arrival.published_ns
+        if late_ns > self._latest_ns and not self._loop.lockstep:
+            text = f"commands come {late_ns * 1e-6:.0f} ms after they were sent: refused"
+            self._role.warn("late", "fault", text, self._endpoint.session)
+            self.late += 1
+            return False
         read = self._endpoint.wire.command.unpack(arrival.frame)
         if read is not None and (elapsed := arrival.at_ns - self._sent_at[read[0]]) > 0:
             self._latency.add(elapsed)
+        return True
 
     def after_tick(self, k: int) -> None:
         """Tell what happened at tick k, and the status once a second."""
@@ -93,6 +109,9 @@ class Presence:
     def follow_session(self) -> None:
         """Tell what happened, and close the link of a session that ended."""
         endpoint = self._endpoint
+        if endpoint.state is not self._told_state:
+            self._told_state = endpoint.state
+            self._status_due = 0
         if endpoint.session is None and self.link is not None:
             self.link.close()
             self.link = None
@@ -101,7 +120,8 @@ class Presence:
         if endpoint.cause is None:
             self._since = None
         elif any(notice.kind == "tripped" for notice in endpoint.notices):
-            self._since = _now()
+            self._told_state = endpoint.state
+        self._since = _now()
         for notice in endpoint.notices:
             self._role.event(*notice)
         endpoint.notices.clear()
@@ -161,6 +181,7 @@ class Presence:
         """Tell the status."""
         now = time.monotonic()
         endpoint = self._endpoint
+        self._latency.turn_when_due()
         self._role.status(
             Status(
                 role=self._role.role,
@@ -174,9 +195,10 @@ class Presence:
                 skipped=self.skipped,
                 received=self._received,
                 sent=self._sent,
-                refused=endpoint.refused,
+                refused=endpoint.refused + self.late,
                 saturated=endpoint.saturated,
-                latency_us=summary(self._latency),
+                latency_us=summary(self._latency.total),
+                recent_latency_us=summary(self._latency.recent()),
                 timing=report(self.timing) if self.timing else None,
                 notes=self.notes,
             )

@@ -151,16 +151,23 @@ class RollingHistogram:
         self.total = Histogram()
         self._windows: deque[Histogram] = deque([Histogram()], maxlen=self.WINDOWS)
         self._current = self._windows[0]
+        self._turned_at = 0
 
     def add(self, nanoseconds: int) -> None:
         """Count one duration [ns]."""
         self._current.add(nanoseconds)
 
     def turn(self) -> None:
-        """End a window; called once a second by whoever reports."""
+        """End a window."""
+        self._turned_at = time.monotonic_ns()
         self.total.merge(self._current)
         self._current = Histogram()
         self._windows.append(self._current)
+
+    def turn_when_due(self) -> None:
+        """End a one-second window; called by whoever reports. A report that comes sooner ends none."""
+        if time.monotonic_ns() - self._turned_at >= _SHORTEST_WINDOW_NS:
+            self.turn()
 
     def recent(self) -> Histogram:
         """The last ten windows."""
@@ -185,7 +192,6 @@ class LoopTiming:
         self.period = RollingHistogram()
         self._warm_at = time.monotonic_ns() + warm_up_ns
         self._woke_at = 0
-        self._turned_at = 0
 
     def woke(self, due_ns: int) -> None:
         """A tick begins that was due at `due_ns` on `time.monotonic_ns()`."""
@@ -206,13 +212,9 @@ class LoopTiming:
         self._woke_at = 0
 
     def turn(self) -> None:
-        """End a one-second window; a report that comes sooner, because something happened, does not."""
-        now = time.monotonic_ns()
-        if now - self._turned_at < _SHORTEST_WINDOW_NS:
-            return
-        self._turned_at = now
+        """End a one-second window."""
         for histogram in (self.wake, self.busy, self.period):
-            histogram.turn()
+            histogram.turn_when_due()
 
 
 class Throttle:

@@ -142,6 +142,7 @@ class Status(Message):
     latency_us: Percentiles | None = Field(
         default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
     )
+    recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
     timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
 

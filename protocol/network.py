@@ -39,6 +39,9 @@ class NetworkSettings(BaseModel):
         description="Zenoh endpoints this process can be reached at; port 0 is any free one",
     )
     connect: list[str] = Field(default=[], description="Zenoh endpoints to reach besides the rendezvous")
+    gossip: bool = Field(
+        default=True, description="learn of further processes from those one is linked to, and link to them directly"
+    )
     timestamps: bool = Field(
         default=True, description="stamp every message with its time of publication, for the log; 26 bytes each"
     )
@@ -54,7 +57,7 @@ def _zenoh_config(settings: NetworkSettings, listen: list[str], connect: list[st
             "exit_on_failure": False,
             "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "timestamping": {"enabled": {"peer": settings.timestamps}},
         "transport": {
             # Useless at seven bytes, and it leaves files behind when a process is killed.

@@ -134,6 +134,13 @@ class Bench:
         """Process id of a role that was started."""
         return self._children[role].pid
 
+    def replace_log(self, path: Path) -> None:
+        """Let a recorder that is started from now on write another log."""
+        self._settings = self._settings.model_copy(
+            update={"recorder": self._settings.recorder.model_copy(update={"path": path})}
+        )
+        self._config.write_text(self._settings.toml())
+
     def check(self) -> None:
         """Raise if any process has failed.
 

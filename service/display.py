@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from service.demo import Progress as DemoProgress
     from service.doctor import Diagnosis
     from service.operate import Statuses
+    from service.soak import Soak
     from service.tables import Tables
 
 _stderr = Console(stderr=True)
@@ -248,3 +249,36 @@ def wire_table(wire: WireSpec) -> None:
     frames: tuple[tuple[str, FrameFormat], ...] = (("measurement", wire.measurement), ("command", wire.command))
     for label, kind in frames:
         Console().print(f"{label}: {kind.bits} bits in {kind.size} bytes")
+
+
+def soak_table(soak: Soak) -> None:
+    """Print what a soak has shown."""
+    console = Console()
+    loop = Table("at", "missed ticks", "unanswered", "latency p50/p99", "wake-up p50/p99", box=None)
+    for minute in soak.minutes:
+        latency, wake = minute.latency_us, minute.wake_us
+        loop.add_row(
+            f"{minute.at_s:.0f} s",
+            str(minute.skipped),
+            str(minute.unanswered),
+            f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+            f"{wake.p50:.0f}/{wake.p99:.0f} µs" if wake else "–",
+        )
+    console.print(loop)
+    console.print()
+    growth = Table("process", "memory", "threads", "open files", "CPU", box=None)
+    first, last = soak.minutes[0], soak.minutes[-1]
+    for role, before in first.usage.items():
+        after = last.usage[role]
+        share = (after.cpu_s - before.cpu_s) / max(1e-9, last.at_s - first.at_s)
+        growth.add_row(
+            role,
+            f"{before.memory_mb:.1f} → {after.memory_mb:.1f} MB",
+            f"{before.threads} → {after.threads}",
+            f"{before.files} → {after.files}",
+            f"{100 * share:.1f} %",
+        )
+    console.print(growth)
+    console.print(f"\n{soak.rate_hz:g} Hz; log {soak.log}, {soak.log_mb:g} MB")
+    for finding in soak.findings or ["nothing grew, and one session held throughout"]:
+        console.print(finding)

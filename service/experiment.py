@@ -50,7 +50,8 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
         if command is None or (read := wire.command.unpack(command)) is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
             raise ValueError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
-        score.error(k, controller.attitude_error)
+        if controller.tick_index == k:  # it used the measurement
+            score.error(k, controller.attitude_error)
         score.command(k, [level(code) for code in read[1]])
         measurement = endpoint.tick(command, k + 1)
         if progress is not None and k % report_every == 0:

@@ -82,12 +82,16 @@ class Score:
         self._errors += 1
 
     def command(self, k: int, voltages: Sequence[float]) -> None:
-        """The voltages [V] commanded at tick k; held until the next, or the watchdog. Shape (actuators,)."""
+        """The voltages [V] commanded at tick k; held until the next, or the watchdog. Shape (actuators,).
+
+        A command without a valid value puts the plant at 0 V.
+        """
         if self._commands:
             held = min(k - self._command_tick, self._longest_hold)
             self._u_total += self._command_square * (held * self._period)
         self._command_tick = k
-        self._command_square = sum(u * u for u in voltages)
+        square = sum(u * u for u in voltages)
+        self._command_square = square if square == square else 0.0
         self._commands += 1
 
     @property

@@ -145,11 +145,14 @@ class Hil:
         self._logs.append(HilLog(log))
         for name, hear in (("event", self._hear_event), ("status", self._hear_status)):
             self.bench.zenoh.declare_subscriber(topics.key(name, self.settings.vehicle), hear)
-        for role in ("recorder", "emulator"):
+        roles: tuple[RoleName, ...] = ("recorder", "emulator")
+        for role in roles:
             self.bench.start(role)
+        if drive:
+            self.bench.start("controller")  # which waits for the recorder by itself
+        for role in roles:
             self.bench.await_role(role)
         if drive:
-            self.bench.start("controller")
             ready = {PlantState.GRANTED, PlantState.DRIVEN} if self._lockstep else {PlantState.DRIVEN}
             self.eventually("the controller drives the plant", lambda: self.state("plant") in ready)
 
@@ -210,7 +213,13 @@ class Hil:
         self.bench.signal(role, signal.SIGCONT)
 
     def restart(self, role: RoleName) -> None:
-        """Start a role again that has ended or was killed, and wait until it is on the network."""
+        """Start a role again that has ended or was killed, and wait until it is on the network.
+
+        A recorder begins another log, which is `log` from then on.
+        """
+        if role == "recorder":
+            self._logs.append(HilLog(self._folder / f"hil-{len(self._logs)}.mcap"))
+            self.bench.replace_log(self._logs[-1].path)
         self.bench.start(role)
         if role != "controller":
             self.bench.await_role(role)

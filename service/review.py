@@ -151,8 +151,6 @@ class Session:
             if answered is None:
                 continue  # answers what the log does not have, or repeats an answer
             voltages = [self._level(code) for code in codes]
-            if voltages[0] != voltages[0]:
-                voltages = [0.0] * len(voltages)  # "no valid value": the plant goes to 0 V
             while self._measured and self._measured[0][0] <= answered:
                 self._score(*self._measured.popleft(), voltages)
             self.score.command(answered, voltages)

@@ -19,6 +19,7 @@ from service.commands.common import (
 
 if TYPE_CHECKING:
     from service.doctor import Diagnosis
+    from service.soak import Soak
 
 group = typer.Typer(no_args_is_help=True, help="This machine.")
 
@@ -43,6 +44,38 @@ def doctor(json: Json = False, config: Config = None, overrides: Overrides = Non
 
         diagnosis_table(diagnosis)
     if not diagnosis.holds:
+        raise typer.Exit(1)
+
+
+@group.command()
+def soak(
+    minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="How long.")] = 20.0,
+    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the three processes for long, and say whether anything grows, drifts or is lost."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Soak:
+        from datetime import datetime
+
+        from service.display import progress_bar
+        from service.soak import run_soak
+
+        path = log or settings.recorder.directory / datetime.now().strftime("soak-%Y%m%d-%H%M%S.mcap")
+        with progress_bar("soak", minutes * 60, hidden=json) as update:
+            return run_soak(settings, minutes, path, lambda reached, _: update(reached))
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from service.display import soak_table
+
+        soak_table(result)
+    if result.findings:
         raise typer.Exit(1)
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from service.commands.common import (
     Config,
     Overrides,
+    fail,
     settings_of,
 )
 
-if TYPE_CHECKING:
-    pass
+EXAMPLES = Path(__file__).parent.parent / "examples"
 
 group = typer.Typer(no_args_is_help=True, help="What would be used.")
 
@@ -30,3 +31,21 @@ def spec(config: Config = None, overrides: Overrides = None) -> None:
     from service.display import wire_table
 
     wire_table(settings_of(config, overrides).wire)
+
+
+@group.command()
+def examples(
+    name: Annotated[
+        str | None, typer.Argument(help="Which one; all are listed if left out.", show_default=False)
+    ] = None,
+) -> None:
+    """List the example configurations, or print one of them."""
+    known = {path.stem: path.read_text(encoding="utf-8") for path in sorted(EXAMPLES.glob("*.toml"))}
+    if name is None:
+        for stem, text in known.items():
+            about = " ".join(line[2:] for line in text.split("\n\n")[0].splitlines() if line.startswith("# "))
+            typer.echo(f"{stem:12}  {about}")
+    elif name in known:
+        typer.echo(known[name], nl=False)
+    else:
+        fail(f"no example is called {name!r}; there are {', '.join(known)}", 2)

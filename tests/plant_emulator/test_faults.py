@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.faults import SIGNALS, Fault
-from plant_emulator.faulty import GARBLED_RATE, FaultyPlant, FaultyStream
+from plant_emulator.faulty import GARBLED_RATE, FaultyPlant
+from plant_emulator.faulty_stream import FaultyStream
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Quaternion, Vector
@@ -611,6 +612,7 @@ def test_it_is_closed_at_no_voltage_whatever_its_faults(fault: str) -> None:
 def test_a_closed_plant_is_not_woken_by_a_fault_that_comes_too_late() -> None:
     plant, stand = faulty()
     plant.actuate((5.0, 5.0))
+    plant.advance()
     plant.close()
     plant.inject(Fault.parse("motor1:off"))
     plant.advance()

@@ -1,0 +1,153 @@
+"""What an operator can do to a running loop, by the command line, and what the log says of it afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from math import degrees
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol import topics
+from protocol.attitude import to_euler
+from protocol.messages import Event, Telemetry, Truth
+from protocol.verbs import Change, Setpoint
+from service.hil import Hil
+from service.review import read
+from tests.hil.test_faults import PATIENT
+
+AEROLOOP = [sys.executable, "-m", "service.cli"]
+
+
+def op(hil: Hil, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """An operator's command on the loop's network."""
+    network = ["--set", f"network.rendezvous={hil.settings.network.rendezvous}"]
+    return subprocess.run(
+        [*AEROLOOP, "op", *arguments, *network], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def done(hil: Hil, *arguments: str) -> str:
+    """As `op`, for what must succeed."""
+    result = op(hil, *arguments)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def refused(hil: Hil, *arguments: str) -> str:
+    """As `op`, for what must be refused in one line."""
+    result = op(hil, *arguments)
+    assert result.returncode in (1, 2), result.stdout
+    assert len(result.stderr.splitlines()) == 1
+    return result.stderr
+
+
+def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_again_to_the_last_bit(hil: Hil) -> None:
+    hil.start(settings={**PATIENT, "reference.kind": "hold", "controller.telemetry_rate_hz": 500})
+    done(hil, "goto", "0", "-10", "20", "--in", "1")
+    done(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
+    assert "4.63 rad/s" in refused(hil, "goto", "0", "0", "90", "--in", "0.5") or "rad/s, more than" in refused(
+        hil, "goto", "0", "0", "170", "--in", "0.5"
+    )
+    assert "rolls" in refused(hil, "goto", "5", "0", "0", "--in", "3")
+    assert "at most 20" in refused(hil, "set-gains", "--C1", "1", "1", "100")
+    hil.run(2.0)
+    log = hil.log
+    last = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)][-1]
+    roll, pitch, yaw = (degrees(angle) for angle in to_euler(last.desired))
+    assert (roll, pitch, yaw) == pytest.approx((0.0, -10.0, 20.0), abs=1e-6)  # quintics and quaternions, rounded
+    # The review computes the errors again from frames and changes; the controller told what it had computed.
+    computed = {tick.k: tick.attitude_error for tick in read(log.path, keep=True).session.ticks or []}
+    told = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
+    compared = [(message.attitude_error, computed[message.tick]) for message in told if message.tick in computed]
+    assert len(compared) > 500
+    assert all(mine == theirs for mine, theirs in compared)
+
+
+def test_the_body_follows_a_file_and_a_live_stream_which_is_held_when_it_falls_silent(hil: Hil, tmp_path: Path) -> None:
+    points = tmp_path / "points.csv"
+    points.write_text("time,roll,pitch,yaw\n0,0,0,0\n1,0,5,10\n2,0,0,15\n")
+    hil.start(settings={**PATIENT, "reference.kind": "hold"})
+    done(hil, "track", str(points), "--in", "0.5")
+    hil.eventually("the change", lambda: hil.happened("changed", "3 points"))
+    hil.run(2.6)
+    done(hil, "track", "stream", "--in", "0.5", "--timeout", "0.3")
+    key = topics.key("reference", hil.settings.vehicle)
+    for yaw in np.linspace(15, 25, 25):
+        hil.bench.zenoh.put(key, Setpoint(attitude=(0.0, 0.0, float(yaw))).encode())
+        time.sleep(0.02)
+    hil.bench.zenoh.put(key, b"nonsense")
+    hil.eventually("its silence", lambda: hil.happened("lost", "no set-point for 0.3 s"))
+    hil.run(0.5)
+    assert hil.happened("fault", "set-point refused")
+    assert hil.state("plant") == "driven"
+    log = hil.log
+    truths = [truth for _, truth in log.messages("truth") if isinstance(truth, Truth)]
+    yaw_now = degrees(to_euler(truths[-1].attitude)[2])
+    assert yaw_now == pytest.approx(25.0, abs=4.0)  # it tracks to a few degrees, as in the paper's experiment
+    changes = [change for _, change in log.messages("change") if isinstance(change, Change)]
+    assert changes[0].tick == 0
+    assert len(changes) > 10  # every set-point that a tick took
+
+
+def test_a_released_vehicle_is_another_controllers_until_the_first_is_recalled(hil: Hil) -> None:
+    hil.start(settings=PATIENT)
+    done(hil, "release")
+    hil.eventually("holding", lambda: hil.state("controller") == "holding" and hil.state("plant") == "idle")
+    hil.run(0.6)
+    assert hil.state("plant") == "idle"  # it claims four times a second where it does not hold
+    status = json.loads(done(hil, "status", "--json"))
+    assert status["aero"]["plant"]["state"] == "idle"
+    assert status["aero"]["controller"]["state"] == "holding"
+    assert "does not have" in refused(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
+    done(hil, "arm")
+    hil.eventually("driving", lambda: hil.state("controller") == "running" and hil.state("plant") == "driven")
+    done(hil, "stop")
+    hil.eventually("tripped", lambda: hil.state("plant") == "tripped")
+    assert hil.status("plant").cause == "stopped by an operator: 0 V"
+    assert hil.status("plant").since is not None
+    assert hil.log.trips == ["stopped by an operator: 0 V"]
+
+
+def test_a_configuration_read_again_changes_what_can_change_live_and_names_the_rest(hil: Hil, tmp_path: Path) -> None:
+    config = tmp_path / "a.toml"
+    config.write_text("[law]\nC2 = [0.15, 0.15, 0.15]\n")
+    rendezvous = ["--set", "network.rendezvous={}", "--set", "controller.stale_s=2"]
+    hil.start(settings=PATIENT, drive=False)
+    rendezvous[1] = f"network.rendezvous={hil.settings.network.rendezvous}"
+    controller = subprocess.Popen([*AEROLOOP, "controller", "--config", str(config), *rendezvous])
+    try:
+        hil.eventually("driving", lambda: hil.state("plant") == "driven")
+        config.write_text("[law]\nC2 = [0.2, 0.2, 0.2]\nmass = 2.0\n")
+        os.kill(controller.pid, signal.SIGHUP)
+        hil.eventually("the change", lambda: hil.happened("changed", "configuration read again"))
+        config.write_text("[law]\nC2 = -1\n")
+        os.kill(controller.pid, signal.SIGHUP)
+        hil.eventually("its refusal", lambda: hil.happened("fault", "not reloaded: law.C2"))
+    finally:
+        controller.terminate()
+        assert controller.wait(30) == 0
+    log = hil.log
+    text = next(event.text for event in log.events if event.kind == "changed" and "read again" in event.text)
+    assert "law.C2: (0.15, 0.15, 0.15) → (0.2, 0.2, 0.2)" in text or "law.C2: [0.15, 0.15, 0.15] →" in text
+    assert "law.mass: 1.075 → 2.0, after a restart" in text
+    gains = [change.gains.C2 for _, change in log.messages("change") if isinstance(change, Change) and change.gains]
+    assert gains[-1] == (0.2, 0.2, 0.2)
+    assert not any(isinstance(event, Event) and event.kind == "lost" for event in log.events)
+
+
+def test_a_controller_on_a_grid_of_its_own_drives_the_plant_too(hil: Hil) -> None:
+    hil.start(settings={**PATIENT, "controller.pace": "clock"})
+    hil.run(2.0)
+    figures = hil.log.figures
+    # Two grids side by side: a measurement waits for up to a period, and one is missed where they drift past each other.
+    assert figures.command.frames_per_s is not None
+    assert figures.command.frames_per_s > 250
+    assert figures.max_error_deg is not None
+    assert figures.max_error_deg < 10

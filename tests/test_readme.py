@@ -1,0 +1,46 @@
+"""What the README shows works as it stands there."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.cli import execute
+from service.commands.show import EXAMPLES
+from service.config import load
+from service.experiment import run_experiment
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    example = text.split("```python\n")[1].split("```")[0]
+    assert "def test_" in example
+    (tmp_path / "test_example.py").write_text(example)
+    command = [sys.executable, "-m", "pytest", "-q", "test_example.py", "--hil-lockstep"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "1 passed" in done.stdout
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_example_configuration_makes_a_loop_that_tracks(path: Path) -> None:
+    settings = load(path)
+    if settings.plant.faults:  # of frames, which the experiment has none of; tests/hil tries those
+        settings.plant.faults = []
+    figures = run_experiment(settings, 4.0)
+    assert figures.max_error_deg is not None
+    assert figures.max_error_deg < 6
+
+
+def test_examples_are_listed_and_printed(capfd: pytest.CaptureFixture[str]) -> None:
+    assert execute(["show", "examples"]) == 0
+    listed = capfd.readouterr().out.splitlines()
+    assert [line.split()[0] for line in listed] == sorted(path.stem for path in EXAMPLES.glob("*.toml"))
+    assert execute(["show", "examples", "paper"]) == 0
+    assert capfd.readouterr().out == (EXAMPLES / "paper.toml").read_text(encoding="utf-8")
+    assert execute(["show", "examples", "nothing"]) == 2
