@@ -52,9 +52,7 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     hil.start(settings={**PATIENT, "reference.kind": "hold", "controller.telemetry_rate_hz": 500})
     done(hil, "goto", "0", "-10", "20", "--in", "1")
     done(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
-    assert "4.63 rad/s" in refused(hil, "goto", "0", "0", "90", "--in", "0.5") or "rad/s, more than" in refused(
-        hil, "goto", "0", "0", "170", "--in", "0.5"
-    )
+    assert "rad/s, more than" in refused(hil, "goto", "0", "0", "170", "--in", "0.5")
     assert "rolls" in refused(hil, "goto", "5", "0", "0", "--in", "3")
     assert "at most 20" in refused(hil, "set-gains", "--C1", "1", "1", "100")
     hil.run(2.0)
@@ -118,10 +116,10 @@ def test_a_released_vehicle_is_another_controllers_until_the_first_is_recalled(h
 def test_a_configuration_read_again_changes_what_can_change_live_and_names_the_rest(hil: Hil, tmp_path: Path) -> None:
     config = tmp_path / "a.toml"
     config.write_text("[law]\nC2 = [0.15, 0.15, 0.15]\n")
-    rendezvous = ["--set", "network.rendezvous={}", "--set", "controller.stale_s=2"]
     hil.start(settings=PATIENT, drive=False)
-    rendezvous[1] = f"network.rendezvous={hil.settings.network.rendezvous}"
-    controller = subprocess.Popen([*AEROLOOP, "controller", "--config", str(config), *rendezvous])
+    ours = [f"network.rendezvous={hil.settings.network.rendezvous}", "controller.stale_s=2"]
+    overrides = [word for setting in ours for word in ("--set", setting)]
+    controller = subprocess.Popen([*AEROLOOP, "controller", "--config", str(config), *overrides])
     try:
         hil.eventually("driving", lambda: hil.state("plant") == "driven")
         config.write_text("[law]\nC2 = [0.2, 0.2, 0.2]\nmass = 2.0\n")
@@ -135,7 +133,7 @@ def test_a_configuration_read_again_changes_what_can_change_live_and_names_the_r
         assert controller.wait(30) == 0
     log = hil.log
     text = next(event.text for event in log.events if event.kind == "changed" and "read again" in event.text)
-    assert "law.C2: (0.15, 0.15, 0.15) → (0.2, 0.2, 0.2)" in text or "law.C2: [0.15, 0.15, 0.15] →" in text
+    assert "law.C2: [0.15, 0.15, 0.15] → [0.2, 0.2, 0.2]" in text
     assert "law.mass: 1.075 → 2.0, after a restart" in text
     gains = [change.gains.C2 for _, change in log.messages("change") if isinstance(change, Change) and change.gains]
     assert gains[-1] == (0.2, 0.2, 0.2)
@@ -146,7 +144,7 @@ def test_a_controller_on_a_grid_of_its_own_drives_the_plant_too(hil: Hil) -> Non
     hil.start(settings={**PATIENT, "controller.pace": "clock"})
     hil.run(2.0)
     figures = hil.log.figures
-    # Two grids side by side: a measurement waits for up to a period, and one is missed where they drift past each other.
+    # Two grids side by side: a measurement waits for up to a period, and one is missed where they drift apart.
     assert figures.command.frames_per_s is not None
     assert figures.command.frames_per_s > 250
     assert figures.max_error_deg is not None
