@@ -22,6 +22,7 @@ from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.messages import Truth
 from protocol.role import Role
+from protocol.states import TripCause
 from protocol.verbs import Advance, Answer, Inject
 
 IDLE_WAIT_S: Final = 0.02
@@ -162,7 +163,7 @@ class Emulator:
                 return arrival
             self._presence.take_inbox()
             if time.monotonic() > deadline:
-                self._endpoint.expire(f"no answer for {self._settings.answer_timeout_s:g} s")
+                self._endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
             self._presence.follow_session()
             self._presence.tell_when_due()
         return None

@@ -1,43 +1,24 @@
-"""The plant end of the loop, sans-I/O: measure → frame; frame → actuate; claim and watchdog.
+"""The plant end of the loop, sans-I/O: measure → frame; frame → actuate; and the watchdog.
 
 It knows no socket and no clock: time is the tick index. Whoever owns it feeds it the newest command frame, once a tick,
 and sends what it returns. A command acts from the start of the period in which it arrived; when none has come in time
 the watchdog trips: the session ends, and the motors have 0 V until somebody arms the plant and a controller claims it.
-
-              claim                first command
-  idle ────────────────► granted ───────────────► driven
-   ▲  ▲                     │ release                │ release
-   │  └─────────────────────┴────────────────────────┤
-   │ arm                                             │ watchdog, holder gone, invalid command, limit, operator's stop
-   └────────────────────────────────── tripped ◄─────┘
-
-A tripped plant, and one that starts unarmed, refuse claims and say why. A claim may carry its own arming
-(`auto_arm`), which clears anything but an operator's stop.
 """
 
 from __future__ import annotations
 
 from math import isfinite
-from typing import NamedTuple
 
 from plant_emulator.limits import Guard
 from plant_emulator.plant import Measurement, Plant
+from plant_emulator.tenancy import Tenancy
 from protocol.attitude import sent_vector
 from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
 from protocol.frames import COUNTERS, WireSpec
-from protocol.messages import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal
-from protocol.states import PLANT_TABLE, Machine, PlantState, PlantTrigger
+from protocol.states import PlantState, PlantTrigger, TripCause
 
 
-class Notice(NamedTuple):
-    """Something for the `event` topic."""
-
-    kind: EventKind
-    text: str
-    session: str | None
-
-
-class Endpoint:
+class Endpoint(Tenancy):
     """One plant, one controller at a time.
 
     Args:
@@ -53,10 +34,6 @@ class Endpoint:
         ValueError: The wire commands another number of actuators than the plant has.
 
     Attributes:
-        session: Name of the session it is in, or None.
-        holder: Controller that holds it, or None.
-        notices: What happened since the owner last emptied this list.
-        refused: Malformed command frames so far.
         accepted: Commands acted upon so far.
     """
 
@@ -73,15 +50,8 @@ class Endpoint:
     ) -> None:
         if plant.actuators != wire.actuators:
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
+        super().__init__(wire, period_ns, lockstep=lockstep, armed=armed)
         self.plant = plant
-        self.wire = wire
-        self.period_ns = period_ns
-        self.lockstep = lockstep
-        self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
-        self.session: str | None = None
-        self.holder: str | None = None
-        self.notices: list[Notice] = []
-        self.refused = 0
         self.accepted = 0
         self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
         self._encode = [quantizer.encode for quantizer in self._quantizers]
@@ -89,8 +59,6 @@ class Endpoint:
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
-        self._latch: str | None = None if armed else "not armed since it was started"
-        self._operator_stop = False
         self.protect(watchdog_s, guard)
         self._first_command = max(1, round(FIRST_COMMAND_S * 1e9 / period_ns))
         self._tick = -1
@@ -106,77 +74,9 @@ class Endpoint:
         self._guard = guard
 
     @property
-    def state(self) -> PlantState:
-        """What it is doing."""
-        return self._machine.state
-
-    @property
-    def cause(self) -> str | None:
-        """Why claims are held back, or None."""
-        return self._latch
-
-    @property
     def saturated(self) -> int:
         """Measured values beyond their quantizer's range so far."""
         return sum(quantizer.saturated for quantizer in self._quantizers)
-
-    def claim(self, claim: Claim) -> Grant | Refusal:
-        """Grant a claim, or say which field differs or who holds the plant. The next tick measures first."""
-        differences = self.wire.differences(claim.wire)
-        if claim.protocol != PROTOCOL_VERSION:
-            differences.append(f"protocol: {PROTOCOL_VERSION}, not {claim.protocol}")
-        if claim.period_ns != self.period_ns:
-            differences.append(f"period_ns: {self.period_ns}, not {claim.period_ns}")
-        if claim.lockstep != self.lockstep:
-            differences.append(f"lockstep: {self.lockstep}, not {claim.lockstep}")
-        if differences:
-            return Refusal(reason=f"the plant has {'; '.join(differences)}", differences=differences)
-        if self.session is not None:
-            return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
-        if claim.auto_arm and not self._operator_stop:
-            self._clear()
-        if self._latch is not None:
-            return Refusal(reason=f"{self._latch}; `aeroloop op arm` clears it")
-        if self._guard is not None:
-            self._guard.reset()
-        self._machine.fire(PlantTrigger.GRANT)
-        self.session, self.holder = claim.session, claim.controller
-        self._voltages = self._off
-        self._session_tick = self._fresh_tick = self._tick + 1
-        self._echo = self._answered = -1
-        self._notice("claimed", f"granted to {claim.controller}")
-        return Grant(session=claim.session)
-
-    def release(self, session: str) -> bool:
-        """End a session at its holder's wish: 0 V. False if it is not the session that runs."""
-        if session != self.session:
-            return False
-        self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}")
-        return True
-
-    def arm(self) -> bool:
-        """Clear what holds claims back; the next one is granted. False while a controller holds the plant."""
-        if self.session is not None:
-            return False
-        self._operator_stop = False
-        self._clear()
-        self._notice("armed", "armed by an operator: the next claim is granted")
-        return True
-
-    def stop(self) -> None:
-        """An operator's stop, from any state: 0 V, and no claim is granted before `arm`."""
-        self._trip("stopped by an operator")
-        self._operator_stop = True
-
-    def lost(self, controller: str) -> None:
-        """A controller's liveliness token went; if it held the plant, its session ends: 0 V."""
-        if controller == self.holder:
-            self._trip(f"{controller} is gone")
-
-    def expire(self, reason: str) -> None:
-        """End a session for a reason that only its owner can see, such as no answer in lockstep: 0 V."""
-        if self.session is not None:
-            self._trip(reason)
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Let the time since the last tick pass under the newest command, and measure.
@@ -199,8 +99,8 @@ class Endpoint:
         if self.session is None:
             return None
         seen = self.plant.measure()
-        if self._guard is not None and (reason := self._guard.check(seen, self._voltages)) is not None:
-            self._trip(reason)
+        if self._guard is not None and (trip := self._guard.check(seen, self._voltages)) is not None:
+            self._trip(*trip)
             self.plant.actuate(self._voltages)
             return None
         codes = self._encoded(seen)
@@ -238,7 +138,7 @@ class Endpoint:
             if self._unmeasured[echo]:
                 voltages = self._off  # the right answer; how long it may go on is the guard's to say
             else:
-                self._trip(f"{self.holder} commands 'no valid value'")
+                self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
                 return
         self._voltages = voltages
         self._echo, self._answered = echo, answered
@@ -257,21 +157,14 @@ class Endpoint:
             text = f"no first command within {FIRST_COMMAND_S:g} s"
         else:
             return
-        self._trip(text)
+        self._trip(TripCause.COMMAND_TIMEOUT, text)
 
-    def _trip(self, reason: str) -> None:
-        self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V")
-        self._latch = f"{reason}: 0 V"
-
-    def _clear(self) -> None:
-        self._latch = None
-        self._machine.fire(PlantTrigger.ARM)
-
-    def _end(self, trigger: PlantTrigger, kind: EventKind, text: str) -> None:
-        self._notice(kind, text)
-        self._machine.fire(trigger)
-        self.session = self.holder = None
+    def _begin(self) -> None:
+        if self._guard is not None:
+            self._guard.reset()
         self._voltages = self._off
+        self._session_tick = self._fresh_tick = self._tick + 1
+        self._echo = self._answered = -1
 
-    def _notice(self, kind: EventKind, text: str) -> None:
-        self.notices.append(Notice(kind, text, self.session))
+    def _rest(self) -> None:
+        self._voltages = self._off

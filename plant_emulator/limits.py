@@ -12,6 +12,8 @@ from math import acos, cos, degrees, hypot, isfinite, radians
 from pydantic import BaseModel, ConfigDict, Field
 
 from plant_emulator.plant import Measurement
+from plant_emulator.tenancy import Trip
+from protocol.states import TripCause
 
 
 class LimitSettings(BaseModel):
@@ -51,7 +53,7 @@ class Guard:
         """Forget what was counted, for a new session."""
         self._saturated = self._invalid = 0
 
-    def check(self, seen: Measurement, voltages: Sequence[float]) -> str | None:
+    def check(self, seen: Measurement, voltages: Sequence[float]) -> Trip | None:
         """A reason to trip, or None.
 
         Args:
@@ -63,21 +65,27 @@ class Guard:
         if not isfinite(w + x + y + z + wx + wy + wz):
             self._invalid += 1
             if self._seconds(self._invalid) > limits.max_invalid_s:
-                return f"the sensors have had no valid value for {self._seconds(self._invalid) * 1e3:.0f} ms"
+                return Trip(
+                    TripCause.SENSORS,
+                    f"the sensors have had no valid value for {self._seconds(self._invalid) * 1e3:.0f} ms",
+                )
             return None
         self._invalid = 0
         upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
         if upright < self._least_upright:
             tilt = degrees(acos(max(-1.0, upright)))
-            return f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
+            reason = f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
+            return Trip(TripCause.ENVELOPE, reason)
         if (speed := hypot(wx, wy, wz)) > limits.max_rate:
-            return f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
+            reason = f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
+            return Trip(TripCause.ENVELOPE, reason)
         if max(voltages) < self._full and min(voltages) > -self._full:
             self._saturated = 0
             return None
         self._saturated += 1
         if self._seconds(self._saturated) > limits.max_saturated_s:
-            return f"a motor has been at its voltage limit for {self._seconds(self._saturated):.1f} s"
+            reason = f"a motor has been at its voltage limit for {self._seconds(self._saturated):.1f} s"
+            return Trip(TripCause.SATURATION, reason)
         return None
 
     def _seconds(self, ticks: int) -> float:

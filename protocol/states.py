@@ -30,6 +30,21 @@ class PlantTrigger(StrEnum):
     ARM = "arm"
 
 
+class TripCause(StrEnum):
+    """Why a plant end trips. On a CAN bus a cause is its place in this list, from 1."""
+
+    COMMAND_TIMEOUT = "no command in time"
+    INVALID_COMMAND = "invalid command"
+    ENVELOPE = "attitude or rate envelope"
+    SATURATION = "voltage saturation"
+    SENSORS = "no valid measurement"
+    OPERATOR = "operator's stop"
+    HOLDER_GONE = "controller gone"
+    NO_ANSWER = "no answer in lockstep"
+    BUS = "bus lost"
+    NODE = "node lost"
+
+
 class ControllerState(StrEnum):
     """What the controller is doing."""
 

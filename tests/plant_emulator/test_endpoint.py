@@ -16,7 +16,7 @@ from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Vector
 from protocol.frames import COUNTERS, SignalSpec, WireSpec
 from protocol.messages import Claim, Grant, Refusal
-from protocol.states import PlantState
+from protocol.states import PlantState, TripCause
 
 WIRE = WireSpec()
 CONTINUOUS = WireSpec().with_bits(None, None)
@@ -343,7 +343,7 @@ def test_a_trip_is_latched_and_only_a_new_claim_ends_it() -> None:
 
 def test_the_holder_of_a_tripped_session_can_claim_again() -> None:
     endpoint, _ = _claimed()
-    endpoint.expire("nobody answers")
+    endpoint.expire(TripCause.NO_ANSWER, "nobody answers")
     assert _state(endpoint) is PlantState.TRIPPED
     assert isinstance(endpoint.claim(_claim(changed={"session": "second"})), Grant)
     assert (endpoint.state, endpoint.session) == (PlantState.GRANTED, "second")
@@ -389,8 +389,8 @@ def test_a_holder_that_is_gone_means_0_v() -> None:
 def test_the_owner_can_end_a_session_and_ending_none_is_not_told() -> None:
     endpoint, plant = _claimed()
     endpoint.tick(_command(0), 1)
-    endpoint.expire("no answer in lockstep")
-    endpoint.expire("no answer in lockstep")
+    endpoint.expire(TripCause.NO_ANSWER, "no answer in lockstep")
+    endpoint.expire(TripCause.NO_ANSWER, "no answer in lockstep")
     endpoint.tick(_command(1), 2)
     assert plant.held == [_volts(), OFF]
     assert _told(endpoint) == ["claimed", "tripped"]

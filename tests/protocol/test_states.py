@@ -32,6 +32,7 @@ from protocol.states import (
     Machine,
     PlantState,
     PlantTrigger,
+    TripCause,
 )
 
 # The tables
@@ -322,7 +323,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
     @rule()
     def its_owner_ends_the_session(self) -> None:
-        self.endpoint.expire("no answer for 2 s")
+        self.endpoint.expire(TripCause.NO_ANSWER, "no answer for 2 s")
         if self.session is not None:
             self.tripped()
 
@@ -373,7 +374,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
 
 TestForetoldPlantEnd = ForetoldPlantEnd.TestCase
-TestForetoldPlantEnd.settings = settings(max_examples=100, stateful_step_count=40, deadline=None)
+TestForetoldPlantEnd.settings = settings(max_examples=80, stateful_step_count=40, deadline=None)
 
 
 @pytest.mark.xfail(

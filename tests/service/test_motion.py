@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from math import nextafter, pi, radians
 from typing import Any, Final
 
