@@ -1,39 +1,72 @@
-"""The emulator process: an emulated plant behind an Endpoint, on the network.
+"""The emulated plant as a process: a driver whose plant is computed, and can be told to fail.
 
-The loop is wait → receive → tick → send → account. In real time it waits for the grid; in lockstep it waits for the
-answer to its last measurement, so that a run repeats bit for bit. Faults, if any are asked for, act on the plant's
-sensors and motors, on the measurements before they are sent and on the commands after they have come.
+Faults act on the plant's sensors and motors, on the measurements before they are sent and on the commands after they
+have come. On Zenoh it also tells the truth, takes faults while it runs, and steps on request in lockstep.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
-from typing import Final
 
-from plant_emulator.endpoint import Endpoint
+from plant_emulator.driver import Driver
 from plant_emulator.faults import Fault
 from plant_emulator.faulty_stream import FaultyStream
+from plant_emulator.front import Front
 from plant_emulator.presence import Presence
 from plant_emulator.settings import PlantSettings
-from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
+from protocol.clock import LoopSettings
 from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.messages import Truth
 from protocol.role import Role
-from protocol.states import TripCause
 from protocol.verbs import Advance, Answer, Inject
-
-IDLE_WAIT_S: Final = 0.02
 
 
 class FaultError(AeroloopError):
     """A fault that cannot be injected; one line that says why."""
 
 
-class Emulator:
-    """The plant end as a process.
+class Emulator(Driver):
+    """An emulated plant, whatever network it is on.
+
+    Args:
+        loop: The grid.
+        wire: How frames are read and written.
+        settings: The plant.
+        stop: Set when it is to end.
+
+    Raises:
+        ValueError: A fault of a motor that the plant does not have.
+    """
+
+    def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
+        self._emulated = settings.build(loop.period)
+        self._faulty = settings.with_faults(self._emulated, loop.period)
+        super().__init__(self._faulty, loop, wire, settings, stop)
+        faults = settings.parsed_faults
+        self._measurements = FaultyStream("measurement", faults, settings.fault_seed)
+        self._commands = FaultyStream("command", faults, settings.fault_seed)
+
+    def _incoming(self, arrival: Arrival | None) -> Arrival | None:
+        if self.endpoint.session is not None:
+            self._faulty.start()
+        if self._commands.idle:
+            return arrival
+        frame, sent_ns = (arrival.frame, arrival.published_ns) if arrival else (None, 0)
+        passed = self._commands.passes(frame, self._faulty.time, sent_ns)
+        return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns) if passed else None
+
+    def _outgoing(self, frame: bytes | None) -> list[bytes]:
+        if self._measurements.idle:
+            return super()._outgoing(frame)
+        return self._measurements.passes(frame, self._faulty.time)
+
+
+class EmulatorOnZenoh(Emulator):
+    """The emulator as it stands on Zenoh.
 
     Args:
         role: Its name on the network.
@@ -46,127 +79,41 @@ class Emulator:
     """
 
     def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
+        super().__init__(loop, wire, settings, role.stop)
         self._role = role
-        self._loop = loop
-        self._settings = settings
-        self._emulated = settings.build(loop.period)
-        self._plant = settings.with_faults(self._emulated, loop.period)
-        self._endpoint = Endpoint(
-            self._plant,
-            wire,
-            loop.period_ns,
-            lockstep=loop.lockstep,
-            watchdog_s=settings.watchdog_s,
-            guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
-            armed=settings.armed_at_start,
-        )
-        self._presence = Presence(role, loop, self._endpoint, latest_s=settings.watchdog_s)
-        faults = settings.parsed_faults
-        self._measurements = FaultyStream("measurement", faults, settings.fault_seed)
-        self._commands = FaultyStream("command", faults, settings.fault_seed)
-        self._k = -1
         self._steps: int | None = 0 if settings.steps_on_request else None  # that may still be taken; None: any number
         self._truth_every = self._ticks_between_truths()
 
-    def run(self) -> None:
+    def run(self, front: Front | None = None) -> None:
         """Run until the role is told to stop; then 0 V and a last status."""
         self._role.serve("inject", Inject, lambda inject: self._inject(inject.fault))
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        self._presence.serve()
-        try:
-            if self._loop.lockstep:
-                self._run_lockstep()
-            else:
-                self._run_real_time()
-        finally:
-            self._plant.close()
-            self._presence.leave()
+        super().run(front or Presence(self._role, self._loop, self.endpoint, latest_s=self._settings.watchdog_s))
 
     def reconfigure(self, settings: PlantSettings) -> None:
-        """Take over what can change between two ticks: limits, watchdog, how often the truth is told."""
-        self._settings = settings
-        guard = settings.guard(self._loop.period_ns, self._endpoint.wire.voltage.quantizer().outermost)
-        self._endpoint.protect(settings.watchdog_s, guard)
+        """Take over limits, watchdog, and how often the truth is told."""
+        super().reconfigure(settings)
         self._truth_every = self._ticks_between_truths()
 
-    def _run_real_time(self) -> None:
-        presence = self._presence
-        presence.notes = prepare_process(self._loop)
-        timing = presence.timing = LoopTiming()
-        grid = TickGrid(self._loop.period_ns)
-        while not self._role.stop.is_set():
-            skipped = grid.skipped
-            k = grid.wait()
-            timing.woke(grid.due_ns)
-            presence.take_inbox()
-            arrival = presence.link.take() if presence.link else None
-            self._tick(arrival, k)
-            if self._endpoint.session:
-                presence.skipped += grid.skipped - skipped
-            timing.done()
-
-    def _run_lockstep(self) -> None:
-        arrival = None
-        while not self._role.stop.is_set():
-            self._presence.take_inbox()
-            if self._presence.link is None or self._steps == 0:
-                time.sleep(IDLE_WAIT_S if self._presence.link is None else 0)
-                self._presence.tell_when_due()
-                continue
-            if self._steps is not None:
-                self._steps -= 1
-            echo = self._tick(arrival, self._k + 1)
-            arrival = None if echo is None else self._await_answer(echo)
-            if self._steps == 0:
-                self._presence.tell()
+    def _may_step(self) -> bool:
+        return self._steps != 0
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        """One tick of the plant end. Returns the counter that an answer to its measurement will echo, if one will."""
-        command = None
-        if self._endpoint.session is not None:
-            self._plant.start()
-        t = self._plant.time
-        if not self._commands.idle:
-            arrival = self._disturbed(arrival, t)
-        if arrival is not None and self._presence.arrived(arrival):
-            command = arrival.frame
-        frame = self._endpoint.tick(command, k)
-        frames = [frame] if frame is not None else []
-        if not self._measurements.idle:
-            frames = self._measurements.passes(frame, t)
-        echo = None
-        for frame in frames:
-            read = self._endpoint.wire.measurement.unpack(frame)
-            echo = None if read is None else read[0]
-            self._presence.send(frame, self._endpoint.counter if echo is None else echo)
-        self._k = k
-        self._presence.after_tick(k)
+        echo = super()._tick(arrival, k)
         if self._truth_every and k % self._truth_every == 0:
             state = self._emulated.truth()
             self._role.publish(
                 "truth", Truth(tick=k, attitude=state.attitude, rate=state.rate, voltages=state.voltages)
             )
+        if self._steps is not None:
+            self._steps -= 1
         return echo
 
-    def _disturbed(self, arrival: Arrival | None, t: float) -> Arrival | None:
-        """What is left of a command after its faults; one that comes late was still sent when it was."""
-        frame, sent_ns = (arrival.frame, arrival.published_ns) if arrival else (None, 0)
-        passed = self._commands.passes(frame, t, sent_ns)
-        return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns) if passed else None
-
     def _await_answer(self, echo: int) -> Arrival | None:
-        """The command that echoes a counter, or None when the session ends before it comes."""
-        deadline = time.monotonic() + self._settings.answer_timeout_s
-        while self._presence.link and not self._role.stop.is_set():
-            arrival = self._presence.link.wait(IDLE_WAIT_S)
-            if arrival is not None and _echo(self._endpoint.wire, arrival) in (echo, None):
-                return arrival
-            self._presence.take_inbox()
-            if time.monotonic() > deadline:
-                self._endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
-            self._presence.follow_session()
-            self._presence.tell_when_due()
-        return None
+        arrival = super()._await_answer(echo)
+        if self._steps == 0:
+            self._front.tell()  # whoever asked for the steps waits for this
+        return arrival
 
     def _ticks_between_truths(self) -> int:
         rate = self._settings.truth_rate_hz
@@ -182,22 +129,22 @@ class Emulator:
 
         def inject() -> Answer:
             if fault is None:
-                self._plant.clear()
+                self._faulty.clear()
                 self._measurements.clear()
                 self._commands.clear()
                 return self._told("no faults any more")
             try:
-                self._plant.inject(fault)
+                self._faulty.inject(fault)
             except ValueError as error:
                 raise FaultError(str(error)) from None
-            self._measurements.inject(fault, self._plant.time)
-            self._commands.inject(fault, self._plant.time)
+            self._measurements.inject(fault, self._faulty.time)
+            self._commands.inject(fault, self._faulty.time)
             return self._told(f"fault injected: {fault}")
 
         return inject
 
     def _told(self, text: str) -> Answer:
-        self._role.event("fault", text, self._endpoint.session)
+        self._role.event("fault", text, self.endpoint.session)
         return Answer(done=True, text=text)
 
     def _advance(self, seconds: float) -> Answer:
@@ -205,8 +152,3 @@ class Emulator:
             return Answer(done=False, text="this plant steps by itself: set plant.steps_on_request and loop.lockstep")
         self._steps += self._loop.ticks(seconds)
         return Answer(done=True, text=f"goes on for {seconds:g} s")
-
-
-def _echo(wire: WireSpec, arrival: Arrival) -> int | None:
-    read = wire.command.unpack(arrival.frame)
-    return None if read is None else read[0]

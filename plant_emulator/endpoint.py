@@ -91,11 +91,13 @@ class Endpoint(Tenancy):
         if self._tick >= 0:
             if frame is not None:
                 self._command(frame)
-            for tick in range(self._tick + 1, k + 1):
-                self._watch(tick)
+            while self._tick < k:
+                self._watch(self._tick + 1)
                 self.plant.actuate(self._voltages)
                 self.plant.advance()
-        self._tick = k
+                self._tick += self.plant.passed
+        else:
+            self._tick = k
         if self.session is None:
             return None
         seen = self.plant.measure()
@@ -106,6 +108,11 @@ class Endpoint(Tenancy):
         codes = self._encoded(seen)
         self._unmeasured[self.counter] = codes is self._no_measurement
         return self.wire.measurement.pack(self.counter, codes)
+
+    @property
+    def ticked(self) -> int:
+        """Index of the last tick; beyond the one asked for where hardware let more than one period pass."""
+        return self._tick
 
     @property
     def counter(self) -> int:

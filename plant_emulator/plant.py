@@ -44,9 +44,13 @@ class Plant(ABC):
 
     Attributes:
         actuators: Number of its motors, 2 or 3.
+        paces: Whether `advance` returns when the next sample is there, and so paces the loop.
+        passed: How many periods the last `advance` let pass; more than one where its owner was late.
     """
 
     actuators: int
+    paces: bool = False
+    passed: int = 1
 
     @abstractmethod
     def actuate(self, voltages: Sequence[float]) -> None:

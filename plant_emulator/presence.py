@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime
+from threading import Condition
 from typing import Final
 
-from plant_emulator.endpoint import Endpoint
+from plant_emulator.front import Front
+from plant_emulator.tenancy import Tenancy
 from protocol import topics
-from protocol.clock import LoopSettings, LoopTiming, RollingHistogram
+from protocol.clock import LoopSettings, RollingHistogram
 from protocol.frames import COUNTERS
-from protocol.links import Arrival, ZenohLink
+from protocol.links import Arrival, Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
 from protocol.role import Role
 from protocol.verbs import Answer, Ask
@@ -23,7 +25,7 @@ from protocol.verbs import Answer, Ask
 STATUS_PERIOD_NS: Final = 1_000_000_000
 
 
-class Presence:
+class Presence(Front):
     """A plant end on the network.
 
     Args:
@@ -31,24 +33,23 @@ class Presence:
         loop: The grid.
         endpoint: Who grants, refuses and trips.
         latest_s: A command is acted upon for so long after it was sent, and no longer [s].
+        changed: Notified when a command arrives, for an owner that waits for more than one thing.
 
     Attributes:
-        link: The session's frames; None while there is no session.
-        timing: How well the owner's loop keeps time, if it keeps any.
-        skipped: Ticks of sessions that the owner missed.
         late: Commands that came too late to be acted upon.
-        notes: What the machine refused.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, endpoint: Endpoint, latest_s: float) -> None:
+    def __init__(
+        self, role: Role, loop: LoopSettings, endpoint: Tenancy, latest_s: float, changed: Condition | None = None
+    ) -> None:
+        super().__init__()
         self._role = role
         self._loop = loop
         self._endpoint = endpoint
         self._latest_ns = round(latest_s * 1e9)
-        self.link: ZenohLink | None = None
-        self.timing: LoopTiming | None = None
-        self.skipped = self.late = 0
-        self.notes: list[str] = []
+        self._link: ZenohLink | None = None
+        self._changed = changed
+        self.late = 0
         self._latency = RollingHistogram()
         self._sent_at = [0] * COUNTERS
         self._sent = self._received = 0
@@ -57,6 +58,11 @@ class Presence:
         self._k = self._status_tick = -1
         self._status_due = 0
         self._status_time = time.monotonic()
+
+    @property
+    def link(self) -> ZenohLink | None:
+        """The session's frames; None while there is no session."""
+        return self._link
 
     def serve(self) -> None:
         """Answer claims and operators from now on."""
@@ -76,9 +82,9 @@ class Presence:
 
     def send(self, frame: bytes, counter: int) -> None:
         """Send a measurement frame of the session."""
-        if self.link is not None:
+        if self._link is not None:
             self._sent_at[counter] = time.monotonic_ns()
-            self.link.send(frame)
+            self._link.send(frame)
             self._sent += 1
 
     def arrived(self, arrival: Arrival) -> bool:
@@ -112,9 +118,9 @@ class Presence:
         if endpoint.state is not self._told_state:
             self._told_state = endpoint.state
             self._status_due = 0
-        if endpoint.session is None and self.link is not None:
-            self.link.close()
-            self.link = None
+        if endpoint.session is None and self._link is not None:
+            self._link.close()
+            self._link = None
         if not endpoint.notices:
             return
         if endpoint.cause is None:
@@ -170,11 +176,12 @@ class Presence:
     def _open_link(self, session: str) -> None:
         """Listen for commands before the grant goes out, so that the first one finds somebody."""
         vehicle = self._role.vehicle
-        self.link = ZenohLink(
+        self._link = ZenohLink(
             self._role.zenoh,
             send_key=topics.key("measurement", vehicle, session=session),
             receive_key=topics.key("command", vehicle, session=session),
             lossless=self._loop.lockstep,
+            mailbox=Mailbox(self._changed),
         )
 
     def tell(self) -> None:

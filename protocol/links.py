@@ -50,10 +50,14 @@ class Link(ABC):
 
 
 class Mailbox:
-    """A slot for one frame, written by a receiving thread and read by the loop. The newest wins."""
+    """A slot for one frame, written by a receiving thread and read by the loop. The newest wins.
 
-    def __init__(self) -> None:
-        self._changed = Condition()
+    Args:
+        changed: Notified when a frame comes; one of its own if None. Several slots may share one.
+    """
+
+    def __init__(self, changed: Condition | None = None) -> None:
+        self._changed = changed or Condition()
         self._arrival: Arrival | None = None
 
     def put(self, frame: bytes, published_ns: int = 0) -> None:
@@ -84,11 +88,20 @@ class ZenohLink(Link):
         session: An open session; it outlives the link.
         send_key: Where frames go.
         receive_key: Where frames come from.
+        mailbox: Where frames wait; one of its own if None.
         lossless: Block when a peer does not keep up, instead of dropping. For lockstep, where each frame is waited for.
     """
 
-    def __init__(self, session: zenoh.Session, send_key: str, receive_key: str, *, lossless: bool = False) -> None:
-        self._mailbox = Mailbox()
+    def __init__(
+        self,
+        session: zenoh.Session,
+        send_key: str,
+        receive_key: str,
+        *,
+        lossless: bool = False,
+        mailbox: Mailbox | None = None,
+    ) -> None:
+        self._mailbox = mailbox or Mailbox()
         self._subscriber = session.declare_subscriber(
             receive_key,
             lambda sample: self._mailbox.put(sample.payload.to_bytes(), published_ns(sample, time.time_ns())),

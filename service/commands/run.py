@@ -119,10 +119,10 @@ def emulator(
     settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
-        from plant_emulator.emulator import Emulator
+        from plant_emulator.emulator import EmulatorOnZenoh
         from service.reload import reload_on_hangup
 
-        emulator = Emulator(role, settings.loop, settings.wire, settings.plant)
+        emulator = EmulatorOnZenoh(role, settings.loop, settings.wire, settings.plant)
         reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
         emulator.run()
 

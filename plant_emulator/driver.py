@@ -1,0 +1,151 @@
+"""A plant behind an Endpoint, driven in time: the process at the plant end, whatever the plant and the network.
+
+The loop is wait → receive → tick → send → account. Who leads depends on the plant: on an emulated one the loop waits
+for the grid; hardware lets `advance` return when its next sample is there; in lockstep the loop waits for the answer to
+its last measurement, so that a run repeats bit for bit.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Final
+
+from plant_emulator.endpoint import Endpoint
+from plant_emulator.front import Front
+from plant_emulator.plant import Plant
+from plant_emulator.settings import PlantSettings
+from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
+from protocol.frames import WireSpec
+from protocol.links import Arrival
+from protocol.states import TripCause
+
+IDLE_WAIT_S: Final = 0.02
+
+
+class Driver:
+    """Drives a plant.
+
+    Args:
+        plant: The plant.
+        loop: The grid.
+        wire: How frames are read and written.
+        settings: How it looks after itself.
+        stop: Set when it is to end.
+
+    Raises:
+        ValueError: The wire commands another number of actuators than the plant has.
+
+    Attributes:
+        endpoint: Who grants, refuses and trips.
+    """
+
+    def __init__(
+        self, plant: Plant, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event
+    ) -> None:
+        self._plant = plant
+        self._loop = loop
+        self._settings = settings
+        self._stop = stop
+        self._k = -1
+        self.endpoint = Endpoint(
+            plant,
+            wire,
+            loop.period_ns,
+            lockstep=loop.lockstep,
+            watchdog_s=settings.watchdog_s,
+            guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
+            armed=settings.armed_at_start,
+        )
+
+    def run(self, front: Front) -> None:
+        """Run until told to stop; then 0 V, and a last word."""
+        self._front = front
+        front.serve()
+        try:
+            if self._loop.lockstep:
+                self._run_lockstep()
+            else:
+                self._run_real_time()
+        finally:
+            self._plant.close()
+            front.leave()
+
+    def reconfigure(self, settings: PlantSettings) -> None:
+        """Take over what can change between two ticks: limits and watchdog."""
+        self._settings = settings
+        guard = settings.guard(self._loop.period_ns, self.endpoint.wire.voltage.quantizer().outermost)
+        self.endpoint.protect(settings.watchdog_s, guard)
+
+    def _run_real_time(self) -> None:
+        front = self._front
+        front.notes = prepare_process(self._loop)
+        timing = front.timing = LoopTiming()
+        grid = None if self._plant.paces else TickGrid(self._loop.period_ns)
+        while not self._stop.is_set():
+            skipped = grid.skipped if grid else 0
+            k = grid.wait() if grid else self.endpoint.ticked + 1
+            timing.woke(grid.due_ns if grid else time.monotonic_ns())
+            front.take_inbox()
+            self._tick(front.link.take() if front.link else None, k)
+            if self.endpoint.session:
+                front.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
+            timing.done()
+
+    def _run_lockstep(self) -> None:
+        arrival = None
+        while not self._stop.is_set():
+            self._front.take_inbox()
+            if self._front.link is None or not self._may_step():
+                time.sleep(IDLE_WAIT_S if self._front.link is None else 0)
+                self._front.tell_when_due()
+                continue
+            echo = self._tick(arrival, self._k + 1)
+            arrival = None if echo is None else self._await_answer(echo)
+
+    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
+        """One tick of the plant end. Returns the counter that an answer to its measurement will echo, if one will."""
+        arrival = self._incoming(arrival)
+        in_time = arrival is not None and self._front.arrived(arrival)
+        frame = self.endpoint.tick(arrival.frame if arrival is not None and in_time else None, k)
+        echo = None
+        for sent in self._outgoing(frame):
+            read = self.endpoint.wire.measurement.unpack(sent)
+            echo = None if read is None else read[0]
+            self._front.send(sent, self.endpoint.counter if echo is None else echo)
+        self._k = self.endpoint.ticked
+        self._front.after_tick(self._k)
+        return echo
+
+    def _await_answer(self, echo: int) -> Arrival | None:
+        """The command that echoes a counter, or None when the session ends before it comes."""
+        deadline = time.monotonic() + self._settings.answer_timeout_s
+        while self._front.link and not self._stop.is_set():
+            arrival = self._front.link.wait(IDLE_WAIT_S)
+            if arrival is not None and _echo(self.endpoint.wire, arrival) in (echo, None):
+                return arrival
+            self._front.take_inbox()
+            if time.monotonic() > deadline:
+                self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
+            self._front.follow_session()
+            self._front.tell_when_due()
+        return None
+
+    # ── where somebody may stand in between ──
+
+    def _may_step(self) -> bool:
+        """Whether the next step in lockstep may be taken now."""
+        return True
+
+    def _incoming(self, arrival: Arrival | None) -> Arrival | None:
+        """A command as it comes from the network; returned as the endpoint is to have it."""
+        return arrival
+
+    def _outgoing(self, frame: bytes | None) -> list[bytes]:
+        """A measurement as the endpoint gives it; returned as what goes to the network."""
+        return [] if frame is None else [frame]
+
+
+def _echo(wire: WireSpec, arrival: Arrival) -> int | None:
+    read = wire.command.unpack(arrival.frame)
+    return None if read is None else read[0]

@@ -1,0 +1,243 @@
+"""The DBC of one node: what every bit on the CAN bus means, for tools that know nothing of this project.
+
+A CAN payload is the wire frame byte for byte, so the whole file follows from the `WireSpec`: widths place the signals,
+and the quantizer gives factor, bounds and the code that says "no valid value". With half-step dead zone the level of
+code i is i·l, which is what a DBC can say. With any other it is not; the signal is then the bare code, and its comment
+has the formula. Many tools read DBC files as cp1252, so the text keeps to ASCII.
+
+cantools takes about half a second to import: import this module where it is used, not at a program's head.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from math import isclose
+from typing import Final, NamedTuple
+
+from cantools.database.can import Database, Message, Node, Signal
+from cantools.database.can.formats.dbc import DbcAttribute, DbcAttributeDefinition, DbcSpecifics
+from cantools.database.conversion import BaseConversion
+from cantools.typechecking import Choices
+
+from protocol.frames import COUNTER_BITS, FrameFormat, SignalSpec, WireSpec
+from protocol.messages import PROTOCOL_VERSION
+from protocol.quantizer import UniformQuantizer
+from protocol.states import PlantState
+
+NODES: Final = range(1, 128)
+"""Numbers a node may have: the lowest seven bits of its identifiers."""
+
+MEASUREMENT_ID: Final = 0x100
+COMMAND_ID: Final = 0x200
+PLANT_HEARTBEAT_ID: Final = 0x300
+CONTROLLER_HEARTBEAT_ID: Final = 0x380
+
+CLASSIC_BYTES: Final = 8
+FD_BYTES: Final = (12, 16, 20, 24, 32, 48, 64)
+"""Lengths a CAN FD payload of more than eight bytes can have (ISO 11898-1)."""
+
+HEARTBEAT_MS: Final = 100
+FINGERPRINT_BITS: Final = 56
+
+NO_VALID_VALUE: Final = "no_valid_value"
+"""Name of the code −2^(R−1)."""
+
+_PLANT: Final = "Plant"
+_CONTROLLER: Final = "Controller"
+_MAX_CYCLE_MS: Final = 2**16 - 1  # what cantools declares for GenMsgCycleTime
+_SAME_STEP: Final = 1e-12  # a dead zone this near to l/2, relatively, shifts no level by more than 1e-12 l
+
+
+class _Quantity(NamedTuple):
+    """A quantized signal, as a person knows it."""
+
+    name: str
+    unit: str
+    comment: str
+    spec: SignalSpec
+
+
+def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
+    """The DBC file of a plant's node and the controller that drives it.
+
+    Args:
+        wire: What the frames carry.
+        node: Number of the plant's node, 1…127.
+        period_ns: Period of the plant's grid [ns].
+
+    Raises:
+        ValueError: A node or a period out of bounds.
+    """
+    if node not in NODES:
+        raise ValueError(f"a node's number is {NODES[0]} to {NODES[-1]}, not {node}")
+    cycle_ms = -(-period_ns // 1_000_000)
+    if not 1 <= cycle_ms <= _MAX_CYCLE_MS:
+        raise ValueError(f"a period of {period_ns} ns is not between 1 ns and {_MAX_CYCLE_MS} ms")
+    rate = f"one every {period_ns} ns ({1e9 / period_ns:.6g} Hz; the cycle time is in whole ms, rounded up)"
+    idle = "Every bit that belongs to no signal must be 0."
+    counter = _unsigned("counter", 0, COUNTER_BITS, "Tick of the plant modulo 16; 0 in a session's first measurement.")
+    measurement = _message(
+        "Measurement",
+        MEASUREMENT_ID + node,
+        _PLANT,
+        wire.measurement.size,
+        [counter, *_codes(wire.measurement, _measured(wire))],
+        cycle_ms,
+        f"What the plant measures: {rate}. {idle}",
+    )
+    echo = _unsigned("echo", 0, COUNTER_BITS, "Counter of the measurement that this command answers.")
+    command = _message(
+        "Command",
+        COMMAND_ID + node,
+        _CONTROLLER,
+        wire.command.size,
+        [echo, *_codes(wire.command, _commanded(wire))],
+        cycle_ms,
+        f"What the controller commands in answer to a measurement: {rate}. {idle}",
+    )
+    messages = [
+        measurement,
+        command,
+        _heartbeat("PlantHeartbeat", PLANT_HEARTBEAT_ID + node, _PLANT),
+        _heartbeat("ControllerHeartbeat", CONTROLLER_HEARTBEAT_ID + node, _CONTROLLER),
+    ]
+    database = Database(
+        messages,
+        [
+            Node(_PLANT, f"What measures and has the motors: node {node}."),
+            Node(_CONTROLLER, f"What computes the commands of node {node}."),
+        ],
+        version=f"aeroloop protocol {PROTOCOL_VERSION}",
+        dbc_specifics=_bus_type("CAN FD" if any(message.is_fd for message in messages) else "CAN"),
+    )
+    return database.as_dbc_string(sort_signals=None, sort_attribute_signals=None)
+
+
+def payload_bytes(size: int) -> int:
+    """Length of the CAN payload that carries a frame of `size` bytes: itself, or the next that CAN FD has.
+
+    Raises:
+        ValueError: No CAN frame is that long.
+    """
+    if size <= CLASSIC_BYTES:
+        return size
+    for length in FD_BYTES:
+        if size <= length:
+            return length
+    raise ValueError(f"a frame of {size} bytes is longer than a CAN FD frame's {FD_BYTES[-1]}")
+
+
+def _measured(wire: WireSpec) -> list[_Quantity]:
+    part = "of the attitude quaternion's vector part, where the scalar part is >= 0."
+    axes = {1: "x, roll", 2: "y, pitch", 3: "z, yaw"}
+    return [
+        *(_Quantity(f"eps{i}", "", f"Component {i} {part}", wire.attitude) for i in axes),
+        *(_Quantity(f"omega{i}", "rad/s", f"Angular velocity about the body's {axes[i]}.", wire.rate) for i in axes),
+    ]
+
+
+def _commanded(wire: WireSpec) -> list[_Quantity]:
+    numbers = (2, 3) if wire.actuators == 2 else (1, 2, 3)  # the Aero's two are the paper's u₂ and u₃
+    return [_Quantity(f"u{i}", "V", f"Command u{i}.", wire.voltage) for i in numbers]
+
+
+def _message(
+    name: str, identifier: int, sender: str, size: int, signals: list[Signal], cycle_ms: int, comment: str
+) -> Message:
+    """A message that carries `size` bytes from `sender` to the other end."""
+    for signal in signals:
+        signal.receivers = [_CONTROLLER if sender == _PLANT else _PLANT]
+    length = payload_bytes(size)
+    return Message(
+        identifier,
+        name,
+        length,
+        signals,
+        comment=comment,
+        senders=[sender],
+        cycle_time=cycle_ms,
+        is_fd=length > CLASSIC_BYTES,
+    )
+
+
+def _heartbeat(name: str, identifier: int, sender: str) -> Message:
+    states: Choices = OrderedDict((code, str(state)) for code, state in enumerate(PlantState))
+    signals = [
+        _unsigned("cause", 0, 4, "Why the sender is in its state."),
+        _unsigned("state", 4, 4, "State of the sender.", states),
+        _unsigned("fingerprint", 8, FINGERPRINT_BITS, "Fingerprint of the wire spec that the sender has."),
+    ]
+    comment = f"The {sender.lower()} lives: one every {HEARTBEAT_MS} ms."
+    return _message(name, identifier, sender, CLASSIC_BYTES, signals, HEARTBEAT_MS, comment)
+
+
+def _codes(layout: FrameFormat, quantities: Iterable[_Quantity]) -> Iterator[Signal]:
+    """The signals that follow a frame's counter."""
+    at = 2 * COUNTER_BITS if None in layout.widths else COUNTER_BITS  # four zero bits precede doubles
+    for quantity, width in zip(quantities, layout.widths, strict=True):
+        yield _signal(quantity, at)
+        at += 64 if width is None else width
+
+
+def _unsigned(name: str, at: int, width: int, comment: str, choices: Choices | None = None) -> Signal:
+    return Signal(
+        name,
+        _start(at),
+        width,
+        "big_endian",
+        conversion=BaseConversion.factory(choices=choices),
+        minimum=0,
+        maximum=max(choices) if choices else 2**width - 1,
+        comment=comment,
+    )
+
+
+def _signal(quantity: _Quantity, at: int) -> Signal:
+    """One quantized signal whose first bit is `at`, counted from the frame's first."""
+    quantizer = quantity.spec.quantizer()
+    comment, unit = quantity.comment, quantity.unit
+    scale: float = 1
+    choices: Choices | None = None
+    if not isinstance(quantizer, UniformQuantizer):
+        width, top = 64, quantizer.limit
+        comment += " IEEE 754 double; NaN says: no valid value."
+    else:
+        width, top = quantizer.bits, quantizer.top
+        choices = OrderedDict([(quantizer.invalid, NO_VALID_VALUE)])
+        comment += f" Quantized; code {quantizer.invalid} says: no valid value."
+        if isclose(quantizer.deadzone, quantizer.step / 2, rel_tol=_SAME_STEP):
+            scale = quantizer.step
+        else:
+            comment += (
+                " This is the bare code i; the level is 0 for i = 0, else"
+                f" sgn(i) * (y0 + l/2 + (|i| - 1) * l) [{unit or 1}]"
+                f" with y0 = {quantizer.deadzone!r} and l = {quantizer.step!r}."
+            )
+            unit = ""
+    return Signal(
+        quantity.name,
+        _start(at),
+        width,
+        "big_endian",
+        is_signed=True,
+        conversion=BaseConversion.factory(scale=scale, choices=choices, is_float=quantity.spec.bits is None),
+        minimum=-top * scale,
+        maximum=top * scale,
+        unit=unit,
+        comment=comment,
+    )
+
+
+def _start(at: int) -> int:
+    """A DBC counts bits from each byte's least significant, and a big-endian signal starts at its most significant."""
+    return at // 8 * 8 + 7 - at % 8
+
+
+def _bus_type(bus: str) -> DbcSpecifics:
+    """What the database says of itself. Only with BusType "CAN FD" does cantools write which messages are FD."""
+    definition = DbcAttributeDefinition("BusType", default_value="CAN", type_name="STRING")
+    return DbcSpecifics(
+        attributes=OrderedDict([("BusType", DbcAttribute(bus, definition))]),
+        attribute_definitions=OrderedDict([("BusType", definition)]),
+    )
