@@ -102,10 +102,10 @@ class Sensors:
             pitch = pitch_step * floor(angles[0] / pitch_step + pitch_zero)
             yaw = yaw_step * floor(angles[1] / yaw_step + yaw_zero)
             if self._attitude == "encoders":
-                attitude = _attitude_of(pitch, yaw)
+                attitude = attitude_of(pitch, yaw)
             if self._rate == "derivative":
                 pitch_rate, yaw_rate = self._filters[0].update(pitch), self._filters[1].update(yaw)
-                return attitude, (-sin(pitch) * yaw_rate, pitch_rate, cos(pitch) * yaw_rate)
+                return attitude, rate_of(pitch, pitch_rate, yaw_rate)
         return attitude, self._gyro(rate) if self._rate == "gyro" else rate
 
     def _gyro(self, rate: Vector) -> Vector:
@@ -116,7 +116,12 @@ class Sensors:
         return rate[0] + error[0], rate[1] + error[1], rate[2] + error[2]
 
 
-def _attitude_of(pitch: float, yaw: float) -> Quaternion:
+def attitude_of(pitch: float, yaw: float) -> Quaternion:
     """q of a body that first yaws, then pitches by these joint angles [rad]."""
     cp, sp, cy, sy = cos(pitch / 2), sin(pitch / 2), cos(yaw / 2), sin(yaw / 2)
     return cy * cp, -sy * sp, cy * sp, sy * cp
+
+
+def rate_of(pitch: float, pitch_rate: float, yaw_rate: float) -> Vector:
+    """ω in the body frame [rad/s] of joints that turn at these rates [rad/s], at this pitch [rad]."""
+    return -sin(pitch) * yaw_rate, pitch_rate, cos(pitch) * yaw_rate

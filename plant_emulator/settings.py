@@ -26,6 +26,11 @@ class PlantSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
+    via: Literal["emulator", "can", "quanser", "quanser-fake"] = Field(
+        default="emulator",
+        description="what stands at the plant end: an emulated plant, a node on the CAN bus of [can], Quanser's USB "
+        "board, or the fake of it with an emulated Aero behind",
+    )
     kind: Literal["aero", "rigid_body"] = Field(
         default="aero", description="the body; rotor, friction, wind and sensors act on either"
     )

@@ -53,6 +53,7 @@ class Tenancy:
         trip: The cause of the last trip, until it is cleared.
         notices: What happened since the owner last emptied this list.
         refused: Malformed frames so far.
+        unavailable: Why no claim can be granted now, for a reason that only the owner can see; None if there is none.
     """
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool = False, armed: bool = False) -> None:
@@ -64,6 +65,7 @@ class Tenancy:
         self.trip: TripCause | None = None
         self.notices: list[Notice] = []
         self.refused = 0
+        self.unavailable: str | None = None
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self._latch: str | None = None if armed else "not armed since it was started"
         self._operator_stop = False
@@ -92,6 +94,8 @@ class Tenancy:
             differences.append(f"period_ns: {self.period_ns}, not {claim.period_ns}")
         if claim.lockstep != self.lockstep:
             differences.append(f"lockstep: {self.lockstep}, not {claim.lockstep}")
+        if self.unavailable is not None:
+            return Refusal(reason=self.unavailable)
         if differences:
             return Refusal(reason=f"the plant has {'; '.join(differences)}", differences=differences)
         if self.session is not None:

@@ -36,6 +36,11 @@ class Link(ABC):
     def send(self, frame: bytes) -> None:
         """Send a frame. Never blocks for longer than it takes to hand it over, and never raises for a lost peer."""
 
+    @property
+    @abstractmethod
+    def pending(self) -> bool:
+        """Whether a frame has come that was not yet taken."""
+
     @abstractmethod
     def take(self) -> Arrival | None:
         """The newest frame that was not yet taken, or None."""
@@ -66,6 +71,11 @@ class Mailbox:
         with self._changed:
             self._arrival = arrival
             self._changed.notify()
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is something in the slot."""
+        return self._arrival is not None
 
     def take(self) -> Arrival | None:
         """Empty the slot."""
@@ -117,6 +127,11 @@ class ZenohLink(Link):
     def send(self, frame: bytes) -> None:
         """Send a frame."""
         self._publisher.put(frame)
+
+    @property
+    def pending(self) -> bool:
+        """Whether a frame has come that was not yet taken."""
+        return self._mailbox.pending
 
     def take(self) -> Arrival | None:
         """The newest frame that was not yet taken, or None."""

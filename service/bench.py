@@ -22,13 +22,13 @@ from typing import Final, Literal, Self
 import zenoh
 
 from protocol import topics
+from protocol.can_link import CanSettings
 from protocol.errors import AeroloopError
 from protocol.network import join
 from service.config import ENV_PREFIX, Settings
 
-RoleName = Literal["controller", "emulator", "recorder"]
+RoleName = Literal["controller", "plant", "can-node", "recorder"]
 
-_TOKENS: Final = {"emulator": "plant", "recorder": "recorder"}
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
 
@@ -42,6 +42,16 @@ def free_rendezvous() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def private_bus(can: CanSettings) -> CanSettings:
+    """The same bus, for processes of this machine only, where the interface knows no bounds by itself."""
+    if can.interface != "udp_multicast":
+        return can
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port: int = probe.getsockname()[1]
+    return can.model_copy(update={"options": {"hop_limit": 0, "port": port, **can.options}})
 
 
 class Bench:
@@ -72,11 +82,18 @@ class Bench:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for role in ("controller", "emulator", "recorder"):
+        roles: tuple[RoleName, ...] = ("controller", "plant", "can-node", "recorder")
+        for role in roles:
             if role in self._children:
                 self.stop(role)
         self.zenoh.close()
         self._folder.cleanup()
+
+    def start_plant(self) -> None:
+        """Start the plant end that the configuration names, and a node on the bus where it needs one."""
+        if self._settings.plant.via == "can":
+            self.start("can-node")
+        self.start("plant")
 
     def start(self, role: RoleName) -> subprocess.Popen[bytes]:
         """Start a role; it is not yet on the network when this returns."""
@@ -103,7 +120,7 @@ class Bench:
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
-            while _TOKENS[role] not in self._alive:
+            while role not in self._alive:
                 self._check(role)
                 if time.monotonic() > deadline:
                     raise BenchError(f"the {role} did not join the network within {timeout_s:g} s")

@@ -22,6 +22,7 @@ from pydantic_settings import (
 
 from plant_emulator.settings import PlantSettings
 from protocol import topics
+from protocol.can_link import CanSettings
 from protocol.clock import LoopSettings
 from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
@@ -54,6 +55,7 @@ class Settings(BaseSettings):
     law: LawSettings = LawSettings()
     controller: ControllerSettings = ControllerSettings()
     plant: PlantSettings = PlantSettings()
+    can: CanSettings = CanSettings()
     recorder: RecorderSettings = RecorderSettings()
     network: NetworkSettings = NetworkSettings()
 

@@ -15,7 +15,7 @@ import zenoh
 from protocol import topics
 from protocol.attitude import angle
 from protocol.messages import Status, Telemetry
-from service.bench import Bench, free_rendezvous
+from service.bench import Bench, free_rendezvous, private_bus
 from service.config import Settings
 from service.figures import Figures
 from service.review import review
@@ -89,6 +89,7 @@ def run_demo(
             "controller": settings.controller.model_copy(
                 update={"duration_s": duration_s, "require_recorder": True, "auto_arm": True}
             ),
+            "can": private_bus(settings.can),
             "recorder": settings.recorder.model_copy(update={"path": path.absolute()}),
         }
     )
@@ -98,9 +99,9 @@ def run_demo(
         for topic in ("telemetry", "status"):
             bench.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.hear)
         bench.start("recorder")
-        bench.start("emulator")
+        bench.start_plant()
         bench.await_role("recorder")
-        bench.await_role("emulator")
+        bench.await_role("plant")
         bench.start("controller")
         while bench.running("controller") and not interrupted.wait(REFRESH_S):
             bench.check()

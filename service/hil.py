@@ -23,11 +23,12 @@ from protocol.errors import AeroloopError
 from protocol.messages import Event, Status, model_of
 from protocol.states import PlantState
 from protocol.verbs import Advance, Answer, Ask, Inject, Message
-from service.bench import Bench, RoleName, free_rendezvous
+from service.bench import Bench, RoleName, free_rendezvous, private_bus
 from service.config import Settings, load
 from service.figures import Figures
 from service.review import review
 
+ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
 PATIENCE_S: Final = 30.0
 """For what another process must do: it takes a second to start here, and CI may have other work."""
 PATIENCE_PER_STEP_S: Final = 0.02
@@ -84,6 +85,7 @@ class Hil:
     Args:
         folder: Where logs go.
         lockstep: Whether `run` counts steps instead of waiting.
+        via: What stands at the plant end; see `plant.via`.
 
     Attributes:
         events: What has happened so far, as it was told on the network.
@@ -94,8 +96,9 @@ class Hil:
     settings: Settings
     bench: Bench
 
-    def __init__(self, folder: Path, *, lockstep: bool = False) -> None:
+    def __init__(self, folder: Path, *, lockstep: bool = False, via: str = "emulator") -> None:
         self._folder = folder
+        self._via = via
         self._lockstep = lockstep
         self._running = False
         self._logs: list[HilLog] = []
@@ -133,10 +136,12 @@ class Hil:
             "recorder.path": str(log),
             "controller.require_recorder": True,
             "loop.lockstep": self._lockstep,
-            "plant.steps_on_request": self._lockstep,
+            "plant.steps_on_request": self._lockstep and self._via == "emulator",
+            "plant.via": self._via,
         }
         overrides = [f"{key}={json.dumps(value)}" for key, value in {**ours, **(settings or {})}.items()]
         self.settings = load(Path(config) if config else None, overrides)
+        self.settings = self.settings.model_copy(update={"can": private_bus(self.settings.can)})
         self.events.clear()
         self._statuses.clear()
         self._asked_ticks = 0
@@ -145,12 +150,11 @@ class Hil:
         self._logs.append(HilLog(log))
         for name, hear in (("event", self._hear_event), ("status", self._hear_status)):
             self.bench.zenoh.declare_subscriber(topics.key(name, self.settings.vehicle), hear)
-        roles: tuple[RoleName, ...] = ("recorder", "emulator")
-        for role in roles:
-            self.bench.start(role)
+        self.bench.start("recorder")
+        self.bench.start_plant()
         if drive:
             self.bench.start("controller")  # which waits for the recorder by itself
-        for role in roles:
+        for role in ROLES:
             self.bench.await_role(role)
         if drive:
             ready = {PlantState.GRANTED, PlantState.DRIVEN} if self._lockstep else {PlantState.DRIVEN}

@@ -16,15 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from protocol import topics
 from protocol.messages import Percentiles, Status
-from service.bench import Bench, RoleName, free_rendezvous
+from service.bench import Bench, RoleName, free_rendezvous, private_bus
 from service.config import Settings
 
-ROLES: Final[tuple[tuple[RoleName, str], ...]] = (
-    ("controller", "controller"),
-    ("emulator", "plant"),
-    ("recorder", "recorder"),
-)
-"""Each process, and the role whose status it tells."""
+ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 WARM_UP: Final = 0.1
 """Share of the time that is left to the processes to settle before growth is judged."""
 MAX_GROWTH: Final = 0.05
@@ -86,6 +81,7 @@ def run_soak(
         update={
             "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
             "controller": settings.controller.model_copy(update={"require_recorder": True, "auto_arm": True}),
+            "can": private_bus(settings.can),
             "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
         }
     )
@@ -102,10 +98,11 @@ def run_soak(
     total_s, every_s = minutes * 60, min(60.0, max(2.0, minutes * 60 / 10))
     with Bench(settings) as bench:
         bench.zenoh.declare_subscriber(topics.key("status", settings.vehicle), hear)
-        for process, _ in ROLES:
-            bench.start(process)
-        for process in ("emulator", "recorder"):
-            bench.await_role(process)
+        bench.start("recorder")
+        bench.start_plant()
+        bench.start("controller")
+        bench.await_role("plant")
+        bench.await_role("recorder")
         start = time.monotonic()
         while (reached := time.monotonic() - start) < total_s:
             time.sleep(min(every_s, total_s - reached))
@@ -131,7 +128,7 @@ def _sample(bench: Bench, statuses: dict[str, Status], at_s: float) -> Minute:
         unanswered=plant.sent - plant.received if plant else 0,
         latency_us=plant.recent_latency_us if plant else None,
         wake_us=plant.timing.recent_wake if plant and plant.timing else None,
-        usage={role: _usage(bench.pid(process)) for process, role in ROLES},
+        usage={role: _usage(bench.pid(role)) for role in ROLES},
     )
 
 
@@ -152,7 +149,7 @@ def _findings(samples: list[Minute], sessions: list[str]) -> list[str]:
     if len(sessions) != 1:
         found.append(f"{len(sessions)} sessions instead of one: the log's events say why")
     settled = samples[int(len(samples) * WARM_UP) :]
-    for role in (role for _, role in ROLES):
+    for role in ROLES:
         first, last = settled[0].usage[role], settled[-1].usage[role]
         if last.memory_mb > first.memory_mb * (1 + MAX_GROWTH):
             found.append(f"the {role}'s memory grew from {first.memory_mb:.1f} to {last.memory_mb:.1f} MB")

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn, TypeVar
 import typer
 
 if TYPE_CHECKING:
+    from threading import Event
+
     from protocol.role import Role
     from service.config import Settings
     from service.figures import Figures
@@ -117,13 +119,7 @@ def run_role(
     kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, log_format: str, with_parent: bool
 ) -> None:
     """Join the network as a role and run until a signal says stop."""
-    from service.logs import set_up_logging
-
-    set_up_logging(logging.WARNING if quiet else logging.INFO, as_json=log_format == "json")
-    if with_parent:
-        import ctypes
-
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    _prepare(quiet=quiet, log_format=log_format, with_parent=with_parent)
 
     def live() -> None:
         from protocol.role import Role
@@ -135,6 +131,27 @@ def run_role(
             run(role)
 
     guarded(live)
+
+
+def run_alone(run: Callable[[Event], None], *, quiet: bool, log_format: str, with_parent: bool) -> None:
+    """Run a process that is on no Zenoh network until a signal says stop."""
+    from threading import Event
+
+    _prepare(quiet=quiet, log_format=log_format, with_parent=with_parent)
+    stop = Event()
+    for which in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(which, lambda *_: stop.set())
+    guarded(lambda: run(stop))
+
+
+def _prepare(*, quiet: bool, log_format: str, with_parent: bool) -> None:
+    from service.logs import set_up_logging
+
+    set_up_logging(logging.WARNING if quiet else logging.INFO, as_json=log_format == "json")
+    if with_parent:
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def print_figures(figures: Figures, json: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,14 +24,28 @@ from service.commands.common import (
     guarded,
     print_figures,
     reloadable,
+    run_alone,
     run_role,
     settings_of,
     with_bits_of,
 )
 
 if TYPE_CHECKING:
+    from threading import Event
+
     from protocol.role import Role
+    from service.config import Settings
     from service.figures import Figures
+
+Faults = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fault",
+        metavar="SIGNAL:KIND@T",
+        help="What shall go wrong, such as rate:off@5 or command:drop=0.05; may be repeated.",
+        show_default=False,
+    ),
+]
 
 group = typer.Typer()
 
@@ -39,6 +54,12 @@ group = typer.Typer()
 def demo(
     duration: Duration = PAPER_DURATION_S,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
+    via: Annotated[
+        str | None,
+        typer.Option(
+            "--via", metavar="emulator|can|quanser-fake", help="What the plant is behind.", show_default=False
+        ),
+    ] = None,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
     log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
@@ -47,7 +68,8 @@ def demo(
     overrides: Overrides = None,
 ) -> None:
     """Run the paper's experiment over Zenoh in three processes, and judge its log."""
-    settings = settings_of(config, [*(overrides or []), *(["loop.lockstep=true"] if lockstep else [])])
+    options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
+    settings = settings_of(config, [*(overrides or []), *options])
     settings = with_bits_of(settings, bits_out, bits_in)
 
     def run() -> tuple[Figures, bool]:
@@ -99,15 +121,7 @@ def controller(
 
 @group.command()
 def emulator(
-    faults: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--fault",
-            metavar="SIGNAL:KIND@T",
-            help="What shall go wrong, such as rate:off@5 or command:drop=0.05; may be repeated.",
-            show_default=False,
-        ),
-    ] = None,
+    faults: Faults = None,
     config: Config = None,
     overrides: Overrides = None,
     quiet: Quiet = False,
@@ -115,16 +129,69 @@ def emulator(
     with_parent: WithParent = False,
 ) -> None:
     """Run the emulated plant until SIGTERM."""
-    options = [f"plant.faults={dumps(faults)}"] if faults else []
-    settings, load = reloadable(config, [*(overrides or []), *options])
+    settings, load = reloadable(config, [*(overrides or []), "plant.via=emulator", *_fault_options(faults)])
+    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
+
+@group.command()
+def plant(
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = False,
+) -> None:
+    """Run the plant end that `plant.via` names, until SIGTERM: emulator, CAN bridge or Quanser's board."""
+    settings, load = reloadable(config, overrides or [])
+    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command()
+def bridge(
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = False,
+) -> None:
+    """Run the bridge to a plant on the CAN bus of `[can]`, until SIGTERM."""
+    settings, load = reloadable(config, [*(overrides or []), "plant.via=can"])
+    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command("can-node")
+def can_node(
+    faults: Faults = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = False,
+) -> None:
+    """Run the emulated plant as a node on the CAN bus of `[can]`, until SIGTERM."""
+    settings = settings_of(config, [*(overrides or []), *_fault_options(faults)])
+
+    def run(stop: Event) -> None:
+        from plant_emulator.can_node import CanFront
+        from plant_emulator.emulator import Emulator
+
+        emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
+        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint))
+
+    run_alone(run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+def _fault_options(faults: list[str] | None) -> list[str]:
+    return [f"plant.faults={dumps(faults)}"] if faults else []
+
+
+def _run_plant(
+    settings: Settings, load: Callable[[], Settings], *, quiet: bool, log_format: str, with_parent: bool
+) -> None:
     def run(role: Role) -> None:
-        from plant_emulator.emulator import EmulatorOnZenoh
-        from service.reload import reload_on_hangup
+        from service.plants import run_plant
 
-        emulator = EmulatorOnZenoh(role, settings.loop, settings.wire, settings.plant)
-        reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
-        emulator.run()
+        run_plant(role, settings, load)
 
     run_role("plant", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
 

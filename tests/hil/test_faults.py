@@ -100,9 +100,9 @@ def test_a_controller_that_stands_still_loses_the_plant_and_what_it_says_afterwa
 def test_a_controller_finds_a_plant_that_was_killed_and_came_back(hil: Hil) -> None:
     hil.start(settings=PATIENT)
     hil.run(0.3)
-    hil.kill("emulator")
+    hil.kill("plant")
     hil.eventually("searching", lambda: hil.state("controller") == "searching")
-    hil.restart("emulator")
+    hil.restart("plant")
     hil.eventually("driving again", lambda: hil.state("plant") == "driven" and hil.state("controller") == "running")
     assert hil.log.figures.z_track is not None
 
@@ -112,10 +112,10 @@ def test_a_plant_that_stood_still_ends_the_old_session_before_anything_else(hil:
     hil.start(settings=TOLD)
     hil.run(0.3)
     old = hil.status("plant").session
-    hil.pause("emulator")
+    hil.pause("plant")
     hil.eventually("the controller's notice", lambda: hil.happened("lost", "no measurement for"))
     hil.run(0.5)
-    hil.resume("emulator")
+    hil.resume("plant")
     hil.eventually("its end", lambda: hil.happened("released") or hil.happened("tripped"))
     log = hil.log
     events = [(at, event) for at, event in log.messages("event") if isinstance(event, Event)]

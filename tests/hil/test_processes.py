@@ -209,9 +209,9 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
     )
     with Bench(settings) as bench:
         bench.start("recorder")
-        bench.start("emulator")
+        bench.start("plant")
         bench.await_role("recorder")
-        bench.await_role("emulator")
+        bench.await_role("plant")
         commands: list[bytes] = []
         bench.zenoh.declare_subscriber(
             topics.key("command", settings.vehicle), lambda sample: commands.append(sample.payload.to_bytes())
