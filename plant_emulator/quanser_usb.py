@@ -388,7 +388,7 @@ class QuanserPlant(Plant):
             self._board.open(card, which)
         except self._error as error:
             raise QuanserError(
-                f"cannot open {card} '{which}': {_text(error)}; is it plugged in, switched on, and in nobody else's use?"
+                f"cannot open {card} '{which}': {_text(error)}; is it plugged in, switched on, and free?"
             ) from error
         try:
             self._prepare()

@@ -90,8 +90,8 @@ class Bench:
         self._folder.cleanup()
 
     def start_plant(self) -> None:
-        """Start the plant end that the configuration names, and a node on the bus where it needs one."""
-        if self._settings.plant.via == "can":
+        """Start the plant end that the configuration names, and a node on the bus if that is one of software only."""
+        if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
             self.start("can-node")
         self.start("plant")
 

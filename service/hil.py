@@ -85,7 +85,8 @@ class Hil:
     Args:
         folder: Where logs go.
         lockstep: Whether `run` counts steps instead of waiting.
-        via: What stands at the plant end; see `plant.via`.
+        plant: What stands at the plant end: as `plant.via`, or can-node for an emulated node on a bus of its own.
+        config: The TOML file to start from, unless `start` is given another.
 
     Attributes:
         events: What has happened so far, as it was told on the network.
@@ -96,9 +97,13 @@ class Hil:
     settings: Settings
     bench: Bench
 
-    def __init__(self, folder: Path, *, lockstep: bool = False, via: str = "emulator") -> None:
+    def __init__(
+        self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
+    ) -> None:
         self._folder = folder
-        self._via = via
+        self._via = plant.replace("can-node", "can")
+        self._bus_of_its_own = plant == "can-node"
+        self._config = config
         self._lockstep = lockstep
         self._running = False
         self._logs: list[HilLog] = []
@@ -140,8 +145,9 @@ class Hil:
             "plant.via": self._via,
         }
         overrides = [f"{key}={json.dumps(value)}" for key, value in {**ours, **(settings or {})}.items()]
-        self.settings = load(Path(config) if config else None, overrides)
-        self.settings = self.settings.model_copy(update={"can": private_bus(self.settings.can)})
+        self.settings = load(Path(config) if config else self._config, overrides)
+        if self._bus_of_its_own:
+            self.settings = self.settings.model_copy(update={"can": private_bus(self.settings.can)})
         self.events.clear()
         self._statuses.clear()
         self._asked_ticks = 0
@@ -163,6 +169,8 @@ class Hil:
     def run(self, seconds: float) -> None:
         """Let the loop run for so long; in lockstep, exactly so many steps, or until the session ends.
 
+        In lockstep only an emulator waits between two calls; other plants run on, and it is at least so many steps.
+
         Raises:
             BenchError: A process has failed.
             HilError: In lockstep, the plant does not step.
@@ -172,7 +180,8 @@ class Hil:
             self.bench.check()
             return
         self._asked_ticks += self.settings.loop.ticks(seconds)
-        self._ask("advance", Advance(seconds=seconds))
+        if self._via == "emulator":
+            self._ask("advance", Advance(seconds=seconds))
 
         def over() -> bool:
             plant = self._statuses.get("plant")

@@ -11,7 +11,7 @@ from typing import Final
 
 UNITS: Final = {
     "controller": ("the adaptive attitude controller", "controller", True),
-    "emulator": ("the emulated plant", "emulator", True),
+    "plant": ("the plant end that plant.via names", "plant", True),
     "recorder": ("the recorder of everything on the network", "recorder --set recorder.directory=%L/aeroloop", False),
 }
 """What each is, its command, and whether its loop is timed."""

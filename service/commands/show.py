@@ -34,6 +34,16 @@ def spec(config: Config = None, overrides: Overrides = None) -> None:
 
 
 @group.command()
+def dbc(config: Config = None, overrides: Overrides = None) -> None:
+    """Print the DBC file of the configured wire on the configured CAN node."""
+    settings = settings_of(config, overrides)
+
+    from protocol.dbc import dbc as describe
+
+    typer.echo(describe(settings.wire, settings.can.node, settings.loop.period_ns), nl=False)
+
+
+@group.command()
 def examples(
     name: Annotated[
         str | None, typer.Argument(help="Which one; all are listed if left out.", show_default=False)

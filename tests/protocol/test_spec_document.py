@@ -16,7 +16,7 @@ import protocol
 from protocol.frames import FrameFormat, WireSpec
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
-from protocol.states import CONTROLLER_TABLE, PLANT_TABLE
+from protocol.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
 from protocol.topics import TOPICS
 
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
@@ -152,3 +152,9 @@ def test_the_tables_of_states_are_those_of_the_code(end: str, table: Mapping[tup
 
 def test_the_text_is_of_the_version_that_a_claim_carries() -> None:
     assert re.search(rf"^# .*version {PROTOCOL_VERSION}$", SPEC.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def test_the_causes_of_a_trip_are_numbered_as_the_text_says() -> None:
+    text = " ".join(SPEC.read_text(encoding="utf-8").split())
+    told = text.split("Causes: ")[1].split(". >")[0]
+    assert told == ", ".join(f"{number} {cause}" for number, cause in enumerate(TripCause, start=1))
