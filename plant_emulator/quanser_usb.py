@@ -233,9 +233,7 @@ class QuanserPlant(Plant):
     Its encoders are relative: hold it level where yaw shall be 0 while it is made. The board's time begins with the
     first `actuate` or `advance`.
 
-    Each `advance` is one period. If the owner was late and samples were lost, the newest is measured, `samples_passed`
-    is the number of periods that went by, and as many calls less one return at once, for periods that are over; these
-    measure nothing. An owner that raises its tick by `samples_passed` thus stays in the board's time.
+    If its owner was late, `advance` measures the newest sample, and `passed` says how many periods went by.
 
     Args:
         settings: The board and its channels.
@@ -246,7 +244,6 @@ class QuanserPlant(Plant):
         QuanserError: The interface is missing, or the board cannot be opened and made ready.
 
     Attributes:
-        samples_passed: Periods that passed by the end of the last `advance` that waited for a sample; 1 in good time.
         overrun: Samples lost so far because they were not read in time.
         failures: Calls of the interface that failed so far, reads without a sample among them.
         failure: What the last of them said, or None.
@@ -254,13 +251,13 @@ class QuanserPlant(Plant):
     """
 
     actuators = 2
+    paces = True
 
     def __init__(self, settings: QuanserSettings, period: float, *, hardware: Hardware | None = None) -> None:
         self._settings, self._period = settings, period
         self._hardware = _quanser() if hardware is None else hardware
         self._error = self._hardware.HILError
         self._board: Board = self._hardware.HIL()
-        self.samples_passed = 1
         self.overrun = self.failures = self.expiries = 0
         self.failure: str | None = None
 
@@ -287,7 +284,7 @@ class QuanserPlant(Plant):
         self._running = self._closed = self._expired = False
         self._obeyed = True  # since the last sample: every output was written
         self._tells_overflows = True
-        self._samples_read = self._index = self._owed = 0  # index: of the last sample, on the board's clock
+        self._samples_read = self._index = 0  # index: of the last sample, on the board's clock
         self._advanced_ns = 0
         self._open()
 
@@ -315,10 +312,6 @@ class QuanserPlant(Plant):
         Raises:
             QuanserError: The board cannot be started.
         """
-        if self._owed:
-            self._owed -= 1
-            self._measurement = NO_MEASUREMENT
-            return
         self._start()
         passed = self._read()
         alive = self._keep_alive(reload=passed > 0 and self._obeyed)
@@ -330,10 +323,9 @@ class QuanserPlant(Plant):
         if not passed:
             self._wait_out_the_period()
             self._index += 1
-        self.samples_passed = max(1, passed)
-        self._owed = self.samples_passed - 1
-        self.overrun += self._owed
-        self._rested = 0 if any(self._held) else self._rested + self.samples_passed
+        self.passed = max(1, passed)
+        self.overrun += self.passed - 1
+        self._rested = 0 if any(self._held) else self._rested + self.passed
         if self._driven is None and self._amplified and self._rested > self._rest:
             self._amplify(False)
         self._advanced_ns = time.monotonic_ns()
@@ -519,12 +511,10 @@ class QuanserPlant(Plant):
         """Get the outputs back after the watchdog has expired, at 0 V and armed. False if they cannot be had."""
         board, n = self._board, len(MOTORS)
         self._unlock()
-        # Armed before the first write: clearing may put outputs back, and if they cannot be written it expires again.
-        done = (
-            self._try(board.watchdog_start, self._settings.board_watchdog_s)
-            and self._try(board.write_analog, MOTORS, n, self._no_volts)
-            and self._amplify(False)
-        )
+        # Clearing may put outputs back as they were: each step is tried, whatever fails before it.
+        armed = self._try(board.watchdog_start, self._settings.board_watchdog_s)
+        still = self._try(board.write_analog, MOTORS, n, self._no_volts)
+        done = self._amplify(False) and still and armed
         self._expired = not done
         if done and self._state is not None:
             self.show(self._state)

@@ -116,6 +116,22 @@ def from_contract(config: dict[str, Any]) -> Settings:
         raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
 
 
+def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
+    """A configuration with some values replaced. Raises ConfigError as `load` does."""
+    tree = settings.contract()
+    for override in overrides:
+        _merge(tree, _tree([override]))
+    return from_contract(tree)
+
+
+def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
+    for name, value in changes.items():
+        if isinstance(value, dict) and isinstance(tree.get(name), dict):
+            _merge(tree[name], value)
+        else:
+            tree[name] = value
+
+
 def _tree(overrides: Sequence[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for override in overrides:

@@ -119,6 +119,15 @@ class Controller:
         if change.reference is not None:
             self.motion.follow(Plan.of(change.reference), change.tick * self.period, change.within_s)
 
+    def resume(self, frame: bytes, k: int, sign: int, damping_estimate: Vector, attitude_error: Vector) -> None:
+        """Take up a session in its middle: the state after tick k, as telemetry told it, with its measurement."""
+        self.tick(frame, k)
+        self._sign[0] = float(sign)
+        self._theta[:] = memoryview(array("d", damping_estimate))
+        if sum(a * b for a, b in zip(self.attitude_error, attitude_error, strict=True)) < 0:  # it followed −q
+            w, x, y, z = self._attitude
+            self._attitude = -w, -x, -y, -z
+
     @property
     def gains(self) -> Gains:
         """The gains now."""

@@ -42,6 +42,7 @@ class Figures(BaseModel):
     latency_us: Percentiles | None
     log: str | None
     trips: list[str] = Field(default_factory=list, description="why the plant went to 0 V by itself, each time it did")
+    damages: list[str] = Field(default_factory=list, description="what of the log could not be read")
     reasons: dict[str, str] = Field(default_factory=dict, description="why a figure is null")
 
 
@@ -106,6 +107,7 @@ class Score:
         log: str | None = None,
         trips: Sequence[str] = (),
         reasons: dict[str, str] | None = None,
+        damages: Sequence[str] = (),
     ) -> Figures:
         """The figures so far; the last error and the last command stand for one period."""
         reasons = dict(reasons or {})
@@ -127,6 +129,7 @@ class Score:
             latency_us=latency,
             log=log,
             trips=list(trips),
+            damages=list(damages),
             reasons=reasons,
         )
 

@@ -23,13 +23,13 @@ from mcap.writer import CompressionType, Writer
 from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.links import published_ns
-from protocol.messages import Contract, Status, model_of
+from protocol.messages import Status, model_of
 from protocol.role import Role, versions
+from service.mcap_records import CONTRACT_METADATA
 from service.settings import RecorderSettings
 
 DRAIN_WAIT_S: Final = 0.02
 FRAME_ENCODING: Final = "x-aeroloop-frame"
-CONTRACT_METADATA: Final = "aeroloop.contract"
 MAX_QUEUED: Final = 1_000_000
 CHUNK_BYTES: Final = 64 * 1024
 """A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
@@ -218,8 +218,3 @@ class Recorder:
             )
         )
         self._status_written, self._status_due = written, now + 1.0
-
-
-def read_contract(text: str) -> Contract:
-    """A contract out of a log's metadata. Raises ValueError if it is none."""
-    return Contract.model_validate_json(text)

@@ -9,30 +9,47 @@ import typer
 
 from service.commands.common import (
     Json,
+    checked,
+    fail,
     guarded,
     print_figures,
 )
 
 if TYPE_CHECKING:
     from service.figures import Figures
+    from service.replay import SessionReplay
 
 group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
 
 
 @group.command()
 def review(
-    log: Annotated[Path, typer.Argument(help="An MCAP log.", show_default=False)],
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
     figures: Annotated[
         Path | None, typer.Option("--figures", help="Draw the paper's figures into this folder.", show_default=False)
     ] = None,
+    require: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--require",
+            metavar="FIGURE=LIMIT",
+            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4 or skipped_ticks=0.",
+            show_default=False,
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Compute every figure of merit from a log alone, and draw the paper's figures if asked."""
+    """Compute every figure of merit from logs alone, hold them to limits, draw the paper's figures."""
+    from service.limits import Limit
+
+    limits = checked(lambda: [Limit.parse(text) for text in require or []])
 
     def run() -> Figures:
+        from service.display import share_bar
         from service.review import read
 
-        judged = read(log, keep=figures is not None)
+        with share_bar("reading", hidden=json) as update:
+            judged = read(*logs, keep=figures is not None, progress=update)
         if figures is not None:
             from service.plots import draw_figures
 
@@ -40,4 +57,39 @@ def review(
                 typer.echo(f"aeroloop: drew {path}", err=True)
         return judged.figures
 
-    print_figures(guarded(run), json)
+    judged = guarded(run)
+    print_figures(judged, json)
+    broken = [text for limit in limits if (text := limit.broken(judged)) is not None]
+    if broken:
+        fail("; ".join(broken), 1)
+
+
+@group.command()
+def replay(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Compute with this instead of what the log says."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compute every command of a log again from its measurements, and compare byte for byte."""
+
+    def run() -> list[SessionReplay]:
+        from service.display import share_bar
+        from service.replay import replay
+
+        with share_bar("replaying", hidden=json) as update:
+            return replay(logs, overrides or [], update)
+
+    replayed = guarded(run)
+    if json:
+        from json import dumps
+
+        typer.echo(dumps([session.model_dump(mode="json") for session in replayed], indent=2))
+    else:
+        from service.display import replay_table
+
+        replay_table(replayed)
+    if not overrides and any(session.differing for session in replayed):
+        raise typer.Exit(1)

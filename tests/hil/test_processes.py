@@ -23,7 +23,8 @@ from protocol import topics
 from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
-from service.review import ReviewError, review
+from service.logfile import ReviewError
+from service.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
 FIGURES = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command")

@@ -1,0 +1,151 @@
+"""A run as its logs tell it: one file, a folder, or the files of a rotated run, read as one and in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from protocol import topics
+from protocol.errors import AeroloopError
+from protocol.messages import Contract
+from protocol.verbs import Change
+from service.config import Settings, from_contract
+from service.mcap_records import (
+    CHANNEL,
+    CONTRACT_METADATA,
+    MESSAGE,
+    METADATA,
+    Channel,
+    Damage,
+    Message,
+    NotMcapError,
+    metadata,
+    records,
+)
+
+Which = tuple[str, str]
+"""A vehicle and a session."""
+
+
+class ReviewError(AeroloopError):
+    """A log cannot be judged; one line that says why."""
+
+
+class LogFiles:
+    """The logs of a run.
+
+    Args:
+        paths: Files and folders; of a folder, every `.mcap` in it.
+
+    Attributes:
+        paths: The files, in the order of their first messages.
+        contracts: Who took part, by role; the last of each.
+        changes: What controllers followed from which tick on, by vehicle and session.
+        damages: What could not be read, by file.
+
+    Raises:
+        ReviewError: Nothing is there, or no log can be read.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.contracts: dict[str, Contract] = {}
+        self.changes: dict[Which, list[Change]] = {}
+        self.damages: dict[Path, list[Damage]] = {}
+        starts = {path: self._prelude(path) for path in _files(paths)}
+        self.paths = sorted(starts, key=lambda path: starts[path])
+        for changes in self.changes.values():
+            changes.sort(key=lambda change: change.tick)
+        self._size = sum(path.stat().st_size for path in self.paths)
+
+    @property
+    def settings(self) -> Settings:
+        """The controller's configuration if the logs have it, else the plant's.
+
+        Raises:
+            ReviewError: They have neither.
+            ConfigError: It is not of this version.
+        """
+        for role in ("controller", "plant"):
+            if role in self.contracts:
+                return from_contract(self.contracts[role].config)
+        raise ReviewError(f"{self.name} has no contract of a controller or a plant, so its frames cannot be read")
+
+    @property
+    def name(self) -> str:
+        """What to call the run."""
+        first = str(self.paths[0])
+        return first if len(self.paths) == 1 else f"{first} and {len(self.paths) - 1} more"
+
+    def messages(
+        self, names: Collection[str], progress: Callable[[float], None] | None = None
+    ) -> Iterator[tuple[topics.Address, bytes, int]]:
+        """Key, content and time of publication [ns] of every message of these topics, in the order of recording."""
+        read = 0
+        for path in self.paths:
+            done = read
+
+            def told(reached: int, done: int = done) -> None:
+                if progress is not None:
+                    progress((done + reached) / self._size)
+
+            wanted: dict[int, topics.Address] = {}
+            for record in records(path, None, told):
+                if record.opcode == MESSAGE:
+                    message = Message.read(record.content)
+                    address = wanted.get(message.channel)
+                    if address is not None:
+                        yield address, message.data, message.publish_time
+                elif record.opcode == CHANNEL:
+                    channel = Channel.read(record.content)
+                    key = topics.read_key(channel.topic)
+                    if key is not None and key.topic.name in names:
+                        wanted[channel.id] = key
+            read += path.stat().st_size
+
+    def _prelude(self, path: Path) -> int:
+        """Gather contracts and changes, which may stand anywhere in a file. Returns the time of its first message."""
+        first = 0
+        changes: dict[int, str] = {}
+        damages: list[Damage] = []
+        try:
+            for record in records(path, damages):
+                if record.opcode == MESSAGE:
+                    if changes or not first:
+                        message = Message.read(record.content)
+                        first = first or message.publish_time
+                        if message.channel in changes:
+                            change = Change.model_validate_json(message.data)
+                            known = self.changes.setdefault((changes[message.channel], change.session), [])
+                            if change not in known:
+                                known.append(change)
+                elif record.opcode == CHANNEL:
+                    channel = Channel.read(record.content)
+                    key = topics.read_key(channel.topic)
+                    if key is not None and key.topic.name == "change":
+                        changes[channel.id] = key.vehicle
+                elif record.opcode == METADATA:
+                    name, entries = metadata(record.content)
+                    if name == CONTRACT_METADATA:
+                        contract = Contract.model_validate_json(entries["json"])
+                        self.contracts[contract.role] = contract
+        except NotMcapError as error:
+            raise ReviewError(f"{error}, so it is no log") from None
+        except OSError as error:
+            raise ReviewError(f"cannot read {path}: {error.strerror}") from None
+        except (ValidationError, ValueError, KeyError) as error:
+            raise ReviewError(f"{path} is not a log of this version: {str(error).splitlines()[0]}") from None
+        if damages:
+            self.damages[path] = damages
+        return first
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    files: list[Path] = []
+    for path in paths:
+        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        if not found:
+            raise ReviewError(f"there is no .mcap file in {path}")
+        files += found
+    return files

@@ -1,0 +1,214 @@
+"""Replay: a log's measurements through the controller again, and every command compared with the one that was logged.
+
+The controller is sans-I/O, and what an operator changed is in the log with its tick, so the same frames in must give
+the same frames out, byte for byte. With another configuration it says what would have been commanded instead; the plant
+of the log does not follow that, so it is no simulation.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from math import sqrt
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol.messages import Telemetry
+from protocol.verbs import Change
+from service.config import Settings, load_over
+from service.controller import Controller
+from service.logfile import LogFiles
+from service.pairing import MAX_WAITING, Pairing, Seen
+
+
+class Difference(BaseModel):
+    """The first command that was computed otherwise than it was logged."""
+
+    model_config = ConfigDict(frozen=True)
+
+    tick: int
+    time_s: float = Field(description="on the law's clock [s]")
+    logged: str = Field(description="the frame, in hexadecimal")
+    computed: str
+
+
+class SessionReplay(BaseModel):
+    """What replaying one session has shown."""
+
+    model_config = ConfigDict(frozen=True)
+
+    vehicle: str
+    session: str
+    first_tick: int | None = Field(description="where the replay could begin; null if nowhere")
+    commands: int = Field(description="commands compared")
+    differing: int
+    first_difference: Difference | None
+    rms_v: float | None = Field(description="root mean square of the difference between computed and logged levels [V]")
+    max_v: float | None = Field(description="largest difference of a motor [V]")
+    u_total_logged: float = Field(description="∫ uᵀu dt of the commands compared [V²·s]")
+    u_total_computed: float
+
+
+class Replayer(Pairing):
+    """Replays one session.
+
+    Args:
+        settings: The controller's configuration.
+        changes: What it followed from which tick on, in order.
+    """
+
+    def __init__(self, settings: Settings, changes: Sequence[Change]) -> None:
+        super().__init__(settings.wire, settings.loop)
+        self._controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self._changes = deque(changes)
+        self._level = settings.wire.voltage.quantizer().level
+        self._period = settings.loop.period
+        self._begun = False
+        self._unplaced: deque[Telemetry] = deque(maxlen=MAX_WAITING)
+        self._held: deque[tuple[int, bytes, bytes]] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
+        self.first_tick: int | None = None
+        self.first_difference: Difference | None = None
+        self.commands = self.differing = 0
+        self._square = self._largest = self._logged = self._computed = 0.0
+
+    def answered(self, k: int, measurement: Seen, command: bytes, codes: tuple[float, ...]) -> None:
+        """Compute the command of tick k again."""
+        del codes
+        if self._begun:
+            self._compare(k, measurement.frame, command)
+        else:
+            self._held.append((k, measurement.frame, command))
+
+    def passed_over(self, k: int, measurement: Seen) -> None:
+        """The controller never saw it."""
+
+    def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
+        """The first telemetry whose tick is known tells where to begin, and with what if that is not the start."""
+        super().telemetry(telemetry, published_ns)
+        self._unplaced.append(telemetry)
+        while not self._begun and self._unplaced and self._held and self._unplaced[0].tick <= self._held[-1][0]:
+            self._begin(self._unplaced.popleft())
+
+    def finish(self) -> None:
+        """No more is to come."""
+        super().finish()
+        while not self._begun and self._unplaced:
+            self._begin(self._unplaced.popleft())
+
+    def _begin(self, telemetry: Telemetry) -> None:
+        tick = telemetry.tick
+        held = next((pair for pair in self._held if pair[0] == tick), None)
+        if held is None:
+            return
+        self._follow(tick)
+        computed = self._controller.tick(held[1], tick)
+        told = telemetry.damping_estimate, telemetry.attitude_error, telemetry.sign
+        controller = self._controller
+        if held is self._held[0] and told == (
+            controller.damping_estimate,
+            controller.attitude_error,
+            controller.sign,
+        ):
+            self.first_tick = tick  # the session's very first: nothing had been computed before it
+            self._count(tick, computed, held[2])
+        else:
+            controller.resume(held[1], tick, telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error)
+            self.first_tick = tick + 1
+        self._begun = True
+        for k, measurement, command in self._held:
+            if k > tick:
+                self._compare(k, measurement, command)
+        self._held.clear()
+
+    def result(self, vehicle: str, session: str) -> SessionReplay:
+        """What has been found."""
+        compared = self.commands > 0
+        return SessionReplay(
+            vehicle=vehicle,
+            session=session,
+            first_tick=self.first_tick,
+            commands=self.commands,
+            differing=self.differing,
+            first_difference=self.first_difference,
+            rms_v=sqrt(self._square / self.commands) if compared else None,
+            max_v=self._largest if compared else None,
+            u_total_logged=self._logged * self._period,
+            u_total_computed=self._computed * self._period,
+        )
+
+    def _follow(self, k: int) -> None:
+        while self._changes and self._changes[0].tick <= k:
+            self._controller.apply(self._changes.popleft())
+
+    def _compare(self, k: int, measurement: bytes, logged: bytes) -> None:
+        self._follow(k)
+        self._count(k, self._controller.tick(measurement, k), logged)
+
+    def _count(self, k: int, computed: bytes | None, logged: bytes) -> None:
+        self.commands += 1
+        if computed != logged:
+            self.differing += 1
+            if self.first_difference is None:
+                self.first_difference = Difference(
+                    tick=k,
+                    time_s=round(k * self._period, 9),
+                    logged=logged.hex(),
+                    computed=computed.hex() if computed is not None else "",
+                )
+        ours, theirs = self._volts(computed), self._volts(logged)
+        self._computed += sum(u * u for u in ours)
+        self._logged += sum(u * u for u in theirs)
+        differences = [abs(a - b) for a, b in zip(ours, theirs, strict=True)]
+        self._square += sum(d * d for d in differences)
+        self._largest = max(self._largest, *differences)
+
+    def _volts(self, frame: bytes | None) -> list[float]:
+        read = None if frame is None else self._wire.command.unpack(frame)
+        if read is None:
+            return [0.0] * self._wire.actuators
+        return [volts if (volts := self._level(code)) == volts else 0.0 for code in read[1]]
+
+
+def replay(
+    paths: Sequence[Path], overrides: Sequence[str] = (), progress: Callable[[float], None] | None = None
+) -> list[SessionReplay]:
+    """Replay every session of a run.
+
+    Args:
+        paths: Logs, folders of logs, or a rotated run.
+        overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
+            or of the reference stands in for every change that the log has of them.
+        progress: Called now and then with the share that is done, 0…1.
+
+    Raises:
+        ReviewError: It cannot be read, or has no controller's configuration.
+        ConfigError: An override is wrong.
+    """
+    files = LogFiles(paths)
+    settings = load_over(files.settings, overrides)
+    own_gains = any(override.startswith("law.") for override in overrides)
+    own_reference = any(override.startswith("reference") for override in overrides)
+    sessions: dict[tuple[str, str], Replayer] = {}
+    for address, payload, published_ns in files.messages(("measurement", "command", "telemetry"), progress):
+        if address.session is not None:
+            which = address.vehicle, address.session
+            if which not in sessions:
+                changes = files.changes.get(which, [])
+                if own_gains:
+                    changes = [change.model_copy(update={"gains": None}) for change in changes]
+                if own_reference:
+                    changes = [change.model_copy(update={"reference": None}) for change in changes]
+                sessions[which] = Replayer(settings, changes)
+            seen = Seen(payload, published_ns)
+            if address.topic.name == "measurement":
+                sessions[which].measurement(seen)
+            else:
+                sessions[which].command(seen)
+        else:
+            telemetry = Telemetry.model_validate_json(payload)
+            if replayer := sessions.get((address.vehicle, telemetry.session)):
+                replayer.telemetry(telemetry, published_ns)
+    for replayer in sessions.values():
+        replayer.finish()
+    return [replayer.result(vehicle, session) for (vehicle, session), replayer in sessions.items()]
