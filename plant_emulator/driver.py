@@ -84,7 +84,7 @@ class Driver:
         grid = None if self._plant.paces else TickGrid(self._loop.period_ns)
         while not self._stop.is_set():
             skipped = grid.skipped if grid else 0
-            k = grid.wait() if grid else self.endpoint.ticked + 1
+            k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
             timing.woke(grid.due_ns if grid else time.monotonic_ns())
             front.take_inbox()
             self._tick(front.link.take() if front.link else None, k)
@@ -113,8 +113,8 @@ class Driver:
             read = self.endpoint.wire.measurement.unpack(sent)
             echo = None if read is None else read[0]
             self._front.send(sent, self.endpoint.counter if echo is None else echo)
-        self._k = self.endpoint.ticked
-        self._front.after_tick(self._k)
+        self._k = k
+        self._front.after_tick(k)
         return echo
 
     def _await_answer(self, echo: int) -> Arrival | None:

@@ -95,7 +95,7 @@ class Endpoint(Tenancy):
                 self._watch(self._tick + 1)
                 self.plant.actuate(self._voltages)
                 self.plant.advance()
-                self._tick += self.plant.passed
+                self._tick += 1
         else:
             self._tick = k
         if self.session is None:
@@ -111,7 +111,7 @@ class Endpoint(Tenancy):
 
     @property
     def ticked(self) -> int:
-        """Index of the last tick; beyond the one asked for where hardware let more than one period pass."""
+        """Index of the last tick; −1 before the first."""
         return self._tick
 
     @property

@@ -45,7 +45,8 @@ class Plant(ABC):
     Attributes:
         actuators: Number of its motors, 2 or 3.
         paces: Whether `advance` returns when the next sample is there, and so paces the loop.
-        passed: How many periods the last `advance` let pass; more than one where its owner was late.
+        passed: How many periods the last `advance` let pass; more than one where its owner was late, who then raises
+            his tick by so many, and `advance` returns at once for those that are over.
     """
 
     actuators: int

@@ -14,6 +14,7 @@ from plant_emulator.friction import FrictionSettings
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.mechanism import Mechanism
 from plant_emulator.plant import Plant
+from plant_emulator.quanser_usb import QuanserSettings
 from plant_emulator.rigid_body import RigidBody, RigidBodySettings
 from plant_emulator.rotor import RotorSettings
 from plant_emulator.sensors import Sensors, SensorSettings
@@ -62,6 +63,7 @@ class PlantSettings(BaseModel):
     limits: LimitSettings = LimitSettings()
     aero: AeroSettings = AeroSettings()
     rigid_body: RigidBodySettings = RigidBodySettings()
+    quanser: QuanserSettings = QuanserSettings()
     rotor: RotorSettings = RotorSettings()
     friction: FrictionSettings = FrictionSettings()
     wind: WindSettings = WindSettings()

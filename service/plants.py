@@ -36,5 +36,9 @@ def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> N
         reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
         emulator.run()
         return
+    from plant_emulator.presence import Presence
+    from plant_emulator.quanser_board import BoardDriver
 
-    raise NotImplementedError
+    driver = BoardDriver(loop, wire, plant, role.stop)
+    reload_on_hangup(role, settings, load, lambda new: driver.reconfigure(new.plant))
+    driver.run(Presence(role, loop, driver.endpoint, latest_s=plant.watchdog_s))
