@@ -26,6 +26,16 @@ class Seen(NamedTuple):
     published_ns: int
 
 
+class Pair(NamedTuple):
+    """A measurement, the command that answered it, and the measurements before it that none did, with counters."""
+
+    counter: int
+    measurement: Seen
+    command: bytes
+    codes: tuple[float, ...]
+    before: list[tuple[int, Seen]]
+
+
 class Pairing(ABC):
     """One session's frames, put together as they are read.
 
@@ -40,10 +50,10 @@ class Pairing(ABC):
     def __init__(self, wire: WireSpec, loop: LoopSettings) -> None:
         self._wire = wire
         self._loop = loop
-        self._waiting: deque[Seen] = deque(maxlen=MAX_WAITING)  # measurements whose tick is not known yet
-        self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
+        self._measured: deque[tuple[int, Seen]] = deque(maxlen=MAX_WAITING)  # not answered yet, with their counters
         self._commands: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
-        self._measured: deque[tuple[int, Seen]] = deque()  # measurements that no command has answered yet
+        self._pairs: deque[Pair] = deque(maxlen=MAX_WAITING)  # whose tick is not known yet
+        self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
         self._ticks: TickCounter | None = None  # once it is known where it starts
         self.malformed = 0
 
@@ -57,16 +67,12 @@ class Pairing(ABC):
 
     def measurement(self, seen: Seen) -> None:
         """A measurement frame; commands that were published before it can now be told which tick they answer."""
-        counter = self._counter(seen)
-        if counter is None:
+        read = self._wire.measurement.unpack(seen.frame)
+        if read is None:
             self.malformed += 1
-        elif self._ticks is None:
-            self._waiting.append(seen)
-            self._anchor(seen.published_ns)
-        else:
-            self._answer(seen.published_ns)
-            if (k := self._ticks.advance(counter, seen.published_ns)) is not None:
-                self._measured.append((k, seen))
+            return
+        self._answer(seen.published_ns)
+        self._measured.append((read[0], seen))
 
     def command(self, seen: Seen) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
@@ -79,24 +85,8 @@ class Pairing(ABC):
 
     def finish(self) -> None:
         """No more is to come: what still waits is judged by what there is."""
-        self._anchor(None)
         self._answer(None)
-
-    def _anchor(self, until_ns: int | None) -> None:
-        """Match telemetry from before `until_ns` with the latest measurement before it that had its counter."""
-        while self._ticks is None and self._anchors and (until_ns is None or self._anchors[0][1] < until_ns):
-            telemetry, published_ns = self._anchors.popleft()
-            waiting = list(self._waiting)
-            for i in reversed(range(len(waiting))):
-                if waiting[i].published_ns < published_ns and self._counter(waiting[i]) == telemetry.counter:
-                    self._waiting.clear()
-                    loop = self._loop
-                    first = self._first_tick(waiting[: i + 1], telemetry.tick)
-                    self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep, tick=first - 1)
-                    for seen in waiting:
-                        self.measurement(seen)
-                    break
-            # else: the measurement that it speaks of came before the log began
+        self._anchor(None)
 
     def _answer(self, until_ns: int | None) -> None:
         """Put together the commands published before `until_ns`, each with the latest measurement before of its echo.
@@ -110,28 +100,55 @@ class Pairing(ABC):
                 self.malformed += 1
                 continue
             echo, codes = read
-            answered = next(
-                (
-                    k
-                    for k, measured in reversed(self._measured)
-                    if k % COUNTERS == echo and measured.published_ns < seen.published_ns
-                ),
-                None,
-            )
-            if answered is None:
+            measured = self._measured
+            found = len(measured) - 1
+            while found >= 0 and (measured[found][0] != echo or measured[found][1].published_ns >= seen.published_ns):
+                found -= 1
+            if found < 0:
                 continue  # answers what the log does not have, or repeats an answer
-            while self._measured[0][0] < answered:
-                self.passed_over(*self._measured.popleft())
-            self.answered(*self._measured.popleft(), seen.frame, codes)
+            before = [measured.popleft() for _ in range(found)]
+            pair = Pair(*measured.popleft(), seen.frame, codes, before)
+            if self._ticks is not None:
+                self._place(pair, self._ticks)
+            else:
+                self._pairs.append(pair)
+                self._anchor(pair.measurement.published_ns)
 
-    def _counter(self, seen: Seen) -> int | None:
-        read = self._wire.measurement.unpack(seen.frame)
-        return None if read is None else read[0]
+    def _anchor(self, until_ns: int | None) -> None:
+        """Match telemetry from before `until_ns` with the latest answered measurement before it with its counter."""
+        while self._ticks is None and self._anchors and (until_ns is None or self._anchors[0][1] < until_ns):
+            telemetry, published_ns = self._anchors.popleft()
+            pairs = list(self._pairs)
+            for i in reversed(range(len(pairs))):
+                if pairs[i].measurement.published_ns < published_ns and pairs[i].counter == telemetry.counter:
+                    first = telemetry.tick
+                    for pair in reversed(pairs[:i]):
+                        first = _before(first, pair.counter)
+                    loop = self._loop
+                    self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep, tick=max(0, first) - 1)
+                    self._pairs.clear()
+                    for pair in pairs:
+                        self._place(pair, self._ticks)
+                    break
+            # else: the measurement that it speaks of came before the log began
 
-    def _first_tick(self, frames: list[Seen], tick: int) -> int:
-        """The tick of the first of some measurements, the last of which is at `tick`, by counting down."""
-        for seen in reversed(frames[:-1]):
-            counter = self._counter(seen)
-            assert counter is not None  # malformed ones never get here
-            tick -= (tick - counter) % COUNTERS or COUNTERS
-        return max(0, tick)
+    def _place(self, pair: Pair, ticks: TickCounter) -> None:
+        """Find the tick as the controller did: it, too, saw the measurements that it answered, and no others."""
+        last = ticks.tick
+        k = ticks.advance(pair.counter, pair.measurement.published_ns)
+        if k is None:
+            return
+        tick, over = k, []
+        for counter, seen in reversed(pair.before):
+            tick = _before(tick, counter)
+            if tick <= last:
+                break
+            over.append((tick, seen))
+        for missed, seen in reversed(over):
+            self.passed_over(missed, seen)
+        self.answered(k, pair.measurement, pair.command, pair.codes)
+
+
+def _before(tick: int, counter: int) -> int:
+    """The last tick before this one that has a counter."""
+    return tick - ((tick - counter) % COUNTERS or COUNTERS)
