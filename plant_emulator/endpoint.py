@@ -138,7 +138,7 @@ class Endpoint(Tenancy):
         # The echo is a tick modulo 16: the latest measurement with that counter. Newer than the last one answered is
         # fresh. An echo that never changes is a sender that repeats itself, however long ago it began.
         answered = self._tick - (self.counter - echo) % COUNTERS
-        if echo == self._echo or answered <= self._answered:
+        if echo == self._echo or answered <= self._answered or answered < self._session_tick:
             return
         voltages = tuple(self._level(code) for code in codes)
         if not isfinite(sum(voltages)):

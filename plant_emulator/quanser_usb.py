@@ -233,7 +233,9 @@ class QuanserPlant(Plant):
     Its encoders are relative: hold it level where yaw shall be 0 while it is made. The board's time begins with the
     first `actuate` or `advance`.
 
-    If its owner was late, `advance` measures the newest sample, and `passed` says how many periods went by.
+    Each `advance` is one period. If its owner was late, the newest sample is measured and `passed` is the number of
+    periods that went by; as many calls less one return at once, for periods that are over, and measure nothing. Who
+    raises his tick by `passed` stays in the board's time.
 
     Args:
         settings: The board and its channels.
@@ -284,7 +286,7 @@ class QuanserPlant(Plant):
         self._running = self._closed = self._expired = False
         self._obeyed = True  # since the last sample: every output was written
         self._tells_overflows = True
-        self._samples_read = self._index = 0  # index: of the last sample, on the board's clock
+        self._samples_read = self._index = self._owed = 0  # index: of the last sample, on the board's clock
         self._advanced_ns = 0
         self._open()
 
@@ -312,6 +314,10 @@ class QuanserPlant(Plant):
         Raises:
             QuanserError: The board cannot be started.
         """
+        if self._owed:
+            self._owed -= 1
+            self._measurement = NO_MEASUREMENT
+            return
         self._start()
         passed = self._read()
         alive = self._keep_alive(reload=passed > 0 and self._obeyed)
@@ -324,7 +330,8 @@ class QuanserPlant(Plant):
             self._wait_out_the_period()
             self._index += 1
         self.passed = max(1, passed)
-        self.overrun += self.passed - 1
+        self._owed = self.passed - 1
+        self.overrun += self._owed
         self._rested = 0 if any(self._held) else self._rested + self.passed
         if self._driven is None and self._amplified and self._rested > self._rest:
             self._amplify(False)

@@ -5,7 +5,8 @@ and the quantizer gives factor, bounds and the code that says "no valid value". 
 code i is i·l, which is what a DBC can say. With any other it is not; the signal is then the bare code, and its comment
 has the formula. Many tools read DBC files as cp1252, so the text keeps to ASCII.
 
-cantools takes about half a second to import: import this module where it is used, not at a program's head.
+Identifiers and lengths are those of `can_link`. cantools takes about half a second to import: import this module where
+it is used, not at a program's head.
 """
 
 from __future__ import annotations
@@ -20,29 +21,27 @@ from cantools.database.can.formats.dbc import DbcAttribute, DbcAttributeDefiniti
 from cantools.database.conversion import BaseConversion
 from cantools.typechecking import Choices
 
+from protocol.can_link import (
+    CLASSIC_BYTES,
+    COMMAND_ID,
+    CONTROLLER_HEARTBEAT_ID,
+    FD_LENGTHS,
+    HEARTBEAT_S,
+    MAX_NODE,
+    MEASUREMENT_ID,
+    PLANT_HEARTBEAT_ID,
+    number_of,
+)
 from protocol.frames import COUNTER_BITS, FrameFormat, SignalSpec, WireSpec
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
-from protocol.states import PlantState
-
-NODES: Final = range(1, 128)
-"""Numbers a node may have: the lowest seven bits of its identifiers."""
-
-MEASUREMENT_ID: Final = 0x100
-COMMAND_ID: Final = 0x200
-PLANT_HEARTBEAT_ID: Final = 0x300
-CONTROLLER_HEARTBEAT_ID: Final = 0x380
-
-CLASSIC_BYTES: Final = 8
-FD_BYTES: Final = (12, 16, 20, 24, 32, 48, 64)
-"""Lengths a CAN FD payload of more than eight bytes can have (ISO 11898-1)."""
-
-HEARTBEAT_MS: Final = 100
-FINGERPRINT_BITS: Final = 56
+from protocol.states import PlantState, TripCause
 
 NO_VALID_VALUE: Final = "no_valid_value"
 """Name of the code −2^(R−1)."""
 
+_HEARTBEAT_MS: Final = round(1000 * HEARTBEAT_S)
+_FINGERPRINT_BITS: Final = 56
 _PLANT: Final = "Plant"
 _CONTROLLER: Final = "Controller"
 _MAX_CYCLE_MS: Final = 2**16 - 1  # what cantools declares for GenMsgCycleTime
@@ -69,8 +68,8 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
     Raises:
         ValueError: A node or a period out of bounds.
     """
-    if node not in NODES:
-        raise ValueError(f"a node's number is {NODES[0]} to {NODES[-1]}, not {node}")
+    if not 1 <= node <= MAX_NODE:
+        raise ValueError(f"a node's number is 1 to {MAX_NODE}, not {node}")
     cycle_ms = -(-period_ns // 1_000_000)
     if not 1 <= cycle_ms <= _MAX_CYCLE_MS:
         raise ValueError(f"a period of {period_ns} ns is not between 1 ns and {_MAX_CYCLE_MS} ms")
@@ -96,11 +95,14 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         cycle_ms,
         f"What the controller commands in answer to a measurement: {rate}. {idle}",
     )
+    causes: Choices = OrderedDict([(0, "none"), *((number_of(cause), str(cause)) for cause in TripCause)])
+    cause = _unsigned("cause", 0, 4, "What tripped the plant last.", causes)
+    session = _unsigned("session", 0, 4, "Number of the session, modulo 16.")
     messages = [
         measurement,
         command,
-        _heartbeat("PlantHeartbeat", PLANT_HEARTBEAT_ID + node, _PLANT),
-        _heartbeat("ControllerHeartbeat", CONTROLLER_HEARTBEAT_ID + node, _CONTROLLER),
+        _heartbeat("PlantHeartbeat", PLANT_HEARTBEAT_ID + node, _PLANT, cause),
+        _heartbeat("ControllerHeartbeat", CONTROLLER_HEARTBEAT_ID + node, _CONTROLLER, session),
     ]
     database = Database(
         messages,
@@ -112,20 +114,6 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         dbc_specifics=_bus_type("CAN FD" if any(message.is_fd for message in messages) else "CAN"),
     )
     return database.as_dbc_string(sort_signals=None, sort_attribute_signals=None)
-
-
-def payload_bytes(size: int) -> int:
-    """Length of the CAN payload that carries a frame of `size` bytes: itself, or the next that CAN FD has.
-
-    Raises:
-        ValueError: No CAN frame is that long.
-    """
-    if size <= CLASSIC_BYTES:
-        return size
-    for length in FD_BYTES:
-        if size <= length:
-            return length
-    raise ValueError(f"a frame of {size} bytes is longer than a CAN FD frame's {FD_BYTES[-1]}")
 
 
 def _measured(wire: WireSpec) -> list[_Quantity]:
@@ -148,7 +136,7 @@ def _message(
     """A message that carries `size` bytes from `sender` to the other end."""
     for signal in signals:
         signal.receivers = [_CONTROLLER if sender == _PLANT else _PLANT]
-    length = payload_bytes(size)
+    length = next(length for length in FD_LENGTHS if length >= size)
     return Message(
         identifier,
         name,
@@ -161,15 +149,14 @@ def _message(
     )
 
 
-def _heartbeat(name: str, identifier: int, sender: str) -> Message:
+def _heartbeat(name: str, identifier: int, sender: str, number: Signal) -> Message:
+    """A heartbeat, whose first four bits are `number`."""
     states: Choices = OrderedDict((code, str(state)) for code, state in enumerate(PlantState))
-    signals = [
-        _unsigned("cause", 0, 4, "Why the sender is in its state."),
-        _unsigned("state", 4, 4, "State of the sender.", states),
-        _unsigned("fingerprint", 8, FINGERPRINT_BITS, "Fingerprint of the wire spec that the sender has."),
-    ]
-    comment = f"The {sender.lower()} lives: one every {HEARTBEAT_MS} ms."
-    return _message(name, identifier, sender, CLASSIC_BYTES, signals, HEARTBEAT_MS, comment)
+    state = _unsigned("state", 4, 4, "What the plant is doing, or what the controller wants it to do.", states)
+    agreed = "What both ends must agree on, wire, period and lockstep, as seven bytes of a hash."
+    fingerprint = _unsigned("fingerprint", 8, _FINGERPRINT_BITS, agreed)
+    comment = f"The {sender.lower()} lives: one every {_HEARTBEAT_MS} ms, and at once on a change."
+    return _message(name, identifier, sender, CLASSIC_BYTES, [number, state, fingerprint], _HEARTBEAT_MS, comment)
 
 
 def _codes(layout: FrameFormat, quantities: Iterable[_Quantity]) -> Iterator[Signal]:

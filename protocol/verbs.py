@@ -80,7 +80,7 @@ class Points(Message):
             raise ValueError(f"{len(self.times)} times for {len(self.attitudes)} attitudes")
         if self.times[0] != 0 or not all(isfinite(t) for t in self.times):
             raise ValueError("the first time must be 0, and every time a number")
-        if any(after - before < 1e-3 for before, after in zip(self.times, self.times[1:], strict=False)):
+        if any(after - before < 1e-3 - 1e-9 for before, after in zip(self.times, self.times[1:], strict=False)):
             raise ValueError("times must rise by at least a millisecond")
         return self
 
@@ -132,6 +132,7 @@ class Change(Message):
     gains: Gains | None = Field(default=None, description="null: as before")
     reference: Reference | None = Field(default=None, description="null: as before")
     within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: at once [s]")
+    ease_s: float = Field(default=0.0, description="time to let the acceleration of before go, before that [s]")
 
 
 class Inject(Message):

@@ -117,7 +117,9 @@ class Controller:
         if change.gains is not None:
             self.set_gains(change.gains)
         if change.reference is not None:
-            self.motion.follow(Plan.of(change.reference), change.tick * self.period, change.within_s)
+            self.motion.follow(
+                Plan.of(change.reference), change.tick * self.period, change.within_s, ease_s=change.ease_s
+            )
 
     def resume(self, frame: bytes, k: int, sign: int, damping_estimate: Vector, attitude_error: Vector) -> None:
         """Take up a session in its middle: the state after tick k, as telemetry told it, with its measurement."""

@@ -92,10 +92,14 @@ class Live:
             if self._controller is not None:
                 self.set_gains(self._gains)
         if reference != configured:
-            self._reference = reference
-            self._stream = reference if isinstance(reference, Stream) else None
-            if self._controller is not None:
-                self.track(reference, Track(reference=reference).within_s)()
+            if self._controller is None:
+                self._reference = reference
+                self._stream = reference if isinstance(reference, Stream) else None
+            else:
+                try:
+                    self.track(reference, Track(reference=reference).within_s)()
+                except FollowError as error:
+                    self._role.event("fault", f"the configured reference is not followed: {error}", self._session)
 
     # ── the loop's side ──
 
@@ -143,6 +147,7 @@ class Live:
             controller.motion.follow(target, t, within_s, self._limits)
             self._reference = held
             self._stream = reference if isinstance(reference, Stream) else None
+            self._setpoint = None  # of the stream before
             self._heard = time.monotonic()
             self._tell(reference=held, within_s=within_s)
             text = f"{_described(reference)} within {within_s:g} s"
@@ -160,8 +165,7 @@ class Live:
             plan = Plan.of(hold)
             plan.check(self._limits)
         except (ValidationError, FollowError) as error:
-            self.refused += 1
-            self._role.warn("set-point", "fault", f"set-point refused: {str(error).splitlines()[0]}", self._session)
+            self._refuse(error)
             return
         self._setpoint = hold, plan
 
@@ -175,10 +179,18 @@ class Live:
             return
         (hold, plan), self._setpoint, self._heard = self._setpoint, None, now
         motion, t = self._running().motion, self._time
-        within_s = motion.time_to_reach(plan, t, stream.within_s, self._limits)
-        motion.follow(plan, t, within_s)
+        within_s, ease_s = motion.time_to_reach(plan, t, stream.within_s, self._limits)
+        try:
+            motion.follow(plan, t, within_s, self._limits, ease_s=ease_s)
+        except FollowError as error:
+            self._refuse(error)
+            return
         self._reference = hold
-        self._tell(reference=hold, within_s=within_s)
+        self._tell(reference=hold, within_s=within_s, ease_s=ease_s)
+
+    def _refuse(self, error: Exception) -> None:
+        self.refused += 1
+        self._role.warn("set-point", "fault", f"set-point refused: {str(error).splitlines()[0]}", self._session)
 
     @property
     def _time(self) -> float:
@@ -189,6 +201,20 @@ class Live:
             raise FollowError(f"{self._role.name} does not have {self._role.vehicle}, so there is nothing to change")
         return self._controller
 
-    def _tell(self, *, gains: Gains | None = None, reference: Reference | None = None, within_s: float = 0.0) -> None:
-        change = Change(session=self._session, tick=self._k, gains=gains, reference=reference, within_s=within_s)
+    def _tell(
+        self,
+        *,
+        gains: Gains | None = None,
+        reference: Reference | None = None,
+        within_s: float = 0.0,
+        ease_s: float = 0.0,
+    ) -> None:
+        change = Change(
+            session=self._session,
+            tick=self._k,
+            gains=gains,
+            reference=reference,
+            within_s=within_s,
+            ease_s=ease_s,
+        )
         self._role.publish("change", change)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import time
+from math import isfinite
 from pathlib import Path
 from typing import Final
 
@@ -105,24 +106,45 @@ def read_points(path: Path) -> Points:
     """
     times: list[float] = []
     attitudes: list[tuple[float, float, float]] = []
+    number = 1
     try:
-        with path.open(newline="") as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or (number == 1 and not _is_number(row[0])):
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file)
+            first = True
+            while True:
+                number = rows.line_num + 1  # of the row that is tried next, if it cannot even be read
+                if (row := next(rows, None)) is None:
+                    break
+                number, heading = rows.line_num, first and bool(row) and not _is_number(row[0])
+                first = False
+                if not row or heading:
                     continue
-                if len(row) != 4 or not all(_is_number(cell) for cell in row):
-                    raise OperatorError(
-                        f"{path}, line {number}: expected four numbers (time [s], roll, pitch, yaw [deg]), not "
-                        f"{','.join(row)!r}"
-                    )
+                if (problem := _problem(row, times)) is not None:
+                    raise OperatorError(f"{path}, line {number}: {problem}")
                 time_s, roll, pitch, yaw = (float(cell) for cell in row)
                 times.append(time_s)
                 attitudes.append((roll, pitch, yaw))
         return Points(times=times, attitudes=attitudes)
+    except csv.Error as error:
+        raise OperatorError(f"{path}, line {number}: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise OperatorError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
     except ValidationError as error:
         raise OperatorError(f"{path}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+
+
+def _problem(row: list[str], times: list[float]) -> str | None:
+    """What is wrong with a row of a table of points, if anything is."""
+    if len(row) != 4 or not all(_is_number(cell) for cell in row):
+        return f"expected four numbers (time [s], roll, pitch, yaw [deg]), not {','.join(row)!r}"
+    values = [float(cell) for cell in row]
+    if not all(isfinite(value) for value in values):
+        return f"every number must be finite, not {','.join(row)!r}"
+    if not times and values[0] != 0:
+        return f"the first time must be 0, not {row[0]}"
+    if times and values[0] <= times[-1]:
+        return f"times must rise, and {row[0]} does not after {times[-1]:g}"
+    return None
 
 
 def _is_number(cell: str) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from math import acos, degrees, pi
 from typing import Final, NamedTuple
 
@@ -17,7 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.attitude import conjugate, from_euler, product
+from protocol import attitude
 from protocol.errors import AeroloopError
 from protocol.symbolic import Buffer, Compiled
 from protocol.verbs import Hold, Points, Reference, Sinusoid
@@ -27,7 +28,8 @@ Floats = NDArray[np.float64]
 POWERS: Final = 6
 _SAMPLES: Final = 65
 """Of a quintic, whose rate is a polynomial of degree 4: the largest of so many is within 0.1 % of the maximum."""
-_LONGEST_LOOK_S: Final = 600.0
+_TURNS: Final = 8
+_MOST_SAMPLES: Final = 100_000
 _SLOWER: Final = 1.05
 _TRIES: Final = 8
 
@@ -104,14 +106,28 @@ class Plan:
         last[0, 0] = angles[-1]
         return cls._polynomial(times, np.concatenate([join(here, there, np.diff(times)), last]))
 
-    def joined(self, here: Angles, t: float, within_s: float) -> Plan:
-        """This plan from t + within_s on, reached by a quintic from where one is at t. Shapes of `here`: (1, 3)."""
+    def joined(self, here: Angles, t: float, within_s: float, ease_s: float = 0.0) -> Plan:
+        """This plan from t + ease_s + within_s on, reached by a quintic from where one is at t; shapes (1, 3).
+
+        With `ease_s`, the acceleration of now is let go first: a long way that began with it would only get faster.
+        """
+        if ease_s:
+            eased = Angles(
+                here.angle + here.rate * ease_s + here.acceleration * ease_s**2 / 3,
+                here.rate + here.acceleration * ease_s / 2,
+                np.zeros((1, 3)),
+            )
+            rest = self.joined(eased, t + ease_s, within_s)
+            return self._polynomial(np.array([t]), join(here, eased, np.array([ease_s])))._then(rest)
         later = replace(self, starts=self.starts + (t + within_s))
         if not within_s:
             return later
         first = Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
         approach = self._polynomial(np.array([t]), join(here, first, np.array([within_s])))
-        return Plan(*(np.concatenate([getattr(p, name) for p in (approach, later)]) for name in self.__annotations__))
+        return approach._then(later)
+
+    def _then(self, later: Plan) -> Plan:
+        return Plan(*(np.concatenate([getattr(p, name) for p in (self, later)]) for name in self.__annotations__))
 
     def piece(self, t: float) -> int:
         """Which piece time t [s] lies in."""
@@ -133,34 +149,49 @@ class Plan:
         )
 
     def samples(self) -> Angles:
-        """Every piece at enough times to know its extremes."""
-        slowest = min((f for f in self.frequency[-1] if f > 0), default=0.0)
-        last = min(2 * pi / slowest, _LONGEST_LOOK_S) if slowest else 0.0
-        lengths = np.append(np.diff(self.starts), last)
-        return self.at(lengths[:, None] * np.linspace(0, 1, _SAMPLES))
+        """Every piece at enough times to know its extremes, one after another. Shapes (n, 3)."""
+        lengths = np.append(np.diff(self.starts), 0.0)
+        every = Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, _SAMPLES))))
+        if not self.frequency[-1].any():
+            return every
+        return Angles(*(np.concatenate(both) for both in zip(every, self._swing(), strict=True)))
+
+    def _swing(self) -> Angles:
+        """The last piece's sinusoid over some turns of its slowest axis; its bounds where that would take too many."""
+        moving = self.frequency[-1][self.frequency[-1] > 0]
+        count = int(_TURNS * (_SAMPLES - 1) * moving.max() / moving.min()) + 1
+        if count <= _MOST_SAMPLES:
+            tau = np.zeros((len(self.starts), count))
+            tau[-1] = np.linspace(0, _TURNS * 2 * pi / moving.min(), count)
+            return Angles(*(part[-1] for part in self.at(tau)))
+        signs = np.array(list(product((-1.0, 1.0), repeat=6)))
+        amplitude, f = self.amplitude[-1], self.frequency[-1]
+        return Angles(signs[:, :3] * amplitude, signs[:, 3:] * amplitude * f, signs[:, :3] * amplitude * f * f)
 
     def fastest(self) -> float:
         """The largest angular velocity [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ."""
         angles = self.samples()
-        square = (angles.rate**2).sum(axis=2)
-        square -= 2 * angles.rate[..., 0] * angles.rate[..., 2] * np.sin(angles.angle[..., 1])
-        return float(np.sqrt(max(0.0, square.max())))
+        square = (angles.rate**2).sum(axis=1)
+        square -= 2 * angles.rate[:, 0] * angles.rate[:, 2] * np.sin(angles.angle[:, 1])
+        return float(np.sqrt(np.maximum(0.0, square).max()))  # NaN stays NaN
 
     def check(self, limits: Limits) -> None:
         """Raise FollowError if it goes beyond the limits."""
-        if (fastest := self.fastest()) > limits.rate:
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is too fast, too
+            fastest = self.fastest()
+        if not fastest <= limits.rate:
             raise FollowError(
                 f"that would turn at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
                 f"{limits.rate:g} rad/s; allow more time, or ask for less"
             )
         angle = self.samples().angle
-        tilt = acos(max(-1.0, float((np.cos(angle[..., 0]) * np.cos(angle[..., 1])).min())))
+        tilt = acos(max(-1.0, float((np.cos(angle[:, 0]) * np.cos(angle[:, 1])).min())))
         if tilt > limits.tilt:
             raise FollowError(
                 f"that would tilt by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
                 f"{degrees(limits.tilt):g}°"
             )
-        if not limits.rolls and np.abs(angle[..., 0]).max() > 0:
+        if not limits.rolls and np.abs(angle[:, 0]).max() > 0:
             raise FollowError("this vehicle has no motor that rolls it: give it a roll of 0")
 
 
@@ -198,9 +229,9 @@ def reference_function() -> ca.Function:
     angles = ca.SX.zeros(3)
     for n in reversed(range(POWERS)):
         angles = angles * tau + quintic[:, n]
-    q_d = from_euler(angles + amplitude * ca.sin(frequency * tau))
+    q_d = attitude.from_euler(angles + amplitude * ca.sin(frequency * tau))
     q_d_dot = ca.jacobian(q_d, t)
-    omega_d = 2 * product(q_d_dot, conjugate(q_d))[1:4]  # (C.12), solved for ω_d
+    omega_d = 2 * attitude.product(q_d_dot, attitude.conjugate(q_d))[1:4]  # (C.12), solved for ω_d
     omega_d_dot = ca.jacobian(omega_d, t)
     return ca.Function(
         "reference",
@@ -232,7 +263,9 @@ class Motion:
         self._time[0] = t
         self._function()
 
-    def follow(self, target: Plan, t: float, within_s: float, limits: Limits | None = None) -> None:
+    def follow(
+        self, target: Plan, t: float, within_s: float, limits: Limits | None = None, *, ease_s: float = 0.0
+    ) -> None:
         """Follow another plan, reached from the present one within some time; its own time begins then.
 
         Args:
@@ -240,13 +273,15 @@ class Motion:
             t: The time now [s].
             within_s: When to have reached it [s]; 0 jumps.
             limits: How far the way there may go; None for no limits.
+            ease_s: Time to let the acceleration of now go before [s].
 
         Raises:
             FollowError: It goes further; nothing has changed then.
         """
-        plan = target.joined(self._here(t), t, within_s)
+        plan = target.joined(self._here(t), t, within_s, ease_s)
         if limits is not None and within_s:
-            replace(plan, **{name: getattr(plan, name)[:2] for name in plan.__annotations__}).check(limits)
+            way = plan.piece(t + ease_s + within_s) + 1  # pieces, up to the target's first
+            replace(plan, **{name: getattr(plan, name)[:way] for name in plan.__annotations__}).check(limits)
         self._plan = plan
         self._load(plan.piece(t))
 
@@ -256,14 +291,18 @@ class Motion:
         roll, pitch, yaw = (degrees(float(angle)) for angle in here.angle[0] + here.rate[0] * within_s / 2)
         return Hold(attitude=(roll, pitch, yaw))
 
-    def time_to_reach(self, target: Plan, t: float, within_s: float, limits: Limits) -> float:
-        """The time in which a set-point is reached within the rate limit, at least `within_s` [s]."""
-        for _ in range(_TRIES):
-            fastest = target.joined(self._here(t), t, within_s).fastest()
-            if fastest <= limits.rate:
-                break
-            within_s *= _SLOWER * fastest / limits.rate
-        return within_s
+    def time_to_reach(self, target: Plan, t: float, within_s: float, limits: Limits) -> tuple[float, float]:
+        """How to reach a set-point within the rate limit: `within_s`, at least as given, and `ease_s` [s]."""
+        here = self._here(t)
+        least = within_s
+        for ease_s in (0.0, least):
+            within_s = least
+            for _ in range(_TRIES):
+                fastest = target.joined(here, t, within_s, ease_s).fastest()
+                if fastest <= limits.rate:
+                    return within_s, ease_s
+                within_s *= _SLOWER * fastest / limits.rate
+        return within_s, least
 
     def _here(self, t: float) -> Angles:
         i = self._plan.piece(t)

@@ -48,6 +48,7 @@ def reload_on_hangup(
         take_over: Given the new configuration between two ticks, takes what is in `LIVE`.
     """
     current = settings
+    effective = settings.contract()
 
     def reload() -> Action:
         nonlocal current
@@ -56,7 +57,14 @@ def reload_on_hangup(
 
         def take() -> None:
             take_over(current)
-            role.configured(current.contract())
+            after = current.contract()
+            for name in LIVE[role.role]:
+                section, _, key = name.partition(".")
+                if key:
+                    effective[section][key] = after[section][key]
+                else:
+                    effective[section] = after[section]
+            role.configured(effective)  # what needs a restart is not in effect, and a log must not say so
             role.event("changed", f"configuration read again: {'; '.join(lines) or 'nothing has changed'}")
 
         return take

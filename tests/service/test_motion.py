@@ -152,12 +152,12 @@ class Followed:
         q_d, omega_d, omega_d_dot = (np.array(memory) for memory in self.memory.values())
         return q_d, omega_d, omega_d_dot
 
-    def follow(self, reference: Reference, t: float, within_s: float) -> None:
+    def follow(self, reference: Reference, t: float, within_s: float, ease_s: float = 0.0) -> None:
         """Follow something else, and know the plan of that."""
         angle, rate, acceleration = states(self.plan, t)
         here = Angles(angle[None], rate[None], acceleration[None])
-        self.plan = Plan.of(reference).joined(here, t, within_s)
-        self.motion.follow(Plan.of(reference), t, within_s)
+        self.plan = Plan.of(reference).joined(here, t, within_s, ease_s)
+        self.motion.follow(Plan.of(reference), t, within_s, ease_s=ease_s)
 
 
 def rounding(here: tuple[Array, Array, Array], there: tuple[Array, Array, Array], t: float, within_s: float) -> Array:
@@ -177,7 +177,7 @@ def rounding(here: tuple[Array, Array, Array], there: tuple[Array, Array, Array]
     return 30 * EPS * 15 * size * (5 / T) ** orders + 2 * EPS * (t + T) * 15 * size * (5 / T) ** (orders + 1)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(first=references, then=references, t=seconds(0, 20), within_s=withins)
 def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
     first: Reference, then: Reference, t: float, within_s: float
@@ -197,7 +197,7 @@ def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
         assert np.abs(before - after).max() <= tolerance[i]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(
     first=references,
     changes=st.lists(st.tuples(references, seconds(0, 3), withins), min_size=1, max_size=4),
@@ -219,7 +219,7 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
             assert np.abs(was - now).max() <= tolerance
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(first=references, then=references, t=seconds(0.1, 10), within_s=withins)
 def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_acceleration(
     first: Reference, then: Reference, t: float, within_s: float
@@ -262,7 +262,7 @@ def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_a
 # Arriving
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(first=references, target=holds, t=seconds(0, 10), within_s=withins)
 def test_going_somewhere_ends_there_exactly_and_at_rest(
     first: Reference, target: Hold, t: float, within_s: float
@@ -278,7 +278,7 @@ def test_going_somewhere_ends_there_exactly_and_at_rest(
     assert followed.at(1e4)[0] == pytest.approx(quaternion(np.radians(target.attitude)), abs=8 * EPS)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(first=references, points=some_points(), t=seconds(0, 10), within_s=withins)
 def test_points_are_passed_each_at_its_time_from_rest_to_rest(
     first: Reference, points: Points, t: float, within_s: float
@@ -302,7 +302,7 @@ def test_points_are_passed_each_at_its_time_from_rest_to_rest(
     assert not np.any(followed.at(start + points.times[-1] + 1.0)[1])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(points=some_points())
 def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> None:
     plan = Plan.of(points)
@@ -314,7 +314,7 @@ def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> N
             assert np.abs(before - after).max() <= tolerance[order]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(first=references, t=seconds(0, 10), within_s=withins)
 def test_resting_comes_to_rest_where_even_braking_ends(first: Reference, t: float, within_s: float) -> None:
     followed = Followed(first)
@@ -342,7 +342,7 @@ def test_resting_from_an_even_turn_only_ever_slows_down() -> None:
 # The loop's function
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(
     first=references,
     changes=st.lists(st.tuples(references, seconds(0.05, 3), withins), max_size=3),
@@ -422,7 +422,6 @@ def test_what_stays_within_the_limits_is_not_refused(reference: Reference, limit
     Plan.of(reference).check(limits)
 
 
-@pytest.mark.xfail(strict=True, reason="samples are taken over the slowest axis's period alone, at most 600 s of it")
 @pytest.mark.parametrize(
     "reference",
     [
@@ -436,7 +435,6 @@ def test_a_sinusoid_that_tilts_too_far_at_any_time_is_refused(reference: Sinusoi
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.xfail(strict=True, reason="overflow gives NaN, and max(0.0, NaN) is 0: not too fast")
 def test_an_approach_that_overflows_is_refused() -> None:
     with pytest.raises(FollowError):
         Motion(Hold()).follow(Plan.of(Hold(attitude=(0.0, 0.0, 1e308))), 0.0, 0.02, BENCH)
@@ -487,7 +485,7 @@ polynomial (the least Σ|w| of weights w that give every quartic's value there f
 direction that is fastest at any time is such a quartic."""
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(first=references, target=holds, t=seconds(0, 5), within_s=seconds(0.2, 5.0))
 def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hold, t: float, within_s: float) -> None:
     """Without roll, where Σ rate² is all; from any state, so from any acceleration."""
@@ -502,7 +500,15 @@ def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hol
     assert fastest <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES + 1e-9
 
 
-@settings(max_examples=60, deadline=None)
+def test_the_fastest_is_found_where_it_falls_between_samples() -> None:
+    """A turn that brakes hard and comes back; every other sample alone would miss its crest by 0.9 %."""
+    here = Angles(*(np.array([[0.0, 0.0, x]]) for x in (0.0, 0.38, -4.92)))
+    plan = Plan.of(Hold(attitude=(0.0, 0.0, float(np.degrees(0.24))))).joined(here, 0.0, 2.95)
+    _, rates, _ = piece_states(plan, 0, 2.95 * np.linspace(0, 1, DENSE)[:, None])
+    assert np.abs(rates).max() <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES
+
+
+@settings(max_examples=40, deadline=None)
 @given(start=holds, target=holds, within_s=seconds(0.2, 5.0))
 def test_from_rest_to_rest_the_fastest_is_that_of_the_angular_velocity_itself(
     start: Hold, target: Hold, within_s: float
@@ -514,7 +520,7 @@ def test_from_rest_to_rest_the_fastest_is_that_of_the_angular_velocity_itself(
     assert followed.plan.fastest() == pytest.approx(fastest, rel=2e-3, abs=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(amplitude=triples(60), frequency=frequencies)
 def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
     amplitude: tuple[float, float, float], frequency: float
@@ -526,14 +532,15 @@ def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
     assert followed.plan.fastest() == pytest.approx(fastest, rel=5e-3, abs=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(start=holds, target=holds, asked_s=withins, rate=st.integers(1, 40).map(lambda n: n / 10))
 def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
     start: Hold, target: Hold, asked_s: float, rate: float
 ) -> None:
     followed, plan = Followed(start), Plan.of(target)
     limits = Limits(rate=rate, tilt=pi, rolls=True)
-    within_s = followed.motion.time_to_reach(plan, 0.0, asked_s, limits)
+    within_s, ease_s = followed.motion.time_to_reach(plan, 0.0, asked_s, limits)
+    assert ease_s == 0.0  # there is no acceleration to let go
     here = Angles(*(part[None] for part in states(followed.plan, 0.0)))
     asked = plan.joined(here, 0.0, asked_s).fastest()
     assert plan.joined(here, 0.0, within_s).fastest() <= rate
@@ -552,15 +559,12 @@ def test_time_to_reach_changes_nothing() -> None:
         assert np.array_equal(got, expected)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a longer way keeps the first acceleration for longer: it gets faster, not slower"
-)
 def test_a_far_set_point_in_the_middle_of_a_quick_one_is_reached_within_the_limit() -> None:
     followed = Followed(Stream())
     near, far = (Hold(attitude=(0.0, 0.0, yaw)) for yaw in (1.0, 170.0))
-    followed.follow(near, 0.0, followed.motion.time_to_reach(Plan.of(near), 0.0, 0.2, BENCH))
-    within_s = followed.motion.time_to_reach(Plan.of(far), 0.04, 0.2, BENCH)
-    followed.follow(far, 0.04, within_s)
+    followed.follow(near, 0.0, *followed.motion.time_to_reach(Plan.of(near), 0.0, 0.2, BENCH))
+    within_s, ease_s = followed.motion.time_to_reach(Plan.of(far), 0.04, 0.2, BENCH)
+    followed.follow(far, 0.04, within_s, ease_s)
     assert followed.plan.fastest() <= BENCH.rate
     assert within_s < 60.0
 
@@ -647,6 +651,5 @@ def test_what_is_just_within_the_bounds_is_taken(model: type[Message], fields: d
     model.model_validate(fields)
 
 
-@pytest.mark.xfail(strict=True, reason="0.009 − 0.008 is 0.000999…: a table at 1 kHz is refused")
 def test_points_a_millisecond_apart_are_taken() -> None:
     Points(times=[n / 1000 for n in range(20)], attitudes=TWO[:1] * 20)

@@ -169,7 +169,6 @@ def test_what_was_read_again_is_taken_over_between_ticks_and_told() -> None:
     ]
 
 
-@pytest.mark.xfail(strict=True, reason="the contract tells all that was read, so a log of it does not run again")
 def test_what_needs_a_restart_is_not_in_the_contract_before_it() -> None:
     role = Hangup()
     reload_on_hangup(cast(Role, role), load(), lambda: load(overrides=["law.mass=2"]), lambda _: None)
@@ -264,7 +263,6 @@ def test_a_table_that_makes_no_sense_is_told_with_file_and_reason(
     assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="what Points itself refuses is told without its line")
 @pytest.mark.parametrize(("content", "why", "line"), [case for case in BAD_TABLES if case.values[2] is not None])
 def test_a_table_that_makes_no_sense_is_told_with_its_line(file: File, content: str, why: str, line: int) -> None:
     with pytest.raises(OperatorError, match=f"line {line}: .*{why}"):
@@ -280,18 +278,15 @@ def test_a_file_that_is_not_there_or_cannot_be_read_is_named(tmp_path: Path, fil
         assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="csv.Error is not caught, as of a cell of over 131 072 characters")
 def test_a_cell_without_end_is_told(file: File) -> None:
     with pytest.raises(OperatorError, match="line 2"):
         read_points(file("0,0,0,0\n1,0,0," + "1" * 200_000 + "\n"))
 
 
-@pytest.mark.xfail(strict=True, reason="rows are counted, not lines: a quoted cell may hold a newline")
 def test_a_row_is_named_by_its_line_in_the_file(file: File) -> None:
     with pytest.raises(OperatorError, match="line 4"):
         read_points(file('"time\n[s]",roll,pitch,yaw\n0,0,0,0\n1,0,0\n'))
 
 
-@pytest.mark.xfail(strict=True, reason="with a byte order mark the first point is taken for a heading")
 def test_a_table_saved_by_a_spreadsheet_is_read(file: File) -> None:
     assert read_points(file("\ufeff" + ROWS)) == POINTS
