@@ -1,7 +1,7 @@
-"""SocketCAN itself: classic and FD frames cross between sockets on `vcan0`, wherever it has to come from.
+"""SocketCAN itself: frames, links and the closed loop on `vcan0`, wherever it has to come from.
 
 The tests that need `vcan0` are in a class that pytest collects only where it is up. The test outside runs pytest on
-this folder once more, where it is.
+this file once more, where it is.
 """
 
 from __future__ import annotations
@@ -9,16 +9,23 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import can
 import pytest
 
+from protocol.can_link import CanLink, CanSettings, Heartbeat
+from protocol.frames import WireSpec
+from protocol.states import PlantState, TripCause
+from service.config import load
+from service.experiment import run_experiment
+from tests.can.closed_loop import run_on_bus
+from tests.can.in_process import virtual
 from tests.can.kernel import NoSocketCan, run_with_socketcan, vcan_is_up
-
-can = pytest.importorskip("can", reason="python-can is not installed")
+from tests.protocol.gathering import eventually
 
 ROOT = Path(__file__).parent.parent.parent
 
 TIMEOUT_S = 120.0
-"""For what takes 2 s inside: a shared machine can keep a process waiting, and this one is slow to begin with."""
+"""For what takes 10 s inside: a shared machine can keep a process waiting, and this one is slow to begin with."""
 
 PATIENCE_S = 20.0
 
@@ -27,7 +34,7 @@ LEAN = ("-p", "no:cacheprovider", "--disable-plugin-autoload", "-o", "addopts=--
 
 
 def test_frames_cross_on_a_real_socketcan() -> None:
-    pytest_inside = [sys.executable, "-m", "pytest", "tests/can", "-k", "socketcan_inside", *LEAN]
+    pytest_inside = [sys.executable, "-m", "pytest", "tests/can/test_socketcan.py", "-k", "socketcan_inside", *LEAN]
     try:
         done = run_with_socketcan(pytest_inside, ROOT, TIMEOUT_S)
     except NoSocketCan as reason:
@@ -35,6 +42,28 @@ def test_frames_cross_on_a_real_socketcan() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "passed" in done.stdout, done.stdout
     assert "skipped" not in done.stdout, done.stdout
+
+
+WIRES = {False: WireSpec(), True: WireSpec().with_bits(12, 16)}
+"""For classic CAN, of 7 and 2 bytes; for CAN FD, of 10, which travel as 12, and 5."""
+
+
+def assert_the_loop_is_the_experiment(
+    bus: CanSettings, wire: WireSpec, duration_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Figures to the last bit. Nothing here depends on real time: a slow machine is no silent peer."""
+    monkeypatch.setattr("plant_emulator.can_node.SILENT_S", PATIENCE_S)
+    settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
+    settings = settings.model_copy(update={"wire": wire})
+    assert run_on_bus(bus, settings, duration_s).model_dump(exclude={"reasons"}) == run_experiment(
+        settings, duration_s
+    ).model_dump(exclude={"reasons"})
+
+
+@pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
+def test_the_loop_over_a_bus_without_a_kernel_is_the_experiment(fd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is compared on `vcan0` below, on a bus that is only a queue."""
+    assert_the_loop_is_the_experiment(virtual(fd=fd), WIRES[fd], 0.5, monkeypatch)
 
 
 class TestInside:
@@ -54,3 +83,33 @@ class TestInside:
             received = there.recv(PATIENCE_S)
         assert received is not None
         assert received.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False), received
+
+    @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
+    def test_socketcan_inside_a_link_carries_frames_and_heartbeats(self, fd: bool) -> None:
+        bus, wire = CanSettings(interface="socketcan", channel="vcan0", fd=fd), WIRES[fd]
+        plant, controller = CanLink(bus, wire, "plant"), CanLink(bus, wire, "controller")
+        try:
+            for counter in range(16):
+                measurement = wire.measurement.pack(counter, [counter - 8, 1, -1, 127, -127, 0])
+                command = wire.command.pack(counter, [counter, -counter])
+                for sender, receiver, frame in ((plant, controller, measurement), (controller, plant, command)):
+                    sender.send(frame)
+                    arrival = receiver.wait(PATIENCE_S)
+                    assert arrival is not None
+                    assert arrival.frame == frame
+            plant.beat(Heartbeat(PlantState.TRIPPED, 9, b"fingers"))
+            eventually("the heartbeat", lambda: controller.heard is not None)
+            assert controller.heard is not None
+            assert controller.heard.cause is TripCause.BUS
+            assert controller.heard[:3] == (PlantState.TRIPPED, 9, b"fingers")
+            assert plant.heard is None
+            assert plant.errors == plant.refused == controller.errors == controller.refused == 0
+            assert plant.fault is controller.fault is None
+        finally:
+            plant.close()
+            controller.close()
+
+    @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
+    def test_socketcan_inside_the_loop_is_the_experiment(self, fd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+        bus = CanSettings(interface="socketcan", channel="vcan0", fd=fd)
+        assert_the_loop_is_the_experiment(bus, WIRES[fd], 0.5, monkeypatch)

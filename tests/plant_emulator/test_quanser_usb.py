@@ -425,9 +425,21 @@ def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_are
     for _ in range(4):
         twin.advance()
     assert plant.measure().attitude == twin.measure().attitude
-    # In between the filter had the newest angle instead of those lost: 3 of them, 3 counts each at 1.5 rad/s and less,
-    # of which it passes on less than ωn² T each. They cost little; that no time passed would cost 3 periods' rise.
-    assert plant.measure().rate == pytest.approx(twin.measure().rate, abs=9 * 2 * pi / 2880 * 50**2 * PERIOD)
+
+
+def test_for_the_filter_the_newest_sample_lasts_as_long_as_those_that_were_lost() -> None:
+    plant, board = _made()
+    filtered = FilteredDerivative(50.0, 0.8, PERIOD)
+    filtered.update(0.0)
+    plant.advance()
+    filtered.update(0.0)
+    _at(board, 0, 40)
+    board.let_pass(4)
+    plant.advance()
+    for _ in range(4):
+        rate = filtered.update(2 * pi / 4096 * 40)
+    assert plant.measure().rate == (0.0, 0.0, rate)
+    assert rate > 0.5
 
 
 def test_periods_that_are_over_are_not_waited_for_and_measure_nothing() -> None:
@@ -554,6 +566,17 @@ def test_a_board_whose_reads_stop_with_the_watchdog_is_found_out_too() -> None:
     board.let_pass(WATCHDOG + 1)
     _drive(plant, 1)
     assert (plant.expiries, _is_nothing(plant.measure())) == (1, True)
+
+
+def test_nothing_is_written_while_the_watchdog_has_the_outputs() -> None:
+    plant, board = _driven()
+    plant.actuate(OFF)
+    board.let_pass(WATCHDOG + 1)
+    n = len(board.calls)
+    for _ in range(WATCHDOG + REST + 2):  # long enough to switch the amplifier off, were it on
+        plant.advance()
+    assert not any(call.startswith("write") for call in _since(board, n))
+    assert (plant.failures, plant.expiries) == (0, 1)
 
 
 def test_a_cleared_watchdog_is_armed() -> None:
@@ -734,12 +757,17 @@ def test_a_light_that_fails_is_tried_again_and_costs_no_sample() -> None:
 
 
 def test_lights_come_back_with_the_outputs() -> None:
-    plant, board = _expired()
-    plant.show(PlantState.GRANTED)
+    plant, board = _driven()
+    plant.show(PlantState.DRIVEN)
+    board.let_pass(WATCHDOG + 1)
+    plant.advance()
+    plant.show(PlantState.DRIVEN)
     assert board.leds == list(COLOURS[PlantState.TRIPPED])  # the board's own
     assert plant.failures == 0
+    n = len(board.calls)
     plant.actuate(OFF)
-    assert board.leds == list(COLOURS[PlantState.GRANTED])
+    assert board.leds == list(COLOURS[PlantState.DRIVEN])
+    assert "write_other" in _since(board, n)  # not every board may give them back by itself
 
 
 # Closing
@@ -1089,6 +1117,20 @@ def test_the_stand_in_leaves_buffers_as_they_were_when_a_read_fails() -> None:
     assert handle.task_read(task, 1, None, counts, None, None) == 0
     assert counts.tolist() == [123, 456]
     assert board.time == began + 2  # both samples are lost
+
+
+def test_the_stand_in_gives_outputs_back_as_they_were() -> None:
+    """The worst that can be read into the documentation: whoever clears a watchdog must write 0 V at once."""
+    board = _board()
+    plant = QuanserPlant(QuanserSettings(), PERIOD, hardware=board)
+    _drive(plant, 1)
+    board.let_pass(WATCHDOG + 1)
+    assert board.motor_voltages == OFF
+    handle = cast(quanser_fake.FakeHIL, board.holder)
+    with pytest.raises(HILError, match="expired"):
+        handle.write_analog(CH, 2, ZERO)
+    handle.watchdog_clear()
+    assert board.motor_voltages == VOLTS
 
 
 def test_the_stand_in_can_be_had_by_one() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from functools import lru_cache
-from math import isnan, nan, pi
+from math import isclose, isnan, nan, pi
 from typing import Any, Final
 
 import cantools
@@ -119,7 +119,7 @@ def assert_tells(signal: Signal, spec: SignalSpec, code: float, told: Any) -> No
     elif code == -(2 ** (spec.bits - 1)):
         assert isnan(value)
         assert told == "no_valid_value"
-    elif spec.deadzone is None:
+    elif spec.deadzone is None or isclose(spec.deadzone, quantizer_of(spec).step / 2, rel_tol=1e-12):
         assert abs(told - value) <= ROUNDING * abs(value)
     else:
         assert told == code

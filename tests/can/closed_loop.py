@@ -1,0 +1,57 @@
+"""The loop closed over a CAN bus within one process, in lockstep: an emulated node in a thread, the controller here.
+
+What the bridge does on the bus is done by hand: heartbeats that say granted, and frames as they are.
+"""
+
+from __future__ import annotations
+
+from threading import Event, Thread
+
+from plant_emulator.can_node import CanFront
+from plant_emulator.emulator import Emulator
+from protocol.can_link import HEARTBEAT_S, CanLink, CanSettings, Heartbeat, fingerprint
+from protocol.states import PlantState
+from service.config import Settings
+from service.controller import Controller
+from service.figures import Figures, Score
+
+PATIENCE_S = 20.0
+
+
+def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figures:
+    """Run the closed loop for `duration_s` of the law's time [s]. The settings must say lockstep."""
+    loop, wire = settings.loop, settings.wire
+    controller = Controller(wire, settings.law, settings.reference, loop.period)
+    score = Score(wire, loop.period, settings.plant.watchdog_s)
+    level = wire.voltage.quantizer().level
+    over = Event()
+    node = Emulator(loop, wire, settings.plant, over)
+    front = CanFront(bus, loop, node.endpoint)
+    link = CanLink(bus, wire, "controller")
+    granted = Heartbeat(PlantState.GRANTED, 1, fingerprint(wire, loop.period_ns, lockstep=True))
+
+    def beat() -> None:
+        while not over.is_set():
+            link.beat(granted)
+            over.wait(HEARTBEAT_S)
+
+    threads = [Thread(target=node.run, args=(front,)), Thread(target=beat)]
+    for thread in threads:
+        thread.start()
+    try:
+        for k in range(loop.ticks(duration_s)):
+            arrival = link.wait(PATIENCE_S)
+            assert arrival is not None, f"no measurement {k}: the node is {node.endpoint.cause or node.endpoint.state}"
+            command = controller.tick(arrival.frame, k)
+            assert command is not None
+            read = wire.command.unpack(command)
+            assert read is not None
+            score.error(k, controller.attitude_error)
+            score.command(k, [level(code) for code in read[1]])
+            link.send(command)
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+        link.close()
+    return score.figures()

@@ -1,0 +1,15 @@
+"""What tests on a bus of this process share."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.can.in_process import Flaws
+
+
+@pytest.fixture
+def flaws(monkeypatch: pytest.MonkeyPatch) -> Flaws:
+    """Every link that is opened from now on is on a virtual bus that fails as they say."""
+    flaws = Flaws()
+    monkeypatch.setattr("protocol.can_link.can.Bus", flaws.bus)
+    return flaws

@@ -1,0 +1,194 @@
+"""The bridge between a real Zenoh and a bus in this process, where the test is the node: when it trips, and why.
+
+That a node trips, is silent, or comes back is tried on real processes too; here the node says whatever a test wants, at
+the moment it wants.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from plant_emulator.can_bridge import Bridge
+from plant_emulator.settings import PlantSettings
+from protocol import topics
+from protocol.can_link import CanLink, Heartbeat, fingerprint, number_of
+from protocol.clock import LoopSettings
+from protocol.frames import WireSpec
+from protocol.messages import Claim, Event, Grant, Refusal, Release
+from protocol.role import Role
+from protocol.states import PlantState, TripCause
+from protocol.verbs import Answer, Ask
+from tests.can.in_process import virtual
+from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
+
+WIRE = WireSpec()
+LOOP = LoopSettings(realtime="off")
+OURS = fingerprint(WIRE, LOOP.period_ns, lockstep=False)
+SLACK_S = 0.3
+"""For a test that other work on the machine keeps waiting: it must run to notice anything."""
+
+
+class Ends:
+    """A bridge in a thread, a node that is the test, and a controller that is the test."""
+
+    def __init__(self, gathering: Gathering) -> None:
+        bus = virtual()
+        self.role = Role("plant", "aero", gathering.settings, {})
+        # No watchdog here: it counts real time, and the relay's is tried without.
+        self._bridge = Bridge(self.role, LOOP, WIRE, PlantSettings(watchdog_s=10), bus)
+        self.node = CanLink(bus, WIRE, "plant")
+        self.events: list[Event] = []
+        self._session = gathering.join()
+        self._session.declare_subscriber(topics.key("event", "aero"), self._hear)
+        alive = threading.Event()
+        token = topics.key("alive", "aero", role="plant")
+        self._session.liveliness().declare_subscriber(token, lambda _: alive.set(), history=True)
+        self._sessions = 0
+        self._says = Heartbeat(PlantState.IDLE, 0, OURS)
+        self._over = threading.Event()
+        self._threads = [threading.Thread(target=run) for run in (self._bridge.run, self._beat)]
+        for thread in self._threads:
+            thread.start()
+        assert alive.wait(PATIENCE_S)
+
+    def close(self) -> None:
+        """End the bridge, and leave."""
+        self._over.set()
+        self.role.stop.set()
+        for thread in self._threads:
+            thread.join()
+        self.role.zenoh.close()
+        self.node.close()
+
+    def say(self, state: PlantState, cause: TripCause | None = None, mark: bytes = OURS) -> None:
+        """Let the node say this, at once and from now on."""
+        self._says = Heartbeat(state, number_of(cause), mark)
+        self.node.beat(self._says)
+
+    def fall_silent(self) -> None:
+        """Let the node say nothing more."""
+        self._over.set()
+        self._threads[1].join()
+
+    def claim(self) -> Grant | Refusal:
+        """Ask for the plant."""
+        self._sessions += 1
+        claim = Claim(
+            controller="a",
+            session=f"of-a-{self._sessions}",
+            period_ns=LOOP.period_ns,
+            lockstep=False,
+            auto_arm=True,
+            wire=WIRE,
+        )
+        payload = self._ask("claim", claim.encode())
+        return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
+
+    def hold(self) -> None:
+        """Have the plant, and let the node say so."""
+        eventually("the grant", lambda: isinstance(self.claim(), Grant))
+        eventually("granted on the bus", lambda: self.heard_state() is PlantState.GRANTED)
+        self.say(PlantState.GRANTED)
+        time.sleep(0.15)  # what a node says in the first 0.1 s may be of before the session
+
+    def release(self) -> bool:
+        """Give the plant back."""
+        release = Release(session=f"of-a-{self._sessions}")
+        return Answer.model_validate_json(self._ask("release", release.encode())).done
+
+    def stop(self) -> Answer:
+        """As `aeroloop op stop`."""
+        return Answer.model_validate_json(self._ask("stop", Ask().encode()))
+
+    def heard_state(self) -> PlantState | None:
+        """What the node last heard from the bridge."""
+        return self.node.heard.state if self.node.heard else None
+
+    def trip(self) -> str:
+        """Why the bridge tripped, once it has; the node has been told to rest then."""
+        eventually("the trip", lambda: any(event.kind == "tripped" for event in self.events))
+        eventually("idle on the bus", lambda: self.heard_state() is PlantState.IDLE)
+        return next(event.text for event in self.events if event.kind == "tripped")
+
+    def _ask(self, topic: str, payload: bytes) -> bytes:
+        for reply in self._session.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+        raise AssertionError(f"nobody answers {topic!r}")
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
+
+    def _beat(self) -> None:
+        while not self._over.wait(0.1):
+            self.node.beat(self._says)
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    """Both ends of a bridge."""
+    with Gathering() as gathering:
+        ends = Ends(gathering)
+        try:
+            yield ends
+        finally:
+            ends.close()
+
+
+def test_it_tells_the_node_of_a_session_its_number_and_its_end(ends: Ends) -> None:
+    eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
+    for number in (1, 2):
+        ends.hold()
+        assert ends.node.heard is not None
+        assert ends.node.heard[1:3] == (number, OURS)
+        assert ends.release()
+        eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
+        ends.say(PlantState.IDLE)
+    ends.hold()
+    ends.role.stop.set()
+    eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
+
+
+def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
+    ends.hold()
+    assert ends.stop().done
+    assert ends.trip() == "stopped by an operator: 0 V"
+    refusal = ends.claim()
+    assert isinstance(refusal, Refusal)
+    assert "stopped by an operator" in refusal.reason
+
+
+@pytest.mark.parametrize("cause", [TripCause.ENVELOPE, TripCause.INVALID_COMMAND, TripCause.SENSORS, None])
+def test_it_trips_when_the_node_has_and_tells_the_nodes_cause(ends: Ends, cause: TripCause | None) -> None:
+    ends.hold()
+    ends.say(PlantState.TRIPPED, cause)
+    assert ends.trip() == f"node 1 tripped: {cause or 'no cause told'}: 0 V"
+    ends.hold()  # armed by the claim; that the node was tripped before is not held against it
+    assert sum(event.kind == "tripped" for event in ends.events) == 1
+
+
+def test_it_trips_when_the_node_knows_nothing_of_the_session_any_more(ends: Ends) -> None:
+    ends.hold()
+    ends.say(PlantState.IDLE)
+    assert ends.trip() == "node 1 was started again: 0 V"
+
+
+def test_it_trips_when_another_node_stands_there_and_refuses_claims_for_it(ends: Ends) -> None:
+    ends.hold()
+    ends.say(PlantState.GRANTED, mark=bytes(7))
+    assert ends.trip() == "node 1 has another wire spec now: 0 V"
+    assert ends.claim() == Refusal(reason="node 1 has another wire spec, period or lockstep setting than the bridge")
+
+
+def test_it_trips_when_the_node_falls_silent_and_refuses_claims_for_it(ends: Ends) -> None:
+    ends.hold()
+    ends.fall_silent()
+    silent_since = time.monotonic()
+    assert ends.trip().startswith("node 1 has been silent for ")
+    assert time.monotonic() - silent_since < 0.5 + SLACK_S
+    assert ends.claim() == Refusal(reason="node 1 is silent on the bus")
