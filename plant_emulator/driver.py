@@ -21,6 +21,8 @@ from protocol.links import Arrival
 from protocol.states import TripCause
 
 IDLE_WAIT_S: Final = 0.02
+ANSWER_SHARE: Final = 0.6
+"""Hardware's sample is answered within this share of the period, or in the next one."""
 
 
 class Driver:
@@ -87,10 +89,17 @@ class Driver:
             k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
             timing.woke(grid.due_ns if grid else time.monotonic_ns())
             front.take_inbox()
-            self._tick(front.link.take() if front.link else None, k)
+            self._tick(self._command(), k)
             if self.endpoint.session:
                 front.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
             timing.done()
+
+    def _command(self) -> Arrival | None:
+        """The command for this period. Hardware lets it act as soon as it is there, so it is worth a wait."""
+        link = self._front.link
+        if link is None:
+            return None
+        return link.wait(ANSWER_SHARE * self._loop.period) if self._plant.paces else link.take()
 
     def _run_lockstep(self) -> None:
         arrival = None

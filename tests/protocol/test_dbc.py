@@ -119,7 +119,7 @@ def assert_tells(signal: Signal, spec: SignalSpec, code: float, told: Any) -> No
     elif code == -(2 ** (spec.bits - 1)):
         assert isnan(value)
         assert told == "no_valid_value"
-    elif spec.deadzone is None or isclose(spec.deadzone, quantizer_of(spec).step / 2, rel_tol=1e-12):
+    elif spec.deadzone is None or isclose(spec.deadzone, spec.limit / (2**spec.bits - 1), rel_tol=1e-12):
         assert abs(told - value) <= ROUNDING * abs(value)
     else:
         assert told == code

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from itertools import accumulate
-from math import atan2, degrees, radians
+from math import acos, atan2, degrees, hypot, radians
 from typing import Any, Final, TypeVar
 
 import pytest
@@ -619,6 +619,34 @@ def test_limits_that_are_read_again_hold_for_what_is_asked_next(loop: Loop) -> N
 def test_a_configured_reference_beyond_the_limits_is_told_and_ends_nothing(loop: Loop) -> None:
     loop.role.later(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 70.0, 0.0))))  # as reload.py's SIGHUP does
     loop.tick()
+
+
+far = st.tuples(st.just(0.0), st.integers(-65, 65).map(float), st.integers(-180, 180).map(float))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    sent=st.lists(st.tuples(far, st.integers(1, 400)), min_size=2, max_size=10),
+    within_s=st.sampled_from([0.02, 0.2, 1.0]),
+)
+def test_whatever_streams_however_quickly_the_limits_hold(
+    sent: list[tuple[tuple[float, float, float], int]], within_s: float
+) -> None:
+    """Set-points anywhere, some of them too tilted, up to 0.8 s from each other, most in the middle of the last."""
+    loop = Loop(Stream(within_s=within_s), ControllerSettings())
+    loop.begin()
+    for attitude, ticks in [*sent, ((0.0, 0.0, 0.0), 1500)]:
+        loop.raw(Setpoint(attitude=attitude).encode())
+        for _ in range(ticks):
+            loop.tick()
+            # The body is level and at rest, so these errors are ω_d and q_d. Ways are sampled, which may miss 0.4 % of a
+            # rate (tests/service/test_motion.py), and of a tilt, at such a rate, less than a hundredth of a degree.
+            assert hypot(*loop.controller.rate_error) <= 1.0 * 1.004
+            _, x, y, _ = loop.controller.desired
+            assert degrees(acos(1 - 2 * (x * x + y * y))) <= 60.01
+    for change in loop.changes()[1:]:
+        assert change.within_s <= 60.0  # and it gets there
+    loop.assert_it_runs_again()
 
 
 # The log

@@ -427,6 +427,10 @@ def test_what_stays_within_the_limits_is_not_refused(reference: Reference, limit
     [
         Sinusoid(amplitude=(0.0, 80.0, 1.0), frequency=(0.0, 0.7, 0.7 / 32)),  # sampled where pitch is 0, each time
         Sinusoid(amplitude=(0.0, 80.0, 0.0), frequency=(0.0, 0.001, 0.0)),  # beyond 60° only after 848 s
+        pytest.param(
+            Sinusoid(amplitude=(0.0, 360.0, 1.0), frequency=(0.0, 0.15, 0.0005)),
+            marks=pytest.mark.xfail(strict=True, reason="its bounds are level again, on the far side of a loop"),
+        ),
     ],
 )
 def test_a_sinusoid_that_tilts_too_far_at_any_time_is_refused(reference: Sinusoid) -> None:
