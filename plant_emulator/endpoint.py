@@ -63,6 +63,7 @@ class Endpoint(Tenancy):
         self._first_command = max(1, round(FIRST_COMMAND_S * 1e9 / period_ns))
         self._tick = -1
         self._session_tick = 0  # tick of the session's first measurement
+        self._unmeasured_yet = False
         self._fresh_tick = 0  # tick of the last fresh command, or of the grant
         self._unmeasured = [False] * COUNTERS  # whether the last measurement of each counter had no valid value
         self._echo = -1  # the last fresh command's echo
@@ -100,6 +101,8 @@ class Endpoint(Tenancy):
             self._tick = k
         if self.session is None:
             return None
+        if self._unmeasured_yet:
+            self._unmeasured_yet, self._session_tick = False, self._tick
         seen = self.plant.measure()
         if self._guard is not None and (trip := self._guard.check(seen, self._voltages)) is not None:
             self._trip(*trip)
@@ -171,6 +174,7 @@ class Endpoint(Tenancy):
             self._guard.reset()
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
+        self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
         self._echo = self._answered = -1
 
     def _rest(self) -> None:

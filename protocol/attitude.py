@@ -9,7 +9,7 @@ The paper's letters are kept: S, T and R are its matrices.
 
 from __future__ import annotations
 
-from math import asin, atan2, copysign, hypot, pi, sqrt
+from math import acos, asin, atan2, copysign, hypot, pi, sqrt
 from typing import TypeAlias
 
 import casadi as ca
@@ -99,3 +99,8 @@ def received_quaternion(x: float, y: float, z: float, last: Quaternion) -> Quate
 def angle(x: float, y: float, z: float) -> float:
     """The rotation angle in rad, 0…π, of an error quaternion's vector part ε̃."""
     return 2 * asin(min(1.0, hypot(x, y, z)))
+
+
+def distance(p: Quaternion, q: Quaternion) -> float:
+    """The angle in rad, 0…π, of the rotation between two attitudes."""
+    return 2 * acos(min(1.0, abs(sum(a * b for a, b in zip(p, q, strict=True)))))

@@ -132,6 +132,10 @@ class Change(Message):
     gains: Gains | None = Field(default=None, description="null: as before")
     reference: Reference | None = Field(default=None, description="null: as before")
     within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: at once [s]")
+    start: Angles | None = Field(
+        default=None,
+        description="where the way to the reference starts, at rest; null: where one was [deg]",
+    )
     ease_s: float = Field(default=0.0, description="time to let the acceleration of before go, before that [s]")
 
 

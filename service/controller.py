@@ -106,6 +106,14 @@ class Controller:
         self.voltages = voltages
         return self._write(counter, [encode(u) for encode, u in zip(self._encode, voltages, strict=True)])
 
+    def attitude_of(self, frame: bytes) -> Quaternion | None:
+        """The attitude that a measurement frame says; None if it is malformed or says no valid value."""
+        read = self._read(frame)
+        if read is None:
+            return None
+        x, y, z = (self._attitude_level(code) for code in read[1][:3])
+        return received_quaternion(x, y, z, IDENTITY) if x + y + z == x + y + z else None
+
     def set_gains(self, gains: Gains) -> None:
         """Use other gains from the next tick on; what is None stays as it is."""
         for name in ("C1", "C2", "Gamma"):
@@ -117,9 +125,8 @@ class Controller:
         if change.gains is not None:
             self.set_gains(change.gains)
         if change.reference is not None:
-            self.motion.follow(
-                Plan.of(change.reference), change.tick * self.period, change.within_s, ease_s=change.ease_s
-            )
+            plan, t = Plan.of(change.reference), change.tick * self.period
+            self.motion.follow(plan, t, change.within_s, ease_s=change.ease_s, start=change.start)
 
     def resume(self, frame: bytes, k: int, sign: int, damping_estimate: Vector, attitude_error: Vector) -> None:
         """Take up a session in its middle: the state after tick k, as telemetry told it, with its measurement."""

@@ -157,7 +157,7 @@ class Daemon:
             measured = k + 1 if read is None else ticks.advance(read[0], arrival.published_ns)
             if measured is None:
                 continue
-            live.before_tick(measured)
+            live.before_tick(measured, arrival.frame)
             if not self._may_go_on():
                 break
             command = controller.tick(arrival.frame, measured)

@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from math import radians
+from math import degrees, radians
+from typing import Final
 
 import zenoh
 from pydantic import ValidationError
 
 from protocol import topics
+from protocol.attitude import Vector, distance, to_euler
 from protocol.role import Role
 from protocol.verbs import Answer, Change, Gains, Hold, Points, Reference, Setpoint, Stream, Track
 from service.controller import Controller
 from service.law import LawSettings
 from service.reference import FollowError, Limits, Plan
 from service.settings import ControllerSettings
+
+START_S: Final = 1.0
+"""The least time for the way to a reference that is far when a session begins [s]."""
 
 
 def gains_of(law: LawSettings) -> Gains:
@@ -67,6 +72,7 @@ class Live:
         self._controller: Controller | None = None
         self._session = ""
         self._k = 0
+        self._placed = True
         self._stream = reference if isinstance(reference, Stream) else None
         self._heard = 0.0
         self._setpoint: tuple[Hold, Plan] | None = None  # the newest that no tick has taken yet
@@ -75,6 +81,7 @@ class Live:
 
     def configure(self, settings: ControllerSettings) -> None:
         """Take other limits."""
+        self._settings = settings
         self._limits = Limits(settings.max_reference_rate, radians(settings.max_reference_tilt_deg), self._rolls)
 
     def serve(self) -> None:
@@ -108,18 +115,44 @@ class Live:
         self._controller, self._session = controller, session
         controller.set_gains(self._gains)
         controller.motion.follow(Plan.of(self._reference), 0.0, 0.0)
+        self._placed = False
         self._role.publish("change", Change(session=session, tick=0, gains=self._gains, reference=self._reference))
 
     def end(self) -> None:
         """The session is over."""
         self._controller = None
 
-    def before_tick(self, k: int) -> None:
-        """Take what came since the last tick; it holds from tick k on."""
+    def before_tick(self, k: int, frame: bytes) -> None:
+        """Take what came since the last tick; it holds from tick k on. The frame is the measurement of that tick."""
         self._k = k
+        if not self._placed:
+            self._place(frame)
         self._role.take_inbox()
         if self._stream is not None:
             self._follow_stream(self._stream)
+
+    def _place(self, frame: bytes) -> None:
+        """Where the body is far from its reference as a session begins, go there from where it is.
+
+        A session that was lost in mid-flight begins again with the reference's own time from 0; to jump back there
+        would hold the motors at their limit until the plant trips.
+        """
+        controller = self._running()
+        attitude = controller.attitude_of(frame)
+        if attitude is None:
+            return
+        self._placed = True
+        roll, pitch, yaw = (degrees(angle) for angle in to_euler(attitude))
+        start = (roll if self._rolls else 0.0, pitch, yaw)
+        target, t = Plan.of(self._reference), self._time
+        away = degrees(distance(attitude, controller.motion.attitude(t)))
+        if away <= self._settings.start_within_deg:
+            return
+        within_s, _ = controller.motion.time_to_reach(target, t, START_S, self._limits, start)
+        controller.motion.follow(target, t, within_s, start=start)
+        self._tell(reference=self._reference, within_s=within_s, start=start)
+        text = f"begins {away:.0f}° away from its reference: goes there within {within_s:.1f} s"
+        self._role.event("changed", text, self._session)
 
     # ── what can be asked ──
 
@@ -208,6 +241,7 @@ class Live:
         reference: Reference | None = None,
         within_s: float = 0.0,
         ease_s: float = 0.0,
+        start: Vector | None = None,
     ) -> None:
         change = Change(
             session=self._session,
@@ -216,5 +250,6 @@ class Live:
             reference=reference,
             within_s=within_s,
             ease_s=ease_s,
+            start=start,
         )
         self._role.publish("change", change)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import attitude
+from protocol.attitude import Quaternion, Vector
 from protocol.errors import AeroloopError
 from protocol.symbolic import Buffer, Compiled
 from protocol.verbs import Hold, Points, Reference, Sinusoid
@@ -27,7 +28,7 @@ Floats = NDArray[np.float64]
 
 POWERS: Final = 6
 _SAMPLES: Final = 65
-"""Of a quintic, whose rate is a polynomial of degree 4: the largest of so many is within 0.1 % of the maximum."""
+"""Of a quintic, whose rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
 _TURNS: Final = 8
 _MOST_SAMPLES: Final = 100_000
 _SLOWER: Final = 1.05
@@ -186,6 +187,9 @@ class Plan:
             )
         angle = self.samples().angle
         tilt = acos(max(-1.0, float((np.cos(angle[:, 0]) * np.cos(angle[:, 1])).min())))
+        # A swing beyond the limit passes through it, though its ends may be level again.
+        swings = (np.abs(self.amplitude) * (self.frequency > 0))[:, :2]
+        tilt = max(tilt, float(np.minimum(swings, pi).max()))
         if tilt > limits.tilt:
             raise FollowError(
                 f"that would tilt by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
@@ -242,6 +246,11 @@ def reference_function() -> ca.Function:
     )
 
 
+def at_rest(attitude: Vector) -> Angles:
+    """The state of a body that rests at roll, pitch, yaw [deg]. Shapes (1, 3)."""
+    return Angles(np.radians(np.array([attitude])), np.zeros((1, 3)), np.zeros((1, 3)))
+
+
 class Motion:
     """A reference as the loop follows it.
 
@@ -264,7 +273,14 @@ class Motion:
         self._function()
 
     def follow(
-        self, target: Plan, t: float, within_s: float, limits: Limits | None = None, *, ease_s: float = 0.0
+        self,
+        target: Plan,
+        t: float,
+        within_s: float,
+        limits: Limits | None = None,
+        *,
+        ease_s: float = 0.0,
+        start: Vector | None = None,
     ) -> None:
         """Follow another plan, reached from the present one within some time; its own time begins then.
 
@@ -274,16 +290,24 @@ class Motion:
             within_s: When to have reached it [s]; 0 jumps.
             limits: How far the way there may go; None for no limits.
             ease_s: Time to let the acceleration of now go before [s].
+            start: Roll, pitch, yaw to begin from, at rest, instead of the present plan [deg].
 
         Raises:
             FollowError: It goes further; nothing has changed then.
         """
-        plan = target.joined(self._here(t), t, within_s, ease_s)
+        here = self._here(t) if start is None else at_rest(start)
+        plan = target.joined(here, t, within_s, ease_s)
         if limits is not None and within_s:
             way = plan.piece(t + ease_s + within_s) + 1  # pieces, up to the target's first
             replace(plan, **{name: getattr(plan, name)[:way] for name in plan.__annotations__}).check(limits)
         self._plan = plan
         self._load(plan.piece(t))
+
+    def attitude(self, t: float) -> Quaternion:
+        """q_d at time t [s]."""
+        self.at(t)
+        w, x, y, z = self._function.outputs["q_d"]
+        return w, x, y, z
 
     def rest(self, t: float, within_s: float) -> Hold:
         """Where one comes to rest within some time, braking evenly."""
@@ -291,9 +315,11 @@ class Motion:
         roll, pitch, yaw = (degrees(float(angle)) for angle in here.angle[0] + here.rate[0] * within_s / 2)
         return Hold(attitude=(roll, pitch, yaw))
 
-    def time_to_reach(self, target: Plan, t: float, within_s: float, limits: Limits) -> tuple[float, float]:
+    def time_to_reach(
+        self, target: Plan, t: float, within_s: float, limits: Limits, start: Vector | None = None
+    ) -> tuple[float, float]:
         """How to reach a set-point within the rate limit: `within_s`, at least as given, and `ease_s` [s]."""
-        here = self._here(t)
+        here = self._here(t) if start is None else at_rest(start)
         least = within_s
         for ease_s in (0.0, least):
             within_s = least

@@ -32,6 +32,12 @@ class ControllerSettings(BaseModel):
     max_reference_tilt_deg: float = Field(
         default=60.0, gt=0, le=180, description="largest tilt that an operator's reference may ask for [deg]"
     )
+    start_within_deg: float = Field(
+        default=20.0,
+        ge=0,
+        le=360,
+        description="a session that begins further than this from its reference first goes there smoothly [deg]",
+    )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
 
 

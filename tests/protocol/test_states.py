@@ -226,6 +226,8 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         assert (sent is not None) == (self.session is not None)
         if sent is not None:
             valid = self.plant.seen is REST
+            if not self.sent:
+                self.first = self.k  # the first measurement has counter 0, also where ticks were skipped before it
             assert WIRE.measurement.unpack(sent) == (
                 (self.k - self.first) % COUNTERS,
                 (0,) * 6 if valid else NO_VALID_VALUE,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from itertools import accumulate
-from math import acos, atan2, degrees, hypot, radians
+from math import acos, atan2, degrees, hypot, radians, sin
 from typing import Any, Final, TypeVar
 
 import pytest
@@ -182,7 +182,7 @@ class Loop:
     def tick(self, codes: list[float] | None = None) -> bytes | None:
         """A measurement comes, at rest and level unless given, and is answered."""
         frame = WIRE.measurement.pack(self.k % COUNTERS, codes or [0.0] * 6)
-        self.live.before_tick(self.k)
+        self.live.before_tick(self.k, frame)
         command = self.controller.tick(frame, self.k)
         self.log[self.session].append((self.k, frame, command))
         self.k += 1
@@ -195,7 +195,7 @@ class Loop:
 
     def malformed(self) -> None:
         """Something comes that is no measurement; the daemon counts it as the one that was due."""
-        self.live.before_tick(self.k)
+        self.live.before_tick(self.k, b"junk")
         assert self.controller.tick(b"junk", self.k) is None
 
     # The operator
@@ -564,6 +564,37 @@ def test_the_way_to_a_set_point_never_tilts_too_far(streaming: Loop) -> None:
 # The next session, and a configuration that is read again
 
 
+def turned(yaw: float) -> list[float]:
+    """The codes of a body at rest that has yawed [deg]."""
+    attitude, rate = WIRE.attitude.quantizer(), WIRE.rate.quantizer()
+    return [*(attitude.encode(x) for x in (0.0, 0.0, sin(radians(yaw) / 2))), *(rate.encode(0.0) for _ in range(3))]
+
+
+def test_a_session_that_begins_far_from_its_reference_goes_there_from_where_the_body_is(loop: Loop) -> None:
+    loop.ask("track", Track(reference=LEVEL, within_s=0.2))
+    loop.run(0.5)
+    loop.end()
+    loop.begin()
+    loop.tick(turned(90.0))
+    (first, way) = loop.changes()
+    assert (first.tick, way.tick, way.reference) == (0, 0, LEVEL)
+    assert way.start == pytest.approx((0.0, 0.0, 90.0), abs=1.0)  # a level of ε is 0.9° wide here
+    # From rest to rest a quintic is at most 15/8 of its mean speed.
+    assert way.within_s == pytest.approx(radians(90) * 15 / 8 / 1.0, rel=0.1)
+    assert loop.yaw() == pytest.approx(90.0, abs=1.0)
+    for _ in range(round(way.within_s / PERIOD) + 2):
+        loop.tick(turned(90.0))
+    assert loop.yaw() == pytest.approx(0.0, abs=1e-9)
+    assert len(loop.changes()) == 2
+
+
+def test_a_session_that_begins_near_its_reference_follows_it_at_once(loop: Loop) -> None:
+    loop.end()
+    loop.begin()
+    loop.tick(turned(15.0))
+    assert [change.tick for change in loop.changes()] == [0]
+
+
 def test_the_next_session_begins_with_the_gains_and_the_reference_of_now(loop: Loop) -> None:
     loop.ask("set_gains", Gains(C2=(0.4, 0.4, 0.4)))
     loop.ask("track", Track(reference=SWING, within_s=0.5))
@@ -639,7 +670,7 @@ def test_whatever_streams_however_quickly_the_limits_hold(
         loop.raw(Setpoint(attitude=attitude).encode())
         for _ in range(ticks):
             loop.tick()
-            # The body is level and at rest, so these errors are ω_d and q_d. Ways are sampled, which may miss 0.4 % of a
+            # The body is level and at rest, so its rate's error is ω_d. Ways are sampled, which may miss 0.4 % of a
             # rate (tests/service/test_motion.py), and of a tilt, at such a rate, less than a hundredth of a degree.
             assert hypot(*loop.controller.rate_error) <= 1.0 * 1.004
             _, x, y, _ = loop.controller.desired
