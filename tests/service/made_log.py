@@ -1,0 +1,107 @@
+"""A log made without a network: a closed loop in lockstep, its messages written as the recorder writes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from plant_emulator.endpoint import Endpoint
+from protocol import topics
+from protocol.messages import Claim, Contract, Telemetry
+from protocol.verbs import Change, Gains, Hold, Reference
+from service.config import Settings, load
+from service.controller import Controller
+from service.recorder import LogFile, Taken
+from service.reference import Plan
+
+START_NS = 1_800_000_000_000_000_000
+VEHICLE, SESSION = "aero", "s1"
+
+
+def lockstep() -> Settings:
+    return load(overrides=["loop.lockstep=true"])
+
+
+def make_log(
+    path: Path,
+    ticks: int,
+    *,
+    settings: Settings | None = None,
+    begin: int = 0,
+    changes: dict[int, tuple[Gains | None, Reference | None]] | None = None,
+    spoil: int | None = None,
+    chunk_every: int = 100,
+) -> None:
+    """Write a log.
+
+    Args:
+        path: Where.
+        ticks: How many ticks the loop runs.
+        settings: Its configuration.
+        begin: The tick at which the recorder comes.
+        changes: Gains and reference that an operator sets, by tick.
+        spoil: The tick whose command is not logged as it was sent.
+        chunk_every: Close a chunk after so many ticks.
+    """
+    settings = settings or lockstep()
+    wire, loop, changes = settings.wire, settings.loop, changes or {}
+    endpoint = Endpoint(settings.plant.build(loop.period), wire, loop.period_ns, lockstep=True)
+    endpoint.claim(
+        Claim(controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
+    )
+    controller = Controller(wire, settings.law, settings.reference, loop.period)
+    log = LogFile(path, chunk_s=3600)
+
+    def write(name: str, payload: bytes, at_ns: int) -> None:
+        key = topics.key(name, VEHICLE, session=SESSION, role="controller")
+        log.add(Taken(key, payload, at_ns, at_ns))
+
+    contract = Contract(role="controller", vehicle=VEHICLE, host="h", versions={}, config=settings.contract())
+    log.add_contract(topics.key("contract", VEHICLE, role="controller"), contract.encode())
+    first = Change(session=SESSION, tick=0, gains=controller.gains, reference=settings.reference)
+    write("change", first.encode(), START_NS - 1)
+    measurement = endpoint.tick(None, 0)
+    for k in range(ticks):
+        assert measurement is not None
+        at = START_NS + k * loop.period_ns
+        if k in changes:
+            gains, reference = changes[k]
+            change = Change(session=SESSION, tick=k, gains=gains, reference=reference, within_s=1.0)
+            if gains is not None:
+                controller.set_gains(gains)
+            if reference is not None:
+                controller.motion.follow(Plan.of(reference), k * loop.period, 1.0)
+            write("change", change.encode(), at)
+        command = controller.tick(measurement, k)
+        assert command is not None
+        if k >= begin:
+            write("measurement", measurement, at)
+            logged = bytes([command[0], command[1] ^ 0x01]) if k == spoil else command
+            write("command", logged, at + 300_000)
+            if k % 10 == 0:
+                write("telemetry", _telemetry(controller).encode(), at + 300_001)
+        measurement = endpoint.tick(command, k + 1)
+        if k % chunk_every == chunk_every - 1:
+            log.chunk_s = 0
+            log.flush_when_due()
+    log.close()
+
+
+def _telemetry(controller: Controller) -> Telemetry:
+    return Telemetry(
+        session=SESSION,
+        tick=controller.tick_index,
+        counter=controller.counter,
+        attitude_error=controller.attitude_error,
+        rate_error=controller.rate_error,
+        desired=controller.desired,
+        damping_estimate=controller.damping_estimate,
+        voltages=tuple(controller.voltages),
+        sign=controller.sign,
+    )
+
+
+AN_OPERATORS_WORDS: dict[int, tuple[Gains | None, Reference | None]] = {
+    120: (Gains(C2=(0.2, 0.2, 0.2)), None),
+    250: (None, Hold(attitude=(0.0, 5.0, -10.0))),
+    400: (Gains(Gamma=(0.01, 0.01, 0.01)), load().reference),
+}
