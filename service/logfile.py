@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -23,6 +24,7 @@ from service.mcap_records import (
     NotMcapError,
     metadata,
     records,
+    summary,
 )
 
 Which = tuple[str, str]
@@ -91,7 +93,7 @@ class LogFiles:
                     progress((done + reached) / self._size)
 
             wanted: dict[int, topics.Address] = {}
-            for record in records(path, None, told):
+            for record in chain(summary(path), records(path, None, told)):
                 if record.opcode == MESSAGE:
                     message = Message.read(record.content)
                     address = wanted.get(message.channel)
@@ -110,7 +112,7 @@ class LogFiles:
         changes: dict[int, str] = {}
         damages: list[Damage] = []
         try:
-            for record in records(path, damages):
+            for record in chain(summary(path), records(path, damages)):
                 if record.opcode == MESSAGE:
                     if changes or not first:
                         message = Message.read(record.content)

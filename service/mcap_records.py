@@ -30,11 +30,15 @@ DATA_END: Final = 0x0F
 CONTRACT_METADATA: Final = "aeroloop.contract"
 """What our own logs call the metadata record with a role's contract, as JSON under the key `json`."""
 
+CHUNK_BYTES: Final = 64 * 1024
+"""A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
+
 MAX_RECORD: Final = 1 << 30
 """A record said to be longer is damage: nobody writes a gigabyte at once."""
 
 _HEAD: Final = struct.Struct("<BQ")
 _CHUNK: Final = struct.Struct("<QQQI")
+_FOOTER: Final = struct.Struct("<QQI")
 _MESSAGE: Final = struct.Struct("<HIQQ")
 
 
@@ -114,6 +118,29 @@ def records(
                 return
             else:
                 yield record
+
+
+def summary(path: Path) -> list[Record]:
+    """Schemas and channels as the end of a file repeats them; none if it has no whole end.
+
+    They stand in the chunk that first used them, too; this helps where that chunk is damaged.
+    """
+    size = path.stat().st_size
+    end = _HEAD.size + _FOOTER.size + len(MAGIC)
+    if size < end + len(MAGIC):
+        return []
+    with path.open("rb") as file:
+        file.seek(size - end)
+        opcode, _ = _HEAD.unpack(file.read(_HEAD.size))
+        start, _, _ = _FOOTER.unpack(file.read(_FOOTER.size))
+        if opcode != FOOTER or file.read() != MAGIC or not 0 < start < size:
+            return []
+        file.seek(start)
+        found = []
+        while (record := _next(file, [])) is not None and record.opcode != FOOTER:
+            if record.opcode in (SCHEMA, CHANNEL):
+                found.append(record)
+        return found
 
 
 def metadata(content: bytes) -> tuple[str, dict[str, str]]:

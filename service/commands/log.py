@@ -17,6 +17,7 @@ from service.commands.common import (
 
 if TYPE_CHECKING:
     from service.figures import Figures
+    from service.recover import Recovery
     from service.replay import SessionReplay
 
 group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
@@ -93,3 +94,27 @@ def replay(
         replay_table(replayed)
     if not overrides and any(session.differing for session in replayed):
         raise typer.Exit(1)
+
+
+@group.command()
+def recover(
+    broken: Annotated[Path, typer.Argument(help="A log that was cut or damaged; it is not changed.")],
+    out: Annotated[Path, typer.Argument(help="The new file.")],
+    json: Json = False,
+) -> None:
+    """Write everything that is whole in a broken log into a new one, and say what was lost."""
+
+    def run() -> Recovery:
+        from service.display import share_bar
+        from service.recover import recover
+
+        with share_bar("recovering", hidden=json) as update:
+            return recover(broken, out, update)
+
+    recovery = guarded(run)
+    if json:
+        typer.echo(recovery.model_dump_json(indent=2))
+    else:
+        typer.echo(f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels")
+        for line in recovery.lost:
+            typer.echo(f"not recovered, {line}")

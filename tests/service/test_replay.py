@@ -32,6 +32,12 @@ def test_every_command_of_a_log_is_computed_again_byte_for_byte(tmp_path: Path) 
     assert session.first_difference is None
 
 
+def test_the_golden_log_gives_the_commands_that_it_always_gave() -> None:
+    """Recorded once, with an operator's words in it: whatever changes the law's bytes shows here."""
+    session = replayed(Path(__file__).parent / "golden.mcap")
+    assert (session.first_tick, session.commands, session.differing) == (0, 500, 0)
+
+
 def test_what_an_operator_changed_is_changed_in_the_replay_at_the_same_tick(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
     session = replayed(tmp_path / "a.mcap")
