@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from plant_emulator.plant import State
-from plant_emulator.quanser_usb import Board, Channels, Counts, Doubles, Lines
+from plant_emulator.quanser_interface import Board, Channels, Counts, Doubles, Lines
 from plant_emulator.settings import PlantSettings
 
 BOARDS: Final = {"quanser_aero2_usb": (2048, 2048, 2880, 4096), "quanser_aero_usb": (2048, 2048, 2048, 4096)}

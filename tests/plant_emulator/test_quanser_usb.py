@@ -17,12 +17,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from plant_emulator import quanser_fake, quanser_usb
+from plant_emulator import quanser_fake, quanser_interface, quanser_usb
 from plant_emulator.emulated import EmulatedPlant
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement, Plant
 from plant_emulator.quanser_fake import BufferOverflowMode, FakeQuanser, HILError, MisuseError
-from plant_emulator.quanser_usb import COLOURS, Hardware, QuanserError, QuanserPlant, QuanserSettings
+from plant_emulator.quanser_interface import Hardware, QuanserError
+from plant_emulator.quanser_usb import COLOURS, QuanserPlant, QuanserSettings
 from plant_emulator.sensors import FilteredDerivative, SensorSettings
 from plant_emulator.settings import PlantSettings
 from plant_emulator.wind import WindSettings
@@ -221,7 +222,7 @@ def test_a_package_whose_libraries_are_missing_is_told_too(monkeypatch: pytest.M
     def fail(name: str) -> ModuleType:
         raise OSError(f"libhil.so not found for {name}")
 
-    monkeypatch.setattr(quanser_usb, "import_module", fail)
+    monkeypatch.setattr(quanser_interface, "import_module", fail)
     with pytest.raises(QuanserError, match=r"libhil\.so not found"):
         QuanserPlant(QuanserSettings(), PERIOD)
 
