@@ -134,13 +134,14 @@ class Bridge:
         self._reopen_due = 0.0
         self._told = self._relay.state
         self._passed = 0
+        self._machine_notes: list[str] = []
         self._granted_ns = 0
 
     def run(self) -> None:
         """Run until the role is told to stop; then the node is released, and a last status told."""
         presence, relay = self._presence, self._relay
         if not self._loop.lockstep:
-            presence.notes = prepare_process(self._loop)
+            presence.notes = self._machine_notes = prepare_process(self._loop)
         presence.serve()
         try:
             while not self._role.stop.is_set():
@@ -153,6 +154,9 @@ class Bridge:
                 relay.watch(time.monotonic_ns())
                 self._watch_node()
                 self._follow()
+                if self._bus.errors or self._bus.refused:
+                    count = f"the bus: {self._bus.errors} errors, {self._bus.refused} malformed frames"
+                    presence.notes = [*self._machine_notes, count]
                 presence.after_tick(self._passed - 1)
         finally:
             if relay.session is not None:

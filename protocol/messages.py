@@ -143,6 +143,10 @@ class Status(Message):
         default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
     )
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
+    age_us: Percentiles | None = Field(
+        default=None,
+        description="controller: age of a measurement when it is used, last 10 s; between hosts, as their clocks agree",
+    )
     timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
 

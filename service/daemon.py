@@ -19,11 +19,11 @@ import zenoh
 from pydantic import ValidationError
 
 from protocol import topics
-from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
+from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, TickGrid, prepare_process
 from protocol.errors import AeroloopError
 from protocol.frames import TickCounter, WireSpec
 from protocol.links import Arrival, ZenohLink
-from protocol.messages import Status, Telemetry, report
+from protocol.messages import Status, Telemetry, report, summary
 from protocol.role import Role
 from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from protocol.verbs import Answer, Ask, Reference
@@ -91,6 +91,7 @@ class Daemon:
         self._sent = self._received = self._skipped = self._refused = self._saturated = 0
         self._notes: list[str] = []
         self._timing: LoopTiming | None = None
+        self._age = RollingHistogram()
         self._status_due = 0
         self._status_ticks = 0
         self._status_time = time.monotonic()
@@ -152,6 +153,7 @@ class Daemon:
             if timing:
                 timing.woke(self._grid.due_ns if self._grid else arrival.at_ns)
             heard = time.monotonic()
+            self._age.add(max(0, time.time_ns() - arrival.published_ns))
             read = self._wire.measurement.unpack(arrival.frame)
             # What is malformed counts as the measurement that was due, and is refused by the controller.
             measured = k + 1 if read is None else ticks.advance(read[0], arrival.published_ns)
@@ -320,6 +322,7 @@ class Daemon:
 
     def _publish_status(self) -> None:
         now = time.monotonic()
+        self._age.turn_when_due()
         self._role.status(
             Status(
                 role=self._role.role,
@@ -333,6 +336,7 @@ class Daemon:
                 sent=self._sent,
                 refused=self._refused + self._controller.refused + self._live.refused,
                 saturated=self._saturated + self._controller.saturated,
+                age_us=summary(self._age.recent()),
                 timing=report(self._timing) if self._timing else None,
                 notes=self._notes,
             )

@@ -102,10 +102,12 @@ def _flight(vehicle: Vehicle) -> Text:
 
 
 def _roles(vehicle: Vehicle) -> Table:
-    table = Table("role", "state", "rate", "skipped", "latency", "wake-up", "age", "", box=None, pad_edge=False)
+    table = Table(
+        "role", "state", "rate", "skipped", "latency", "sample age", "wake-up", "told", "", box=None, pad_edge=False
+    )
     for role, (heard, status) in sorted(vehicle.statuses.items()):
         latency, timing = status.latency_us, status.timing
-        age = time.monotonic() - heard
+        age, sample = time.monotonic() - heard, status.age_us
         wake = timing.recent_wake if timing else None
         table.add_row(
             role,
@@ -113,8 +115,9 @@ def _roles(vehicle: Vehicle) -> Table:
             f"{status.rate_hz:.0f}/s",
             str(status.skipped),
             f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+            f"{sample.p50:.0f}/{sample.p99:.0f} µs" if sample else "–",
             f"{wake.p50:.0f}/{wake.p99:.0f} µs" if wake else "–",
-            f"{age:.1f} s",
+            f"{age:.1f} s ago",
             status.cause or "",
             style="" if age < SILENT_S else "dim",
         )
