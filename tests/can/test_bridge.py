@@ -163,7 +163,7 @@ def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
     assert "stopped by an operator" in refusal.reason
 
 
-@pytest.mark.parametrize("cause", [TripCause.ENVELOPE, TripCause.INVALID_COMMAND, TripCause.SENSORS, None])
+@pytest.mark.parametrize("cause", [TripCause.ENVELOPE, None])
 def test_it_trips_when_the_node_has_and_tells_the_nodes_cause(ends: Ends, cause: TripCause | None) -> None:
     ends.hold()
     ends.say(PlantState.TRIPPED, cause)

@@ -145,12 +145,13 @@ def test_in_lockstep_the_figures_are_those_of_the_experiment_to_the_last_bit(
     assert figures.trips == []
 
 
-@pytest.mark.parametrize(("interface", "settings"), BUSES)
+@pytest.mark.parametrize(("interface", "settings"), BUSES[1:])
 def test_in_real_time_it_tracks(tmp_path: Path, interface: str, settings: dict[str, Any]) -> None:
     """No more than twice the experiment's error, and half a degree in the end.
 
     Commands come a tick or two later than in lockstep, some ticks go unanswered where other work keeps a process
-    waiting, and most of the error is that of the start, which no command can mend sooner.
+    waiting, and most of the error is that of the start, which no command can mend sooner. On the first of the buses
+    service/contract proves the same.
     """
     with Loop(tmp_path, interface) as loop:
         loop.start({**PATIENT, **settings})

@@ -6,6 +6,7 @@ import json
 import re
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from hashlib import sha256
 from math import isinf
@@ -75,8 +76,8 @@ def both_ends(settings: CanSettings, wire: WireSpec = PAPER) -> Iterator[tuple[C
         with Stranger(settings) as stranger:
             yield plant, controller, stranger
     finally:
-        plant.close()
-        controller.close()
+        with ThreadPoolExecutor() as both:  # each waits for its receiver, up to 0.1 s
+            list(both.map(CanLink.close, (plant, controller)))
 
 
 # ── frames ──
