@@ -18,7 +18,7 @@ from protocol.messages import Status, Telemetry
 from service.bench import Bench, free_rendezvous, private_bus
 from service.config import Settings
 from service.figures import Figures
-from service.review import review
+from service.log.review import review
 
 REFRESH_S = 0.1
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from service.calibrate import Calibration
     from service.demo import Progress as DemoProgress
     from service.doctor import Diagnosis
+    from service.log.replay import SessionReplay
     from service.operate import Statuses
-    from service.replay import SessionReplay
     from service.soak import Soak
     from service.tables import Tables
 

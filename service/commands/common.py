@@ -145,7 +145,7 @@ def run_alone(run: Callable[[Event], None], *, quiet: bool, log_format: str, wit
 
 
 def _prepare(*, quiet: bool, log_format: str, with_parent: bool) -> None:
-    from service.logs import set_up_logging
+    from service.log_lines import set_up_logging
 
     set_up_logging(logging.WARNING if quiet else logging.INFO, as_json=log_format == "json")
     if with_parent:

@@ -17,8 +17,8 @@ from service.commands.common import (
 
 if TYPE_CHECKING:
     from service.figures import Figures
-    from service.recover import Recovery
-    from service.replay import SessionReplay
+    from service.log.recover import Recovery
+    from service.log.replay import SessionReplay
 
 group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
 
@@ -41,18 +41,18 @@ def review(
     json: Json = False,
 ) -> None:
     """Compute every figure of merit from logs alone, hold them to limits, draw the paper's figures."""
-    from service.limits import Limit
+    from service.log.limits import Limit
 
     limits = checked(lambda: [Limit.parse(text) for text in require or []])
 
     def run() -> Figures:
         from service.display import share_bar
-        from service.review import read
+        from service.log.review import read
 
         with share_bar("reading", hidden=json) as update:
             judged = read(*logs, keep=figures is not None, progress=update)
         if figures is not None:
-            from service.plots import draw_figures
+            from service.log.plots import draw_figures
 
             for path in draw_figures(judged.session, figures):
                 typer.echo(f"aeroloop: drew {path}", err=True)
@@ -78,7 +78,7 @@ def replay(
 
     def run() -> list[SessionReplay]:
         from service.display import share_bar
-        from service.replay import replay
+        from service.log.replay import replay
 
         with share_bar("replaying", hidden=json) as update:
             return replay(logs, overrides or [], update)
@@ -106,7 +106,7 @@ def recover(
 
     def run() -> Recovery:
         from service.display import share_bar
-        from service.recover import recover
+        from service.log.recover import recover
 
         with share_bar("recovering", hidden=json) as update:
             return recover(broken, out, update)

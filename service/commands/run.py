@@ -210,7 +210,7 @@ def recorder(
     settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
-        from service.recorder import Recorder
+        from service.log.recorder import Recorder
         from service.reload import reload_on_hangup
 
         recorder = Recorder(role, settings.recorder)

@@ -19,7 +19,7 @@ from protocol.attitude import to_euler
 from protocol.messages import Event, Telemetry, Truth
 from protocol.verbs import Change, Setpoint
 from service.hil import Hil
-from service.review import read
+from service.log.review import read
 from tests.hil.test_faults import PATIENT
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]

@@ -23,8 +23,8 @@ from protocol import topics
 from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
-from service.logfile import ReviewError
-from service.review import review
+from service.log.files import ReviewError
+from service.log.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
 FIGURES = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command")

@@ -12,8 +12,8 @@ from protocol.messages import Claim, Telemetry
 from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Figures
-from service.pairing import Seen
-from service.review import Session
+from service.log.pairing import Seen
+from service.log.review import Session
 
 PERIOD_NS = 2_000_000
 START_NS = 1_800_000_000_000_000_000

@@ -10,7 +10,7 @@ from protocol.messages import Claim, Contract, Telemetry
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
-from service.recorder import LogFile, Taken
+from service.log.recorder import LogFile, Taken
 from service.reference import Plan
 
 START_NS = 1_800_000_000_000_000_000

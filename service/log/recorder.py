@@ -25,7 +25,7 @@ from protocol.errors import AeroloopError
 from protocol.links import published_ns
 from protocol.messages import Status, model_of
 from protocol.role import Role, versions
-from service.mcap_records import CHUNK_BYTES, CONTRACT_METADATA
+from service.log.mcap_records import CHUNK_BYTES, CONTRACT_METADATA
 from service.settings import RecorderSettings
 
 DRAIN_WAIT_S: Final = 0.02

@@ -18,8 +18,8 @@ from protocol.messages import Telemetry
 from protocol.verbs import Change
 from service.config import Settings, load_over
 from service.controller import Controller
-from service.logfile import LogFiles
-from service.pairing import MAX_WAITING, Pairing, Seen
+from service.log.files import LogFiles
+from service.log.pairing import MAX_WAITING, Pairing, Seen
 
 
 class Difference(BaseModel):

@@ -13,7 +13,7 @@ from protocol.errors import AeroloopError
 from protocol.messages import Contract
 from protocol.verbs import Change
 from service.config import Settings, from_contract
-from service.mcap_records import (
+from service.log.mcap_records import (
     CHANNEL,
     CONTRACT_METADATA,
     MESSAGE,

@@ -10,12 +10,12 @@ import pytest
 from service.config import load
 from service.experiment import run_experiment
 from service.figures import Figures, Stream
-from service.limits import Limit, LimitError
-from service.logfile import LogFiles, ReviewError
-from service.mcap_records import CHUNK, Damage, records
-from service.replay import SessionReplay, replay
-from service.review import review
-from tests.service.made_log import AN_OPERATORS_WORDS, make_log
+from service.log.files import LogFiles, ReviewError
+from service.log.limits import Limit, LimitError
+from service.log.mcap_records import CHUNK, Damage, records
+from service.log.replay import SessionReplay, replay
+from service.log.review import review
+from tests.service.log.made_log import AN_OPERATORS_WORDS, make_log
 
 TICKS = 600
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import pytest
 from mcap.reader import make_reader
 
-from service.recover import RecoverError, recover
-from service.review import review
-from tests.service.made_log import make_log
+from service.log.recover import RecoverError, recover
+from service.log.review import review
+from tests.service.log.made_log import make_log
 
 TICKS = 400
 

@@ -20,8 +20,8 @@ from protocol.verbs import Change
 from service.config import ConfigError, Settings
 from service.controller import Controller
 from service.figures import Figures, Score
-from service.logfile import LogFiles, ReviewError, Which
-from service.pairing import Pairing, Seen
+from service.log.files import LogFiles, ReviewError, Which
+from service.log.pairing import Pairing, Seen
 
 TOPICS_READ: Final = frozenset({"measurement", "command", "telemetry", "event", "status"})
 

@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.errors import AeroloopError
-from service.mcap_records import (
+from service.log.mcap_records import (
     ATTACHMENT,
     CHANNEL,
     CHUNK_BYTES,

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from service.logfile import ReviewError
-from service.review import Session, Tick
+from service.log.files import ReviewError
+from service.log.review import Session, Tick
 
 Case = Literal["continuous", "quantized", "wind"]
 Array = npt.NDArray[np.float64]

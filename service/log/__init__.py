@@ -1,0 +1,1 @@
+"""The log: what records it, what reads it, and what it answers."""
