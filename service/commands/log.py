@@ -47,14 +47,15 @@ def review(
 
     def run() -> Figures:
         from service.display import share_bar
-        from service.log.review import read
+        from service.log.review import Kept, read
 
+        kept = Kept()
         with share_bar("reading", hidden=json) as update:
-            judged = read(*logs, keep=figures is not None, progress=update)
+            judged = read(*logs, watch=None if figures is None else kept.watch, progress=update)
         if figures is not None:
             from service.log.plots import draw_figures
 
-            for path in draw_figures(judged.session, figures):
+            for path in draw_figures(judged.session.settings, kept[judged.which], figures):
                 typer.echo(f"aeroloop: drew {path}", err=True)
         return judged.figures
 

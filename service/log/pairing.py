@@ -31,7 +31,7 @@ class Pair(NamedTuple):
 
     counter: int
     measurement: Seen
-    command: bytes
+    command: Seen
     codes: tuple[float, ...]
     before: list[tuple[int, Seen]]
 
@@ -58,8 +58,8 @@ class Pairing(ABC):
         self.malformed = 0
 
     @abstractmethod
-    def answered(self, k: int, measurement: Seen, command: bytes, codes: tuple[float, ...]) -> None:
-        """A measurement that a command answered, at tick k; the command's frame and its codes."""
+    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
+        """A measurement that a command answered, at tick k; the command and its codes."""
 
     @abstractmethod
     def passed_over(self, k: int, measurement: Seen) -> None:
@@ -107,7 +107,7 @@ class Pairing(ABC):
             if found < 0:
                 continue  # answers what the log does not have, or repeats an answer
             before = [measured.popleft() for _ in range(found)]
-            pair = Pair(*measured.popleft(), seen.frame, codes, before)
+            pair = Pair(*measured.popleft(), seen, codes, before)
             if self._ticks is not None:
                 self._place(pair, self._ticks)
             else:

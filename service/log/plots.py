@@ -16,8 +16,9 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from service.config import Settings
 from service.log.files import ReviewError
-from service.log.review import Session, Tick
+from service.log.review import Tick
 
 Case = Literal["continuous", "quantized", "wind"]
 Array = npt.NDArray[np.float64]
@@ -44,29 +45,29 @@ NUMBERS: Final[dict[tuple[str, Case], str]] = {
 """Which figure of the paper shows a quantity in a case."""
 
 
-def case_of(session: Session) -> Case:
+def case_of(settings: Settings) -> Case:
     """Which of the paper's cases a session was."""
-    settings = session.settings
     if settings.plant.wind.blowing and not settings.plant.ideal:
         return "wind"
     bits = (settings.wire.attitude.bits, settings.wire.rate.bits, settings.wire.voltage.bits)
     return "continuous" if bits == (None, None, None) else "quantized"
 
 
-def draw_figures(session: Session, folder: Path) -> list[Path]:
+def draw_figures(settings: Settings, ticks: Sequence[Tick], folder: Path) -> list[Path]:
     """Draw every quantity of a session into PNG files and return their paths.
 
     Args:
-        session: A session that kept its ticks.
+        settings: The configuration of its controller.
+        ticks: Its ticks.
         folder: Where; made if need be.
 
     Raises:
         ReviewError: The session has no ticks, or the folder cannot be written.
     """
-    if not session.ticks:
+    if not ticks:
         raise ReviewError("the log has no answered measurement to draw")
-    case, ticks, wire = case_of(session), session.ticks, session.settings.wire
-    t = np.array([tick.k for tick in ticks]) * session.settings.loop.period
+    case, wire = case_of(settings), settings.wire
+    t = np.array([tick.k for tick in ticks]) * settings.loop.period
     q = "" if case == "continuous" else "^Q"
     first_motor = 3 - wire.actuators + 1
 

@@ -72,13 +72,13 @@ class Replayer(Pairing):
         self.commands = self.differing = 0
         self._square = self._largest = self._logged = self._computed = 0.0
 
-    def answered(self, k: int, measurement: Seen, command: bytes, codes: tuple[float, ...]) -> None:
+    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
         """Compute the command of tick k again."""
         del codes
         if self._begun:
-            self._compare(k, measurement.frame, command)
+            self._compare(k, measurement.frame, command.frame)
         else:
-            self._held.append((k, measurement.frame, command))
+            self._held.append((k, measurement.frame, command.frame))
 
     def passed_over(self, k: int, measurement: Seen) -> None:
         """The controller never saw it."""

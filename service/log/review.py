@@ -27,9 +27,20 @@ TOPICS_READ: Final = frozenset({"measurement", "command", "telemetry", "event", 
 
 
 class Tick(NamedTuple):
-    """One tick of a session as the controller saw it: what the figures of the paper draw."""
+    """One tick of a session as the controller saw it.
+
+    Attributes:
+        k: Tick of the law; its time is k·period.
+        published_ns: When its measurement was published, on the plant's wall clock [ns].
+        latency_ns: From then until the command that answered it was published [ns]; None if none did.
+        attitude: q as measured. The other quantities of the law likewise, in its units.
+        voltages: What was commanded, or, of a measurement that was passed over, what the next command said [V]; NaN
+            where a command had no valid value.
+    """
 
     k: int
+    published_ns: int
+    latency_ns: int | None
     attitude: Quaternion
     desired: Quaternion
     rate: Vector
@@ -45,10 +56,12 @@ class Session(Pairing):
     Args:
         settings: The configuration of its controller.
         changes: What its controller followed from which tick on, in order.
-        keep: Whether to keep every tick, for figures.
+        watch: Called with every tick, in order.
     """
 
-    def __init__(self, settings: Settings, changes: Sequence[Change] = (), *, keep: bool = False) -> None:
+    def __init__(
+        self, settings: Settings, changes: Sequence[Change] = (), watch: Callable[[Tick], None] | None = None
+    ) -> None:
         self.settings = settings
         self._changes = deque(changes)
         super().__init__(settings.wire, settings.loop)
@@ -56,22 +69,22 @@ class Session(Pairing):
         self._level = settings.wire.voltage.quantizer().level
         self._passed_over: list[tuple[int, Seen]] = []
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
-        self.ticks: list[Tick] | None = [] if keep else None
+        self._watch = watch
 
-    def answered(self, k: int, measurement: Seen, command: bytes, codes: tuple[float, ...]) -> None:
+    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
         """Score the error at tick k, and the command."""
-        del command
         voltages = [self._level(code) for code in codes]
-        for tick, seen in (*self._passed_over, (k, measurement)):
-            self._score(tick, seen, voltages)
+        for tick, seen in self._passed_over:
+            self._score(tick, seen, None, voltages)
         self._passed_over.clear()
+        self._score(k, measurement, command.published_ns - measurement.published_ns, voltages)
         self.score.command(k, voltages)
 
     def passed_over(self, k: int, measurement: Seen) -> None:
         """It was not answered, but its error counts."""
         self._passed_over.append((k, measurement))
 
-    def _score(self, k: int, seen: Seen, voltages: list[float]) -> None:
+    def _score(self, k: int, seen: Seen, latency_ns: int | None, voltages: list[float]) -> None:
         controller = self._controller
         while self._changes and self._changes[0].tick <= k:
             controller.apply(self._changes.popleft())
@@ -79,12 +92,14 @@ class Session(Pairing):
         if controller.tick_index != k:
             return  # a measurement without a valid value
         self.score.error(k, controller.attitude_error)
-        if self.ticks is not None:
+        if self._watch is not None:
             rate, rate_error = controller.rate, controller.rate_error
             desired_rate = rate[0] - rate_error[0], rate[1] - rate_error[1], rate[2] - rate_error[2]
-            self.ticks.append(
+            self._watch(
                 Tick(
                     k,
+                    seen.published_ns,
+                    latency_ns,
                     controller.attitude,
                     controller.desired,
                     rate,
@@ -96,11 +111,21 @@ class Session(Pairing):
             )
 
 
+class Kept(dict[Which, list[Tick]]):
+    """Every tick of every session, for those who have the memory: its `watch` is what `read` takes as `watch`."""
+
+    def watch(self, which: Which, settings: Settings) -> Callable[[Tick], None]:
+        """Who keeps the ticks of a session."""
+        del settings
+        return self.setdefault(which, []).append
+
+
 class Review(NamedTuple):
-    """What a log says: figures of its longest session, and that session."""
+    """What a log says: figures of its longest session, and which that is."""
 
     figures: Figures
     session: Session
+    which: Which
 
 
 def review(*paths: Path) -> Figures:
@@ -108,12 +133,16 @@ def review(*paths: Path) -> Figures:
     return read(*paths).figures
 
 
-def read(*paths: Path, keep: bool = False, progress: Callable[[float], None] | None = None) -> Review:
+def read(
+    *paths: Path,
+    watch: Callable[[Which, Settings], Callable[[Tick], None]] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Review:
     """Read a run and judge its longest session. What cannot be read of a broken file is named in the figures.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
-        keep: Whether to keep every tick of every session, for figures.
+        watch: Asked for every session, given its vehicle, name and configuration, who is to be told each of its ticks.
         progress: Called now and then with the share that is done, 0…1.
 
     Raises:
@@ -129,7 +158,8 @@ def read(*paths: Path, keep: bool = False, progress: Callable[[float], None] | N
             if address.session is not None:
                 which = address.vehicle, address.session
                 if which not in sessions:
-                    sessions[which] = Session(settings, files.changes.get(which, ()), keep=keep)
+                    told = watch(which, settings) if watch else None
+                    sessions[which] = Session(settings, files.changes.get(which, ()), told)
                 seen = Seen(payload, published_ns)
                 if address.topic.name == "measurement":
                     sessions[which].measurement(seen)
@@ -154,7 +184,7 @@ def read(*paths: Path, keep: bool = False, progress: Callable[[float], None] | N
     vehicle, name = max(sessions, key=lambda which: sessions[which].score.ticks)
     longest = sessions[vehicle, name]
     plant = statuses.get((vehicle, "plant"))
-    return Review(_judge(longest, plant, files, trips), longest)
+    return Review(_judge(longest, plant, files, trips), longest, (vehicle, name))
 
 
 def _judge(session: Session, plant: Status | None, files: LogFiles, trips: list[str]) -> Figures:
