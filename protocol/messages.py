@@ -183,6 +183,18 @@ class Event(Message):
     session: str | None = None
 
 
+class Loss(Message):
+    """Messages of one key that the recorder knows are not in the log."""
+
+    key: str
+    count: int = Field(ge=1, description="how many are missing")
+    reason: Literal["network", "queue", "disk"] = Field(
+        description="network: their sender numbered them and they never came; queue: they came faster than they could "
+        "be written; disk: the log could not be written"
+    )
+    until_ns: int = Field(description="time of publication of the first message after them, ns since 1970")
+
+
 def model_of(topic: Topic) -> type[Message]:
     """The model of what a topic of messages carries. Raises KeyError for a topic of frames."""
     model: type[Message] = globals().get(topic.model) or vars(verbs)[topic.model]

@@ -61,6 +61,7 @@ TOPICS: Final = {
         Topic("truth", "truth", "json", "plant", "truth_rate", "Truth"),
         Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", "Status"),
         Topic("event", "event", "json", "every role", "when it happens", "Event"),
+        Topic("loss", "loss", "json", "recorder", "when it is found", "Loss"),
         Topic("alive", "alive/{role}", "token", "every role", "while it lives", ""),
     )
 }
