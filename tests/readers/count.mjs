@@ -1,0 +1,85 @@
+// Counts what is in an MCAP file with Foxglove's reader, which knows nothing of ours: once from the front to the end as
+// a stream, once by the index at its end. Both check every checksum.
+//
+//   node count.mjs LOG…      prints {LOG: {"stream": counts, "index": counts}}, where counts are by topic
+//
+// A file that either way cannot be read in full ends it with the reader's own words and exit code 1.
+
+import { open } from "node:fs/promises";
+import { createReadStream } from "node:fs";
+import { McapIndexedReader, McapStreamReader } from "@mcap/core";
+import { FileHandleReadable } from "@mcap/nodejs";
+import zstd from "@foxglove/wasm-zstd";
+
+await zstd.isLoaded;
+const decompressHandlers = { zstd: (data, size) => zstd.decompress(data, Number(size)) };
+
+/** Counts of messages by topic, with the first and last log time [ns] and the name of the schema. */
+class Counts {
+  topics = {};
+
+  add(channel, schema, message) {
+    const known = (this.topics[channel.topic] ??= {
+      schema: schema?.name ?? "",
+      count: 0,
+      first: message.logTime,
+      last: message.logTime,
+      bytes: 0,
+    });
+    known.count += 1;
+    known.bytes += message.data.byteLength;
+    if (message.logTime < known.first) known.first = message.logTime;
+    if (message.logTime > known.last) known.last = message.logTime;
+  }
+}
+
+async function asStream(path) {
+  const reader = new McapStreamReader({ decompressHandlers, validateCrcs: true });
+  const [schemas, channels, counts] = [new Map(), new Map(), new Counts()];
+  for await (const block of createReadStream(path)) {
+    reader.append(block);
+    for (let record; (record = reader.nextRecord()); ) {
+      if (record.type === "Schema") schemas.set(record.id, record);
+      else if (record.type === "Channel") channels.set(record.id, record);
+      else if (record.type === "Message") {
+        const channel = channels.get(record.channelId);
+        counts.add(channel, schemas.get(channel.schemaId), record);
+      }
+    }
+  }
+  if (!reader.done()) throw new Error("the file has no end");
+  return counts.topics;
+}
+
+async function byIndex(path) {
+  const file = await open(path);
+  try {
+    const reader = await McapIndexedReader.Initialize({ readable: new FileHandleReadable(file), decompressHandlers });
+    const counts = new Counts();
+    let messages = 0n;
+    for await (const message of reader.readMessages({ validateCrcs: true })) {
+      const channel = reader.channelsById.get(message.channelId);
+      counts.add(channel, reader.schemasById.get(channel.schemaId), message);
+      messages += 1n;
+    }
+    for await (const _ of reader.readMetadata()); // each must be where the index says
+    for await (const _ of reader.readAttachments({ validateCrcs: true }));
+    const told = reader.statistics?.messageCount;
+    if (told !== messages) throw new Error(`the file's statistics tell of ${told} messages, its index of ${messages}`);
+    return counts.topics;
+  } finally {
+    await file.close();
+  }
+}
+
+const found = {};
+for (const path of process.argv.slice(2)) {
+  try {
+    found[path] = { stream: await asStream(path), index: await byIndex(path) };
+  } catch (error) {
+    console.error(`${path}: ${error.message}`);
+    process.exit(1);
+  }
+}
+// Times in ns are beyond what a JSON number holds exactly, so they are told as text.
+console.log(JSON.stringify(found, (_, value) => (typeof value === "bigint" ? value.toString() : value), 2));
