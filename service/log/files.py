@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any, Final
 
 from pydantic import ValidationError
 
@@ -27,6 +29,8 @@ from service.log.mcap_records import (
     summary,
 )
 
+METADATA_PREFIX: Final = "aeroloop."
+
 Which = tuple[str, str]
 """A vehicle and a session."""
 
@@ -46,6 +50,7 @@ class LogFiles:
         contracts: Who took part, by role; the last of each.
         changes: What controllers followed from which tick on, by vehicle and session.
         damages: What could not be read, by file.
+        metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
 
     Raises:
         ReviewError: Nothing is there, or no log can be read.
@@ -55,6 +60,7 @@ class LogFiles:
         self.contracts: dict[str, Contract] = {}
         self.changes: dict[Which, list[Change]] = {}
         self.damages: dict[Path, list[Damage]] = {}
+        self.metadata: dict[str, dict[str, Any]] = {}
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
         for changes in self.changes.values():
@@ -132,6 +138,9 @@ class LogFiles:
                     if name == CONTRACT_METADATA:
                         contract = Contract.model_validate_json(entries["json"])
                         self.contracts[contract.role] = contract
+                    elif name.startswith(METADATA_PREFIX) and "json" in entries:
+                        said = json.loads(entries["json"])
+                        self.metadata[name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
         except NotMcapError as error:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:

@@ -6,19 +6,39 @@ from typing import Final, NamedTuple
 
 from protocol.errors import AeroloopError
 from service.figures import Figures
+from service.log.report import Check, Findings
 
-NAMES: Final = (
-    "duration_s",
-    "z_track",
-    "u_total",
-    "max_error_deg",
-    "final_error_deg",
-    "skipped_ticks",
-    "latency_us.p50",
-    "latency_us.p99",
-    "latency_us.max",
-    "trips",
-)
+_PERCENTILES: Final = ("p50", "p90", "p99", "p999", "max")
+
+UNITS: Final[dict[str, str]] = {
+    "duration_s": "s",
+    "z_track": "s",
+    "u_total": "V²·s",
+    "max_error_deg": "°",
+    "final_error_deg": "°",
+    "skipped_ticks": "",
+    "trips": "",
+    "gap_count": "",
+    "losses": "",
+    "invalid": "",
+    "damages": "",
+    **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
+    **{f"timing.latency.{name}": "µs" for name in _PERCENTILES},
+    **{f"timing.period.{name}": "µs" for name in _PERCENTILES},
+    **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
+    **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
+}
+"""What can be held to a limit, as it is called in the findings, and its unit."""
+
+SHORT: Final[dict[str, str]] = {
+    "skipped": "skipped_ticks",
+    "gaps": "gap_count",
+    **{f"{name}.{p}": f"timing.{name}.{p}" for name in ("latency", "period") for p in _PERCENTILES},
+    **{f"age.{name}": f"age_us.{name}" for name in ("p50", "p99", "max")},
+}
+"""Other names for some of them."""
+
+NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us."))), *SHORT)
 
 
 class LimitError(AeroloopError):
@@ -26,7 +46,7 @@ class LimitError(AeroloopError):
 
 
 class Limit(NamedTuple):
-    """The most that a figure may be. `trips` counts them."""
+    """The most that a figure may be. Of what is a list it is how many there are, of counts by name their sum."""
 
     figure: str
     most: float
@@ -35,20 +55,36 @@ class Limit(NamedTuple):
     def parse(cls, text: str) -> Limit:
         """A limit as the command line gives it. Raises LimitError."""
         name, equals, value = text.partition("=")
-        if not equals or name not in NAMES:
+        if not equals or not (name in SHORT or name in UNITS):
             raise LimitError(f"--require takes FIGURE=LIMIT, not {text!r}; figures are {', '.join(NAMES)}")
         try:
             return cls(name, float(value))
         except ValueError:
             raise LimitError(f"--require {name} takes a number, not {value!r}") from None
 
+    def value(self, figures: Figures) -> float | None:
+        """What the figure is; None if it could not be had."""
+        found: object = figures
+        for part in SHORT.get(self.figure, self.figure).split("."):
+            found = found.get(part) if isinstance(found, dict) else getattr(found, part, None)
+        if isinstance(found, list):
+            return len(found)
+        if isinstance(found, dict):
+            return float(sum(found.values()))
+        return found if isinstance(found, int | float) else None
+
     def broken(self, figures: Figures) -> str | None:
         """Why it does not hold, in a line; None if it does. A figure that could not be had does not hold."""
-        value: object = figures
-        for part in self.figure.split("."):
-            value = getattr(value, part, None)
-        if isinstance(value, list):
-            value = len(value)
-        if not isinstance(value, int | float):
+        value = self.value(figures)
+        if value is None:
             return f"{self.figure} is not known, so it is not at most {self.most:g}"
         return None if value <= self.most else f"{self.figure} is {value:.6g}, more than {self.most:g}"
+
+    def check(self, findings: Findings) -> Check:
+        """Whether it holds, and what was found."""
+        name, value = SHORT.get(self.figure, self.figure), self.value(findings)
+        unit = UNITS[name]
+        space = "" if unit in ("", "°") else " "
+        found = findings.reasons.get(name, "not known") if value is None else f"{value:.6g}{space}{unit}"
+        holds = self.broken(findings) is None
+        return Check(text=f"{self.figure} ≤ {self.most:g}{space}{unit}", holds=holds, found=found)

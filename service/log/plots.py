@@ -1,15 +1,12 @@
-"""The paper's Figures C.4–C.14, drawn from a log.
+"""The paper's Figures C.4–C.14, drawn from a log into PNG files.
 
-A log is one run, and a run is one of the paper's three cases: without quantization (C.4–C.6), with it (C.7–C.11), with
-it and wind (C.12–C.14). All five quantities are drawn whatever the case; a title carries the paper's number where the
-paper has that figure.
+All five quantities are drawn whatever the case; which of them is which of the paper's figures, panels.py says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,39 +15,10 @@ from matplotlib.figure import Figure
 
 from service.config import Settings
 from service.log.files import ReviewError
+from service.log.panels import NUMBERS, case_of, title_of
 from service.log.review import Tick
 
-Case = Literal["continuous", "quantized", "wind"]
 Array = npt.NDArray[np.float64]
-
-CASES: Final[dict[Case, str]] = {
-    "continuous": "without quantization",
-    "quantized": "with quantization",
-    "wind": "with wind",
-}
-
-NUMBERS: Final[dict[tuple[str, Case], str]] = {
-    ("error", "continuous"): "C.4",
-    ("rate_error", "continuous"): "C.5",
-    ("input", "continuous"): "C.6",
-    ("attitude", "quantized"): "C.7",
-    ("rate", "quantized"): "C.8",
-    ("error", "quantized"): "C.9",
-    ("rate_error", "quantized"): "C.10",
-    ("input", "quantized"): "C.11",
-    ("error", "wind"): "C.12",
-    ("rate_error", "wind"): "C.13",
-    ("input", "wind"): "C.14",
-}
-"""Which figure of the paper shows a quantity in a case."""
-
-
-def case_of(settings: Settings) -> Case:
-    """Which of the paper's cases a session was."""
-    if settings.plant.wind.blowing and not settings.plant.ideal:
-        return "wind"
-    bits = (settings.wire.attitude.bits, settings.wire.rate.bits, settings.wire.voltage.bits)
-    return "continuous" if bits == (None, None, None) else "quantized"
 
 
 def draw_figures(settings: Settings, ticks: Sequence[Tick], folder: Path) -> list[Path]:
@@ -99,8 +67,7 @@ def draw_figures(settings: Settings, ticks: Sequence[Tick], folder: Path) -> lis
         folder.mkdir(parents=True, exist_ok=True)
         for name, figure in drawings.items():
             number = NUMBERS.get((name, case))
-            label = f"Figure {number}: " if number else ""
-            figure.suptitle(f"{label}{figure.get_label()} {CASES[case]}", fontsize=12)
+            figure.suptitle(title_of(name, str(figure.get_label()), case), fontsize=12)
             stem = f"{number}-{name}" if number else name
             paths.append(folder / f"{stem}.png")
             figure.savefig(paths[-1], dpi=130)

@@ -15,15 +15,20 @@ from typing import Final, NamedTuple
 from pydantic import ValidationError
 
 from protocol.attitude import Quaternion, Vector
-from protocol.messages import Event, Status, Telemetry
+from protocol.messages import Event, Loss, Status, Telemetry, Truth
 from protocol.verbs import Change
 from service.config import ConfigError, Settings
 from service.controller import Controller
 from service.figures import Figures, Score
 from service.log.files import LogFiles, ReviewError, Which
+from service.log.findings import facts_of, findings_of, name_of
+from service.log.limits import Limit
+from service.log.observe import Observer
 from service.log.pairing import Pairing, Seen
+from service.log.report import Findings, Report
+from service.log.story import Story
 
-TOPICS_READ: Final = frozenset({"measurement", "command", "telemetry", "event", "status"})
+TOPICS_READ: Final = frozenset({"measurement", "command", "telemetry", "truth", "event", "status", "loss"})
 
 
 class Tick(NamedTuple):
@@ -120,17 +125,91 @@ class Kept(dict[Which, list[Tick]]):
         return self.setdefault(which, []).append
 
 
+class ObservedSession(Session):
+    """A session whose observer is told of every frame and every tick."""
+
+    def __init__(
+        self, settings: Settings, changes: Sequence[Change] = (), watch: Callable[[Tick], None] | None = None
+    ) -> None:
+        self.observer = Observer(settings)
+        super().__init__(settings, changes, self.observer.tick if watch is None else self._both(watch))
+
+    def measurement(self, seen: Seen) -> None:
+        """See `Pairing.measurement`."""
+        self.observer.measurement(seen.frame, seen.published_ns)
+        super().measurement(seen)
+
+    def command(self, seen: Seen) -> None:
+        """See `Pairing.command`."""
+        self.observer.command(seen.frame)
+        super().command(seen)
+
+    def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
+        """See `Pairing.telemetry`."""
+        self.observer.telemetry(telemetry)
+        super().telemetry(telemetry, published_ns)
+
+    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
+        """See `Pairing.answered`."""
+        self.observer.answered(k)
+        super().answered(k, measurement, command, codes)
+
+    def finish(self) -> None:
+        """See `Pairing.finish`."""
+        super().finish()
+        self.observer.finish()
+
+    def _both(self, watch: Callable[[Tick], None]) -> Callable[[Tick], None]:
+        observe = self.observer.tick
+
+        def told(tick: Tick) -> None:
+            observe(tick)
+            watch(tick)
+
+        return told
+
+
 class Review(NamedTuple):
-    """What a log says: figures of its longest session, and which that is."""
+    """What a log says of its longest session, and which that is.
+
+    `figures` are the figures alone; `findings` are the same figures and everything else.
+    """
 
     figures: Figures
-    session: Session
+    findings: Findings
+    session: ObservedSession
     which: Which
+    files: LogFiles
+    story: Story
 
 
 def review(*paths: Path) -> Figures:
     """Judge a run: the figures of its longest session. Raises as `read` does."""
     return read(*paths).figures
+
+
+def report(
+    paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Callable[[float], None] | None = None
+) -> Report:
+    """Everything that a log says of its longest session, as data. Raises as `read` does.
+
+    Args:
+        paths: Logs, folders of logs, or the files of a rotated run.
+        limits: What its figures are held to.
+        progress: Called now and then with the share that is done, 0…1.
+    """
+    judged = read(*paths, progress=progress)
+    observer = judged.session.observer
+    time, panels = observer.lines()
+    return Report(
+        name=name_of(paths),
+        findings=judged.findings.model_copy(update={"checks": [limit.check(judged.findings) for limit in limits]}),
+        time=time,
+        panels=panels,
+        thinned=observer.thinned,
+        settings=judged.session.settings.contract(),
+        facts=facts_of(judged.files, judged.story, judged.which[0]),
+    )
 
 
 def read(
@@ -148,43 +227,49 @@ def read(
     Raises:
         ReviewError: Not a log, or one without a session.
     """
-    sessions: dict[Which, Session] = {}
-    statuses: dict[tuple[str, str], Status] = {}
-    trips: list[str] = []
+    sessions: dict[Which, ObservedSession] = {}
+    running: dict[str, ObservedSession] = {}
+    story = Story()
     try:
         files = LogFiles(paths)
         settings = files.settings
         for address, payload, published_ns in files.messages(TOPICS_READ, progress):
+            vehicle, name = address.vehicle, address.topic.name
             if address.session is not None:
-                which = address.vehicle, address.session
+                which = vehicle, address.session
                 if which not in sessions:
                     told = watch(which, settings) if watch else None
-                    sessions[which] = Session(settings, files.changes.get(which, ()), told)
+                    sessions[which] = ObservedSession(settings, files.changes.get(which, ()), told)
+                    running[vehicle] = sessions[which]
                 seen = Seen(payload, published_ns)
-                if address.topic.name == "measurement":
+                if name == "measurement":
                     sessions[which].measurement(seen)
                 else:
                     sessions[which].command(seen)
-            elif address.topic.name == "telemetry":
+            elif name == "telemetry":
                 telemetry = Telemetry.model_validate_json(payload)
-                if session := sessions.get((address.vehicle, telemetry.session)):
+                if session := sessions.get((vehicle, telemetry.session)):
                     session.telemetry(telemetry, published_ns)
-            elif address.topic.name == "event":
-                event = Event.model_validate_json(payload)
-                if event.kind == "tripped":
-                    trips.append(event.text)
+            elif name == "truth":
+                if vehicle in running:
+                    running[vehicle].observer.truth(Truth.model_validate_json(payload).attitude, published_ns)
+            elif name == "event":
+                story.event(vehicle, Event.model_validate_json(payload), published_ns)
+            elif name == "loss":
+                story.loss(vehicle, Loss.model_validate_json(payload))
             elif address.role is not None:
-                statuses[address.vehicle, address.role] = Status.model_validate_json(payload)
+                story.status(vehicle, address.role, Status.model_validate_json(payload))
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
     if not sessions:
         raise ReviewError(f"{files.name} holds no session: no measurement or command frame was recorded")
     for session in sessions.values():
         session.finish()
-    vehicle, name = max(sessions, key=lambda which: sessions[which].score.ticks)
-    longest = sessions[vehicle, name]
-    plant = statuses.get((vehicle, "plant"))
-    return Review(_judge(longest, plant, files, trips), longest, (vehicle, name))
+    longest = max(sessions, key=lambda which: sessions[which].score.ticks)
+    figures = _judge(sessions[longest], story.statuses.get((longest[0], "plant")), files, story.trips)
+    changes, observer = files.changes.get(longest, ()), sessions[longest].observer
+    findings = findings_of(figures, longest, settings, observer, story, changes, len(sessions))
+    return Review(figures, findings, sessions[longest], longest, files, story)
 
 
 def _judge(session: Session, plant: Status | None, files: LogFiles, trips: list[str]) -> Figures:

@@ -1,0 +1,340 @@
+"""What is looked at in a session beside its figures: timing, gaps, saturation, and every quantity over time.
+
+An `Observer` is told frames, ticks and what is told less often, keeps them for a block of a few thousand ticks, and
+reduces each block by numpy; so a tick costs a few microseconds and memory stays bounded however long the session is.
+Durations go into histograms, lines into buckets (thin.py), and of gaps the longest hundred are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from math import nan
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.attitude import Quaternion
+from protocol.frames import FrameFormat, SignalSpec
+from protocol.messages import Telemetry
+from service.config import Settings
+from service.log.panels import columns_of, panels_of
+from service.log.report import Array, Gap, Panel, Spread
+from service.log.thin import ThinnedLines
+
+if TYPE_CHECKING:
+    from service.log.review import Tick
+
+BLOCK: Final = 4096
+LONGEST_GAPS: Final = 100
+_BINS_PER_OCTAVE: Final = 16
+_BINS: Final = 32 * _BINS_PER_OCTAVE  # 1 µs … 2^32 µs, as protocol.clock.Histogram
+
+Integers = npt.NDArray[np.int64]
+
+
+class Durations:
+    """A histogram of durations as `protocol.clock.Histogram`, which takes many at once."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BINS, dtype=np.int64)
+        self._max_us = 0.0
+
+    def add(self, nanoseconds: Array | Integers) -> None:
+        """Count durations [ns]; under 1 µs counts as 1 µs, over an hour as an hour. Shape (n,)."""
+        if len(nanoseconds):
+            us = np.maximum(1.0, nanoseconds * 1e-3)
+            bins = np.minimum((np.log2(us) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
+            self._counts += np.bincount(bins, minlength=_BINS)
+            self._max_us = max(self._max_us, float(us.max()))
+
+    def spread(self) -> Spread | None:
+        """How they were spread; None if there were none."""
+        total = int(self._counts.sum())
+        if not total:
+            return None
+        reached = np.cumsum(self._counts)
+
+        def percentile(percent: float) -> float:
+            i = int(np.searchsorted(reached, total * percent / 100))
+            return float(round(min(2 ** ((i + 0.5) / _BINS_PER_OCTAVE), self._max_us), 1))
+
+        return Spread(
+            count=total,
+            p50=percentile(50),
+            p90=percentile(90),
+            p99=percentile(99),
+            p999=percentile(99.9),
+            max=round(self._max_us, 1),
+            bins=[(round(2 ** (i / _BINS_PER_OCTAVE), 3), int(self._counts[i])) for i in np.flatnonzero(self._counts)],
+        )
+
+
+class Outermost:
+    """How many values of a signal were at the quantizer's outermost level."""
+
+    def __init__(self, signal: SignalSpec) -> None:
+        quantizer = signal.quantizer()
+        self._top, self._invalid = quantizer.encode(quantizer.limit), quantizer.invalid
+        self._values = self._saturated = 0
+
+    def add(self, codes: Array) -> npt.NDArray[np.bool_]:
+        """Count codes, and say which frames have one that is no valid value. Shapes (n, values) and (n,)."""
+        invalid = np.isnan(codes) | (codes == self._invalid)
+        self._values += codes.size - int(invalid.sum())
+        self._saturated += int(((np.abs(codes) >= self._top) & ~invalid).sum())
+        return np.asarray(invalid.any(axis=1))
+
+    @property
+    def share(self) -> float | None:
+        """Of the valid values; None if there were none."""
+        return self._saturated / self._values if self._values else None
+
+
+class Told:
+    """What is told less often than every tick: between two it is interpolated, after the last one it is held."""
+
+    def __init__(self, columns: int) -> None:
+        self._at: list[float] = []
+        self._values: list[tuple[float, ...]] = []
+        self._columns = columns
+
+    def add(self, at: float, values: tuple[float, ...]) -> None:
+        """Told at a place on an axis that rises."""
+        if not self._at or at > self._at[-1]:
+            self._at.append(at)
+            self._values.append(values)
+
+    def on(self, at: Array) -> Array:
+        """The values at places that rise, NaN before the first; forgets what lies before them. Shape (n, columns)."""
+        if not self._at:
+            return np.full((len(at), self._columns), nan)
+        known, values = np.array(self._at), np.array(self._values)
+        columns = [np.interp(at, known, values[:, i], left=nan) for i in range(self._columns)]
+        past = max(0, int(np.searchsorted(known, at[-1], side="right")) - 1)
+        del self._at[:past], self._values[:past]
+        return np.stack(columns, axis=1)
+
+
+class Observer:
+    """Watches one session.
+
+    Args:
+        settings: The configuration of its controller.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        wire = settings.wire
+        self._period = settings.loop.period
+        self._columns = columns_of(settings)
+        self._lines = ThinnedLines(2 + len(self._columns))  # k and time of publication, then what is drawn
+        self._ticks: list[Tick] = []
+        self._frames: dict[str, list[bytes]] = {"measurement": [], "command": []}
+        self._formats: dict[str, FrameFormat] = {"measurement": wire.measurement, "command": wire.command}
+        self._measured: list[int] = []
+        self._answers: list[int] = []
+        self._damping, self._truth = Told(3), Told(4)
+        self._outermost = {name: Outermost(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
+        self._period_ns, self._latency_ns = Durations(), Durations()
+        self._longest: list[tuple[int, int]] = []
+        self._last_measured: int | None = None
+        self._last_answer: int | None = None
+        self._last_tick_ns = nan
+        self._start_ns: int | None = None
+        self.gap_count = 0
+        self.invalid = {"measurement": 0, "command": 0}
+
+    # ── what it is told ──
+
+    def measurement(self, frame: bytes, published_ns: int) -> None:
+        """A measurement frame, answered or not."""
+        if self._start_ns is None:
+            self._start_ns = published_ns
+        self._measured.append(published_ns)
+        self._frame("measurement", frame)
+
+    def command(self, frame: bytes) -> None:
+        """A command frame."""
+        self._frame("command", frame)
+
+    def answered(self, k: int) -> None:
+        """Tick k was answered, be it by a command without a valid value."""
+        self._answers.append(k)
+
+    def tick(self, tick: Tick) -> None:
+        """A tick that is judged."""
+        self._ticks.append(tick)
+        if len(self._ticks) >= BLOCK:
+            self._reduce_ticks()
+
+    def telemetry(self, telemetry: Telemetry) -> None:
+        """What the controller told of a tick."""
+        self._damping.add(telemetry.tick, telemetry.damping_estimate)
+
+    def truth(self, attitude: Quaternion, published_ns: int) -> None:
+        """What the emulator told of the true attitude."""
+        if self._start_ns is not None:
+            self._truth.add((published_ns - self._start_ns) * 1e-9, attitude)
+
+    def finish(self) -> None:
+        """No more is to come."""
+        for name in self._frames:
+            self._reduce_frames(name)
+        self._reduce_ticks()
+
+    # ── what it has found ──
+
+    @property
+    def started(self) -> str:
+        """When the first measurement was published, UTC; empty if there was none."""
+        if self._start_ns is None:
+            return ""
+        return datetime.fromtimestamp(self._start_ns * 1e-9, UTC).isoformat(timespec="milliseconds")
+
+    @property
+    def timing(self) -> dict[str, Spread]:
+        """Spreads by name, of what there was."""
+        found = {"period": self._period_ns.spread(), "latency": self._latency_ns.spread()}
+        return {name: spread for name, spread in found.items() if spread is not None}
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """The longest hundred, in order of time."""
+        return [
+            Gap(time_s=round(k * self._period, 9), tick=k, ticks=ticks)
+            for k, ticks in sorted((k, ticks) for ticks, k in self._longest)
+        ]
+
+    @property
+    def saturated(self) -> dict[str, float]:
+        """Share of values at the outermost level, by signal."""
+        return {name: share for name, signal in self._outermost.items() if (share := signal.share) is not None}
+
+    @property
+    def thinned(self) -> int:
+        """Ticks behind two points of a line."""
+        return self._lines.per_bucket
+
+    def lines(self) -> tuple[Array, list[Panel]]:
+        """Times on the law's clock [s] and panels."""
+        points = self._lines.points()
+        return points[:, 0] * self._period, panels_of(self._columns, points[:, 2:])
+
+    def clock(self, within_s: float) -> Callable[[int], float | None]:
+        """The law's clock [s] at a time of publication [ns]; None further than this from the session.
+
+        In lockstep it does not run evenly, so it is read off the ticks; before the first and after the last it runs
+        as clocks do.
+        """
+        points, start_ns = self._lines.points()[:, :2], self._start_ns
+        law, wall = points[:, 0] * self._period, points[:, 1]
+
+        def at(published_ns: int) -> float | None:
+            if start_ns is None or not len(law):
+                return None
+            now = (published_ns - start_ns) * 1e-9
+            if not wall[0] - within_s <= now <= wall[-1] + within_s:
+                return None
+            outside = min(0.0, now - float(wall[0])) + max(0.0, now - float(wall[-1]))
+            return round(float(np.interp(now, wall, law)) + outside, 6)
+
+        return at
+
+    # ── a block at a time ──
+
+    def _frame(self, name: str, frame: bytes) -> None:
+        frames = self._frames[name]
+        frames.append(frame)
+        if len(frames) >= BLOCK:
+            self._reduce_frames(name)
+
+    def _reduce_frames(self, name: str) -> None:
+        if name == "measurement":
+            times = np.array(self._measured, dtype=np.int64)
+            before = [] if self._last_measured is None else [self._last_measured]
+            self._period_ns.add(np.diff(times, prepend=before))
+            self._last_measured = int(times[-1]) if len(times) else self._last_measured
+            self._measured.clear()
+        unpack, frames = self._formats[name].unpack, self._frames[name]
+        codes = np.array([read[1] for frame in frames if (read := unpack(frame)) is not None], dtype=np.float64)
+        frames.clear()
+        if len(codes):
+            if name == "measurement":
+                wrong = self._outermost["attitude"].add(codes[:, :3]) | self._outermost["rate"].add(codes[:, 3:])
+            else:
+                wrong = self._outermost["voltage"].add(codes)
+            self.invalid[name] += int(wrong.sum())
+
+    def _reduce_ticks(self) -> None:
+        ticks = self._ticks
+        if not ticks:
+            return
+        self._reduce_gaps(ticks[0].k)
+        k = np.array([tick.k for tick in ticks], dtype=np.float64)
+        assert self._start_ns is not None  # set by the first measurement
+        published = np.array([tick.published_ns for tick in ticks], dtype=np.int64) - self._start_ns
+        latency = np.array([nan if tick.latency_ns is None else tick.latency_ns for tick in ticks], dtype=np.float64)
+        self._latency_ns.add(latency[~np.isnan(latency)])
+        periods = np.diff(published, prepend=self._last_tick_ns)
+        self._last_tick_ns = float(published[-1])
+        seconds = np.asarray(published * 1e-9, dtype=np.float64)
+        attitude, desired, rate, desired_rate, error, rate_error, voltages = (
+            np.array([tick[i] for tick in ticks], dtype=np.float64) for i in range(3, 10)
+        )
+        attitude = _beside(attitude, desired)
+        self._lines.add(
+            np.column_stack(
+                [
+                    k,
+                    seconds,
+                    _alternating(attitude, desired),
+                    _alternating(rate, desired_rate),
+                    error,
+                    rate_error,
+                    voltages,
+                    _angle(error),
+                    _angle(_error_vector(self._truth.on(seconds), desired)),
+                    latency * 1e-3,
+                    periods * 1e-3,
+                    self._damping.on(k),
+                ]
+            )
+        )
+        ticks.clear()
+
+    def _reduce_gaps(self, first: int) -> None:
+        answers = np.array(self._answers, dtype=np.int64)
+        self._answers.clear()
+        if not len(answers):
+            return
+        before = min(first, int(answers[0])) - 1 if self._last_answer is None else self._last_answer
+        missing = np.diff(answers, prepend=before) - 1
+        self._last_answer = int(answers[-1])
+        where = np.flatnonzero(missing > 0)
+        self.gap_count += len(where)
+        found = [(int(missing[i]), int(answers[i] - missing[i])) for i in where]
+        self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
+
+
+def _beside(attitude: Array, desired: Array) -> Array:
+    """Of ±q, the one beside q_d. Shape (n, 4)."""
+    return np.where(np.sum(attitude * desired, axis=1, keepdims=True) < 0, -attitude, attitude)
+
+
+def _alternating(one: Array, other: Array) -> Array:
+    """The columns of both by turns. Shape (n, 2·columns)."""
+    return np.stack([one, other], axis=2).reshape(len(one), -1)
+
+
+def _angle(error: Array) -> Array:
+    """The angle [deg] of an error quaternion's vector part. Shapes (n, 3) and (n,)."""
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(1.0, np.linalg.norm(error, axis=1)))))
+
+
+def _error_vector(attitude: Array, desired: Array) -> Array:
+    """The vector part of q_d⁻¹ ⊗ q, as (C.16) has it. Shape (n, 3)."""
+    length = np.linalg.norm(attitude, axis=1, keepdims=True)
+    eta, eps = attitude[:, :1] / length, attitude[:, 1:] / length
+    eta_d, eps_d = desired[:, :1], desired[:, 1:]
+    return np.asarray(eta_d * eps - eta * eps_d - np.cross(eps_d, eps))

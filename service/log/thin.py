@@ -1,0 +1,115 @@
+"""Lines thinned out as they come, so that a page can hold hours of them.
+
+Rows go into buckets, each with the least and the largest value of every column and which of the two came first. When
+there are too many buckets, neighbours are merged in pairs; so the number of points is bounded whatever the length, and
+no extreme is ever lost. While there are few enough rows, each is a bucket of its own and the lines are exact.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+MAX_POINTS: Final = 4096
+"""Of a line: two for each pixel of a wide screen."""
+
+
+class Buckets(NamedTuple):
+    """Rows in buckets.
+
+    Attributes:
+        low: Least value of every column; NaN where a column has none. Shape (buckets, columns).
+        high: Largest value.
+        rising: Whether the least came before the largest.
+        rows: How many rows each holds. Shape (buckets,).
+    """
+
+    low: Array
+    high: Array
+    rising: Flags
+    rows: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, rows: Array) -> Self:
+        """Every row in a bucket of its own. Shape (rows, columns)."""
+        return cls(rows, rows, np.ones(rows.shape, dtype=bool), np.ones(len(rows), dtype=np.int64))
+
+    def followed_by(self, other: Self) -> Self:
+        """These, then those."""
+        return type(self)(
+            np.concatenate([self.low, other.low]),
+            np.concatenate([self.high, other.high]),
+            np.concatenate([self.rising, other.rising]),
+            np.concatenate([self.rows, other.rows]),
+        )
+
+    def part(self, cut: slice) -> Self:
+        """Some of them."""
+        return type(self)(self.low[cut], self.high[cut], self.rising[cut], self.rows[cut])
+
+    def paired(self, since: int = 0) -> Self:
+        """Neighbours merged, from bucket `since` on; if their number is odd, the last stays as it is."""
+        end = since + (len(self.rows) - since) // 2 * 2
+        first, then = self.part(slice(since, end, 2)), self.part(slice(since + 1, end, 2))
+        later_low = (then.low < first.low) | np.isnan(first.low)
+        later_high = (then.high > first.high) | np.isnan(first.high)
+        merged = type(self)(
+            np.where(later_low, then.low, first.low),
+            np.where(later_high, then.high, first.high),
+            np.where(later_low == later_high, np.where(later_low, then.rising, first.rising), later_high),
+            first.rows + then.rows,
+        )
+        return self.part(slice(since)).followed_by(merged).followed_by(self.part(slice(end, None)))
+
+
+class ThinnedLines:
+    """Columns over a position that rises, in bounded memory.
+
+    Args:
+        columns: How many; the first is the position.
+        max_points: The most points that a line may have.
+
+    Attributes:
+        per_bucket: Rows behind two points of a line; 1 as long as nothing was thinned out.
+    """
+
+    def __init__(self, columns: int, max_points: int = MAX_POINTS) -> None:
+        self._buckets = Buckets.of(np.empty((0, columns)))
+        self._max_points = max_points
+        self.per_bucket = 1
+
+    def add(self, rows: Array) -> None:
+        """More rows. Shape (rows, columns)."""
+        buckets, size = Buckets.of(rows), 1
+        while size < self.per_bucket and len(buckets.rows) > 1:
+            buckets, size = buckets.paired(), 2 * size
+        self._buckets = self._buckets.followed_by(buckets)
+        # Where a bucket is to hold more rows than come at once, the last one takes in what fits.
+        while len(self._buckets.rows) > 1 and int(self._buckets.rows[-2:].sum()) <= self.per_bucket:
+            self._buckets = self._buckets.paired(len(self._buckets.rows) - 2)
+        while len(self._buckets.rows) * (1 if self.per_bucket == 1 else 2) > self._max_points:
+            self._buckets = self._buckets.paired()
+            self.per_bucket *= 2
+
+    def points(self) -> Array:
+        """The lines' points: every row, or of each bucket two that span it. Shape (points, columns).
+
+        The two stand in the middle of the bucket's first and second half, each line's extremes in the order in which
+        they came.
+        """
+        low, high, rising, rows = self._buckets
+        if self.per_bucket == 1:
+            return low
+        points = np.empty((2 * len(rows), low.shape[1]))
+        points[0::2], points[1::2] = np.where(rising, low, high), np.where(rising, high, low)
+        start, end = low[:, 0], high[:, 0]
+        quarter = np.maximum(0.0, ((end - start + 1) / 2 - 1) / 2)
+        points[0::2, 0], points[1::2, 0] = start + quarter, end - quarter
+        kept = np.ones(len(points), dtype=bool)
+        kept[1::2] = rows > 1
+        return np.asarray(points[kept])
