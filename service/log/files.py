@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
 
@@ -15,6 +15,7 @@ from protocol.errors import AeroloopError
 from protocol.messages import Contract
 from protocol.verbs import Change
 from service.config import Settings, from_contract
+from service.log.mcap_index import skim
 from service.log.mcap_records import (
     CHANNEL,
     CONTRACT_METADATA,
@@ -24,12 +25,15 @@ from service.log.mcap_records import (
     Damage,
     Message,
     NotMcapError,
+    messages,
     metadata,
     records,
     summary,
 )
 
 METADATA_PREFIX: Final = "aeroloop."
+
+T = TypeVar("T")
 
 Which = tuple[str, str]
 """A vehicle and a session."""
@@ -49,7 +53,7 @@ class LogFiles:
         paths: The files, in the order of their first messages.
         contracts: Who took part, by role; the last of each.
         changes: What controllers followed from which tick on, by vehicle and session.
-        damages: What could not be read, by file.
+        damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
 
     Raises:
@@ -90,27 +94,29 @@ class LogFiles:
         self, names: Collection[str], progress: Callable[[float], None] | None = None
     ) -> Iterator[tuple[topics.Address, bytes, int]]:
         """Key, content and time of publication [ns] of every message of these topics, in the order of recording."""
+        return self.routed(lambda address: address if address.topic.name in names else None, progress)
+
+    def routed(
+        self, route: Callable[[topics.Address], T | None], progress: Callable[[float], None] | None = None
+    ) -> Iterator[tuple[T, bytes, int]]:
+        """The same with, instead of the key, what `route` says of it; it is asked once for every key of a file.
+
+        Args:
+            route: Whose the messages of a key are, such as a method that takes them; None leaves them out.
+            progress: Called now and then with the share that is done, 0…1.
+        """
+
+        def wanted(channel: Channel) -> T | None:
+            address = topics.read_key(channel.topic)
+            return None if address is None else route(address)
+
         read = 0
         for path in self.paths:
-            done = read
-
-            def told(reached: int, done: int = done) -> None:
-                if progress is not None:
-                    progress((done + reached) / self._size)
-
-            wanted: dict[int, topics.Address] = {}
-            for record in chain(summary(path), records(path, None, told)):
-                if record.opcode == MESSAGE:
-                    message = Message.read(record.content)
-                    address = wanted.get(message.channel)
-                    if address is not None:
-                        yield address, message.data, message.publish_time
-                elif record.opcode == CHANNEL:
-                    channel = Channel.read(record.content)
-                    key = topics.read_key(channel.topic)
-                    if key is not None and key.topic.name in names:
-                        wanted[channel.id] = key
+            damages: list[Damage] = []
+            yield from messages(path, wanted, damages, _share_of(progress, read, self._size))
             read += path.stat().st_size
+            if damages:
+                self.damages[path] = damages
 
     def _prelude(self, path: Path) -> int:
         """Gather contracts and changes, which may stand anywhere in a file. Returns the time of its first message."""
@@ -118,7 +124,7 @@ class LogFiles:
         changes: dict[int, str] = {}
         damages: list[Damage] = []
         try:
-            for record in chain(summary(path), records(path, damages)):
+            for record in skim(path, _is_change) or chain(summary(path), records(path, damages)):
                 if record.opcode == MESSAGE:
                     if changes or not first:
                         message = Message.read(record.content)
@@ -150,6 +156,15 @@ class LogFiles:
         if damages:
             self.damages[path] = damages
         return first
+
+
+def _is_change(key: str) -> bool:
+    address = topics.read_key(key)
+    return address is not None and address.topic.name == "change"
+
+
+def _share_of(progress: Callable[[float], None] | None, before: int, size: int) -> Callable[[int], None] | None:
+    return None if progress is None else lambda reached: progress((before + reached) / size)
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
