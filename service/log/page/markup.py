@@ -1,0 +1,52 @@
+"""HTML that cannot be broken into: every text is escaped unless it came out of `tag` itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from html import escape
+from typing import Final
+
+VOID: Final = frozenset({"br", "col", "hr", "img", "input", "link", "meta"})
+"""Elements without an end tag."""
+
+
+class Html(str):
+    """Text that is markup already."""
+
+    __slots__ = ()
+
+
+Child = str | Iterable["Html | str"] | None
+
+
+def tag(name: str, *children: Child, **attributes: str | float | bool | None) -> Html:
+    """An element.
+
+    Args:
+        name: Such as `td`.
+        children: Markup, text to be escaped, or several of them; None is nothing.
+        attributes: `class_="number"`, `data_time=1.5`; True stands alone, False and None are left out.
+    """
+    inside = "".join(_markup(child) for child in children)
+    start = "".join([name, *(_attribute(key, value) for key, value in attributes.items())])
+    return Html(f"<{start}>" if name in VOID else f"<{start}>{inside}</{name}>")
+
+
+def joined(parts: Iterable[Html | str]) -> Html:
+    """Several pieces of markup or text as one."""
+    return Html("".join(_markup(part) for part in parts))
+
+
+def _markup(child: Child) -> str:
+    if child is None:
+        return ""
+    if isinstance(child, Html):
+        return str(child)
+    return escape(child) if isinstance(child, str) else joined(child)
+
+
+def _attribute(key: str, value: str | float | bool | None) -> str:
+    if value is None or value is False:
+        return ""
+    name = key.rstrip("_").replace("_", "-")
+    return f" {name}" if value is True else f' {name}="{escape(str(value))}"'
