@@ -10,9 +10,9 @@ from typing import Any
 
 from service.log.page.data import SPREADS, grave, period_s, spread_names
 from service.log.page.markup import Html, joined, tag
-from service.log.page.rows import micros, percent, seconds
 from service.log.page.verdict import run_name
 from service.log.report import Report
+from service.log.rows import micros, percent, seconds
 
 Column = tuple[str, bool]
 """Its head, and whether it holds numbers."""

@@ -10,9 +10,11 @@ from base64 import b64encode
 from collections.abc import Sequence
 from hashlib import sha256
 from importlib.resources import files
+from pathlib import Path
 from string import Template
 from typing import Final
 
+from service.log.files import ReviewError
 from service.log.page import happenings, setup, verdict
 from service.log.page.data import group_titles, page_data, spread_names
 from service.log.page.markup import Html, joined, tag
@@ -52,6 +54,18 @@ def page(reports: Sequence[Report]) -> str:
         library=library,
         scripts=ours,
     )
+
+
+def write_page(reports: Sequence[Report], out: Path) -> None:
+    """Write the page into a file, in one step. Raises ReviewError if that cannot be."""
+    text = page(reports)
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(out)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ReviewError(f"cannot write {out}: {error.strerror}") from None
 
 
 def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from service.log.page.markup import Html, joined, tag
-from service.log.page.rows import Row, Value, figure_rows, seconds
 from service.log.report import Check, Findings, Report
+from service.log.rows import Row, Value, figure_rows, seconds
 
 
 class Judgement(NamedTuple):
