@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import degrees
 from typing import TYPE_CHECKING
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from service.calibrate import Calibration
     from service.demo import Progress as DemoProgress
     from service.doctor import Diagnosis
-    from service.log.replay import SessionReplay
     from service.operate import Statuses
     from service.soak import Soak
     from service.tables import Tables
@@ -301,31 +300,3 @@ def share_bar(what: str, *, hidden: bool = False) -> Iterator[Callable[[float], 
     ) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(task, completed=share)
-
-
-def replay_table(sessions: Sequence[SessionReplay]) -> None:
-    """Print what replaying has shown."""
-    console = Console()
-    table = Table("session", "from tick", "commands", "differing", "rms", "largest", "u_total", box=None)
-    for session in sessions:
-        table.add_row(
-            f"{session.vehicle}/{session.session}",
-            str(session.first_tick) if session.first_tick is not None else "–",
-            str(session.commands),
-            str(session.differing),
-            f"{session.rms_v:.3f} V" if session.rms_v is not None else "–",
-            f"{session.max_v:.2f} V" if session.max_v is not None else "–",
-            f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s",
-        )
-    console.print(table)
-    for session in sessions:
-        first = session.first_difference
-        if first is not None:
-            console.print(
-                f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): "
-                f"{first.logged} logged, {first.computed or 'none'} computed"
-            )
-        elif session.commands:
-            console.print(f"{session.session}: every command is the same, byte for byte")
-        else:
-            console.print(f"{session.session}: nothing could be replayed: no telemetry says where it began")

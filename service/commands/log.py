@@ -12,13 +12,12 @@ from service.commands.common import (
     checked,
     fail,
     guarded,
-    print_figures,
 )
 
 if TYPE_CHECKING:
-    from service.figures import Figures
     from service.log.recover import Recovery
     from service.log.replay import SessionReplay
+    from service.log.report import Report
 
 group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
 
@@ -34,18 +33,18 @@ def review(
         typer.Option(
             "--require",
             metavar="FIGURE=LIMIT",
-            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4 or skipped_ticks=0.",
+            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4, skipped=0 or latency.p99=2000.",
             show_default=False,
         ),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Compute every figure of merit from logs alone, hold them to limits, draw the paper's figures."""
+    """Say everything that logs tell of a run, hold its figures to limits, draw the paper's figures."""
     from service.log.limits import Limit
 
     limits = checked(lambda: [Limit.parse(text) for text in require or []])
 
-    def run() -> Figures:
+    def run() -> Report:
         from service.display import share_bar
         from service.log.review import Kept, read
 
@@ -57,11 +56,16 @@ def review(
 
             for path in draw_figures(judged.session.settings, kept[judged.which], figures):
                 typer.echo(f"aeroloop: drew {path}", err=True)
-        return judged.figures
+        return judged.report(limits)
 
-    judged = guarded(run)
-    print_figures(judged, json)
-    broken = [text for limit in limits if (text := limit.broken(judged)) is not None]
+    findings = guarded(run).findings
+    if json:
+        typer.echo(findings.model_dump_json(indent=2))
+    else:
+        from service.log.display import review_account
+
+        review_account(findings)
+    broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
     if broken:
         fail("; ".join(broken), 1)
 
@@ -90,7 +94,7 @@ def replay(
 
         typer.echo(dumps([session.model_dump(mode="json") for session in replayed], indent=2))
     else:
-        from service.display import replay_table
+        from service.log.display import replay_table
 
         replay_table(replayed)
     if not overrides and any(session.differing for session in replayed):

@@ -85,6 +85,7 @@ class Limit(NamedTuple):
         name, value = SHORT.get(self.figure, self.figure), self.value(findings)
         unit = UNITS[name]
         space = "" if unit in ("", "°") else " "
-        found = findings.reasons.get(name, "not known") if value is None else f"{value:.6g}{space}{unit}"
+        reasons = (why for key, why in findings.reasons.items() if name == key or name.startswith(f"{key}."))
+        found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
         holds = self.broken(findings) is None
         return Check(text=f"{self.figure} ≤ {self.most:g}{space}{unit}", holds=holds, found=found)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from pydantic import ValidationError
 
@@ -170,17 +170,37 @@ class ObservedSession(Session):
 
 
 class Review(NamedTuple):
-    """What a log says of its longest session, and which that is.
+    """What a log says of its longest session.
 
-    `figures` are the figures alone; `findings` are the same figures and everything else.
+    Attributes:
+        figures: The figures of merit alone.
+        findings: The same figures and everything else.
+        session: The session.
+        which: Its vehicle and name.
+        name: What to call the run.
+        facts: About software and host, by role.
     """
 
     figures: Figures
     findings: Findings
     session: ObservedSession
     which: Which
-    files: LogFiles
-    story: Story
+    name: str
+    facts: dict[str, dict[str, Any]]
+
+    def report(self, limits: Sequence[Limit] = ()) -> Report:
+        """All of it as data, held to limits."""
+        observer = self.session.observer
+        time, panels = observer.lines()
+        return Report(
+            name=self.name,
+            findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),
+            time=time,
+            panels=panels,
+            thinned=observer.thinned,
+            settings=self.session.settings.contract(),
+            facts=self.facts,
+        )
 
 
 def review(*paths: Path) -> Figures:
@@ -198,18 +218,7 @@ def report(
         limits: What its figures are held to.
         progress: Called now and then with the share that is done, 0…1.
     """
-    judged = read(*paths, progress=progress)
-    observer = judged.session.observer
-    time, panels = observer.lines()
-    return Report(
-        name=name_of(paths),
-        findings=judged.findings.model_copy(update={"checks": [limit.check(judged.findings) for limit in limits]}),
-        time=time,
-        panels=panels,
-        thinned=observer.thinned,
-        settings=judged.session.settings.contract(),
-        facts=facts_of(judged.files, judged.story, judged.which[0]),
-    )
+    return read(*paths, progress=progress).report(limits)
 
 
 def read(
@@ -269,7 +278,8 @@ def read(
     figures = _judge(sessions[longest], story.statuses.get((longest[0], "plant")), files, story.trips)
     changes, observer = files.changes.get(longest, ()), sessions[longest].observer
     findings = findings_of(figures, longest, settings, observer, story, changes, len(sessions))
-    return Review(figures, findings, sessions[longest], longest, files, story)
+    facts = facts_of(files, story, longest[0])
+    return Review(figures, findings, sessions[longest], longest, name_of(paths), facts)
 
 
 def _judge(session: Session, plant: Status | None, files: LogFiles, trips: list[str]) -> Figures:

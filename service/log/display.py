@@ -1,0 +1,149 @@
+"""What a person sees of a log in the terminal: the account of a review, and what replaying has shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from math import log2
+from typing import TYPE_CHECKING, Final
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from service.display import figures_table
+from service.log.report import Findings, Mark, Spread
+
+if TYPE_CHECKING:
+    from service.log.replay import SessionReplay
+
+LABELS: Final = 22
+"""Width of the column of labels, as in the table of figures."""
+
+MARKS_SHOWN: Final = 12
+_TIMINGS: Final = {"period": "period as published", "latency": "latency as published"}
+_BARS: Final = "▁▂▃▄▅▆▇█"
+_SPARK_WIDTH: Final = 22
+
+
+def review_account(findings: Findings) -> None:
+    """Print figures of merit, timing, what happened, and whether the limits hold."""
+    figures_table(findings)
+    console = Console()
+    console.print()
+    if findings.timing:
+        console.print(_timing_table(findings))
+        console.print()
+    table = _labelled()
+    for label, text in _rows(findings):
+        table.add_row(label, text)
+    console.print(table)
+    if findings.marks:
+        console.print()
+        console.print(_marks_table(findings.marks))
+    if findings.checks:
+        console.print()
+        checks = Table(show_header=False, box=None, pad_edge=False)
+        for check in findings.checks:
+            style = "green" if check.holds else "bold red"
+            checks.add_row(f"[{style}]{'✓' if check.holds else '✗'}[/]", check.text, check.found)
+        console.print(checks)
+
+
+def _labelled() -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True, min_width=LABELS)
+    table.add_column(overflow="fold")
+    return table
+
+
+def _timing_table(findings: Findings) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="")
+    table.add_column("", style="bold", no_wrap=True, min_width=LABELS)
+    for name in ("p50", "p99", "p99.9", "max"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for name, spread in findings.timing.items():
+        percentiles = (spread.p50, spread.p99, spread.p999, spread.max)
+        table.add_row(_TIMINGS[name], *(f"{us:.0f}" for us in percentiles), "µs", sparkline(spread))
+    if (age := findings.age_us) is not None:
+        table.add_row("age when used", f"{age['p50']:.0f}", f"{age['p99']:.0f}", "", f"{age['max']:.0f}", "µs", "")
+    return table
+
+
+def sparkline(spread: Spread, width: int = _SPARK_WIDTH) -> str:
+    """The distribution as a row of bars, over the logarithm of the duration and high as the logarithm of the count.
+
+    So a single late tick in a million is seen, and how late it was.
+    """
+    first, last = log2(spread.bins[0][0]), log2(spread.bins[-1][0])
+    counts = [0] * width
+    for edge, count in spread.bins:
+        counts[min(width - 1, int((log2(edge) - first) / max(last - first, 1e-9) * width))] += count
+    top = log2(1 + max(counts))
+    bars = (_BARS[round(log2(1 + count) / top * (len(_BARS) - 1))] if count else " " for count in counts)
+    return "".join(bars).rstrip()
+
+
+def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
+    if findings.gap_count:
+        longest = max(findings.gaps, key=lambda gap: gap.ticks)
+        ticks = "1 tick" if longest.ticks == 1 else f"{longest.ticks} ticks"
+        yield "gaps", f"{findings.gap_count}, the longest {ticks} at {longest.time_s:.3f} s"
+    else:
+        yield "gaps", "none"
+    yield (
+        "at the outermost level",
+        ", ".join(f"{name} {100 * share:.2f} %" for name, share in findings.saturated.items()),
+    )
+    for name, count in findings.invalid.items():
+        if count:
+            yield f"invalid {name}s", str(count)
+    lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
+    yield "lost to the recorder", lost or "none that it knows of"
+    began = findings.started.replace("T", " ").replace("+00:00", " UTC")
+    others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
+    yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"
+
+
+def _marks_table(marks: Sequence[Mark]) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for mark in marks[:MARKS_SHOWN]:
+        style = "bold red" if mark.kind in ("tripped", "fault") else ""
+        when = "–" if mark.time_s is None else f"{round(mark.time_s, 3) + 0.0:.3f} s"
+        table.add_row(when, mark.role, mark.kind, Text(mark.text), style=style)
+    if (more := len(marks) - MARKS_SHOWN) > 0:
+        table.add_row("", "", "", f"… and {more} more; --json has them all")
+    return table
+
+
+def replay_table(sessions: Sequence[SessionReplay]) -> None:
+    """Print what replaying has shown."""
+    console = Console()
+    table = Table("session", "from tick", "commands", "differing", "rms", "largest", "u_total", box=None)
+    for session in sessions:
+        table.add_row(
+            f"{session.vehicle}/{session.session}",
+            str(session.first_tick) if session.first_tick is not None else "–",
+            str(session.commands),
+            str(session.differing),
+            f"{session.rms_v:.3f} V" if session.rms_v is not None else "–",
+            f"{session.max_v:.2f} V" if session.max_v is not None else "–",
+            f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s",
+        )
+    console.print(table)
+    for session in sessions:
+        first = session.first_difference
+        if first is not None:
+            console.print(
+                f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): "
+                f"{first.logged} logged, {first.computed or 'none'} computed"
+            )
+        elif session.commands:
+            console.print(f"{session.session}: every command is the same, byte for byte")
+        else:
+            console.print(f"{session.session}: nothing could be replayed: no telemetry says where it began")
