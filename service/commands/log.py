@@ -8,18 +8,24 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.commands.common import (
+    Config,
     Json,
+    Overrides,
     checked,
     fail,
     guarded,
+    run_alone,
+    settings_of,
 )
 
 if TYPE_CHECKING:
+    from threading import Event
+
     from service.log.recover import Recovery
     from service.log.replay import SessionReplay
     from service.log.report import Report
 
-group = typer.Typer(no_args_is_help=True, help="What happened: reads logs.")
+group = typer.Typer(no_args_is_help=True, help="What happened, from logs; and what happens.")
 
 
 @group.command()
@@ -123,3 +129,27 @@ def recover(
         typer.echo(f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels")
         for line in recovery.lost:
             typer.echo(f"not recovered, {line}")
+
+
+@group.command()
+def live(
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free one.")] = 8765,
+    address: Annotated[str, typer.Option("--address", help="Where to listen; 0.0.0.0 is everywhere.")] = "127.0.0.1",
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000, help="Messages a second of each topic.")] = 30.0,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Show what happens now in Foxglove or Lichtblick: a WebSocket server, until ^C."""
+    settings = settings_of(config, overrides)
+    vehicle = settings.vehicle
+
+    def ready(url: str) -> None:
+        layout = f"aeroloop show layout --vehicle {vehicle}"
+        typer.echo(f"{vehicle} at {url} for Foxglove and Lichtblick, until ^C; `{layout}` prints a layout to import")
+
+    def run(stop: Event) -> None:
+        from service.log.live import serve
+
+        serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
+
+    run_alone(run, quiet=False, log_format="text", with_parent=False)

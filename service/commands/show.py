@@ -44,6 +44,22 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 
 
 @group.command()
+def layout(
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", metavar="NAME", help="Whose topics; the configured one's if left out.")
+    ] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print a layout for Foxglove or Lichtblick that shows a log, or `log live`: save it, and import the file there."""
+    settings = settings_of(config, [*(overrides or []), *([f'vehicle="{vehicle}"'] if vehicle is not None else [])])
+
+    from service.log.layout import layout as describe
+
+    typer.echo(describe(settings.vehicle, settings.wire.actuators))
+
+
+@group.command()
 def examples(
     name: Annotated[
         str | None, typer.Argument(help="Which one; all are listed if left out.", show_default=False)

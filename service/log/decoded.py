@@ -26,6 +26,9 @@ from service.log.schemas import json_shape, protobuf_shape
 LIMITED: Final = frozenset({"measurement", "command", "telemetry", "truth", "reference"})
 """Topics of the network that stream, and so are held to the rate."""
 
+UNLIMITED: Final = frozenset({"status", "event", "change", "loss"})
+"""Topics that always pass."""
+
 ROLES: Final = ("plant", "controller", "recorder")
 """Whose statuses are known beforehand; those of others are decoded just the same."""
 

@@ -177,7 +177,7 @@ class RoleStatus(View):
 
 
 def _degree(radians: float) -> float:
-    return round(degrees(radians), 4)
+    return round(degrees(radians), 4) + 0.0  # never −0
 
 
 def _degrees(radians: Vector) -> Vector:
