@@ -9,18 +9,25 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Final, NamedTuple, TypeVar
 
 from protocol.clock import LoopSettings
 from protocol.frames import COUNTERS, TickCounter, WireSpec
 from protocol.messages import Telemetry
+from protocol.topics import Address
+from service.log.files import Which
 
 MAX_WAITING: Final = 4096
 """Measurements kept while no telemetry has yet said which tick they are."""
 
+_NEVER_NS: Final = 1 << 64
+"""Later than any time of publication."""
+
 
 class Seen(NamedTuple):
-    """A frame out of the log."""
+    """A frame, or another payload, out of the log."""
 
     frame: bytes
     published_ns: int
@@ -49,6 +56,7 @@ class Pairing(ABC):
 
     def __init__(self, wire: WireSpec, loop: LoopSettings) -> None:
         self._wire = wire
+        self._read_measurement, self._read_command = wire.measurement.unpack, wire.command.unpack
         self._loop = loop
         self._measured: deque[tuple[int, Seen]] = deque(maxlen=MAX_WAITING)  # not answered yet, with their counters
         self._commands: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
@@ -56,6 +64,11 @@ class Pairing(ABC):
         self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
         self._ticks: TickCounter | None = None  # once it is known where it starts
         self.malformed = 0
+
+    @property
+    def wants_telemetry(self) -> bool:
+        """Whether telemetry can still tell it anything."""
+        return self._ticks is None
 
     @abstractmethod
     def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
@@ -67,11 +80,12 @@ class Pairing(ABC):
 
     def measurement(self, seen: Seen) -> None:
         """A measurement frame; commands that were published before it can now be told which tick they answer."""
-        read = self._wire.measurement.unpack(seen.frame)
+        read = self._read_measurement(seen.frame)
         if read is None:
             self.malformed += 1
             return
-        self._answer(seen.published_ns)
+        if self._commands:
+            self._answer(seen.published_ns)
         self._measured.append((read[0], seen))
 
     def command(self, seen: Seen) -> None:
@@ -85,22 +99,22 @@ class Pairing(ABC):
 
     def finish(self) -> None:
         """No more is to come: what still waits is judged by what there is."""
-        self._answer(None)
-        self._anchor(None)
+        self._answer(_NEVER_NS)
+        self._anchor(_NEVER_NS)
 
-    def _answer(self, until_ns: int | None) -> None:
+    def _answer(self, until_ns: int) -> None:
         """Put together the commands published before `until_ns`, each with the latest measurement before of its echo.
 
         Zenoh's timestamps are hybrid logical clocks: an answer is always stamped later than its question, on any host.
         """
-        while self._commands and (until_ns is None or self._commands[0].published_ns < until_ns):
-            seen = self._commands.popleft()
-            read = self._wire.command.unpack(seen.frame)
+        commands, measured = self._commands, self._measured
+        while commands and commands[0].published_ns < until_ns:
+            seen = commands.popleft()
+            read = self._read_command(seen.frame)
             if read is None:
                 self.malformed += 1
                 continue
             echo, codes = read
-            measured = self._measured
             found = len(measured) - 1
             while found >= 0 and (measured[found][0] != echo or measured[found][1].published_ns >= seen.published_ns):
                 found -= 1
@@ -114,9 +128,9 @@ class Pairing(ABC):
                 self._pairs.append(pair)
                 self._anchor(pair.measurement.published_ns)
 
-    def _anchor(self, until_ns: int | None) -> None:
+    def _anchor(self, until_ns: int) -> None:
         """Match telemetry from before `until_ns` with the latest answered measurement before it with its counter."""
-        while self._ticks is None and self._anchors and (until_ns is None or self._anchors[0][1] < until_ns):
+        while self._ticks is None and self._anchors and self._anchors[0][1] < until_ns:
             telemetry, published_ns = self._anchors.popleft()
             pairs = list(self._pairs)
             for i in reversed(range(len(pairs))):
@@ -138,17 +152,52 @@ class Pairing(ABC):
         k = ticks.advance(pair.counter, pair.measurement.published_ns)
         if k is None:
             return
-        tick, over = k, []
-        for counter, seen in reversed(pair.before):
-            tick = _before(tick, counter)
-            if tick <= last:
-                break
-            over.append((tick, seen))
-        for missed, seen in reversed(over):
-            self.passed_over(missed, seen)
+        if pair.before:
+            tick, over = k, []
+            for counter, seen in reversed(pair.before):
+                tick = _before(tick, counter)
+                if tick <= last:
+                    break
+                over.append((tick, seen))
+            for missed, seen in reversed(over):
+                self.passed_over(missed, seen)
         self.answered(k, pair.measurement, pair.command, pair.codes)
 
 
 def _before(tick: int, counter: int) -> int:
     """The last tick before this one that has a counter."""
     return tick - ((tick - counter) % COUNTERS or COUNTERS)
+
+
+P = TypeVar("P", bound=Pairing)
+
+
+class Sessions(dict[Which, P]):
+    """The sessions of a run, each made when its first frame comes.
+
+    Args:
+        make: Makes a session.
+    """
+
+    def __init__(self, make: Callable[[Which], P]) -> None:
+        self._make = make
+
+    def __missing__(self, which: Which) -> P:
+        self[which] = self._make(which)
+        return self[which]
+
+    def route(self, address: Address) -> Callable[[Seen], None] | None:
+        """Who takes the messages of a key; None if they are no business of a session."""
+        name = address.topic.name
+        if name == "telemetry":
+            return partial(self._telemetry, address.vehicle)
+        if name not in ("measurement", "command") or address.session is None:
+            return None
+        session = self[address.vehicle, address.session]
+        return session.measurement if name == "measurement" else session.command
+
+    def _telemetry(self, vehicle: str, seen: Seen) -> None:
+        if any(whose == vehicle and session.wants_telemetry for (whose, _), session in self.items()):
+            telemetry = Telemetry.model_validate_json(seen.frame)
+            if session := self.get((vehicle, telemetry.session)):
+                session.telemetry(telemetry, seen.published_ns)

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from math import sqrt
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -18,8 +19,8 @@ from protocol.messages import Telemetry
 from protocol.verbs import Change
 from service.config import Settings, load_over
 from service.controller import Controller
-from service.log.files import LogFiles
-from service.log.pairing import MAX_WAITING, Pairing, Seen
+from service.log.files import LogFiles, Which
+from service.log.pairing import MAX_WAITING, Pairing, Seen, Sessions
 
 
 class Difference(BaseModel):
@@ -50,6 +51,15 @@ class SessionReplay(BaseModel):
     u_total_computed: float
 
 
+class Answer(NamedTuple):
+    """A measurement at tick k and the command that was logged for it, with its codes."""
+
+    k: int
+    measurement: bytes
+    logged: bytes
+    codes: tuple[float, ...]
+
+
 class Replayer(Pairing):
     """Replays one session.
 
@@ -66,19 +76,23 @@ class Replayer(Pairing):
         self._period = settings.loop.period
         self._begun = False
         self._unplaced: deque[Telemetry] = deque(maxlen=MAX_WAITING)
-        self._held: deque[tuple[int, bytes, bytes]] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
+        self._held: deque[Answer] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
         self.first_tick: int | None = None
         self.first_difference: Difference | None = None
         self.commands = self.differing = 0
         self._square = self._largest = self._logged = self._computed = 0.0
 
+    @property
+    def wants_telemetry(self) -> bool:
+        """Until it is known where to begin."""
+        return not self._begun
+
     def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
         """Compute the command of tick k again."""
-        del codes
         if self._begun:
-            self._compare(k, measurement.frame, command.frame)
+            self._compare(k, measurement.frame, command.frame, codes)
         else:
-            self._held.append((k, measurement.frame, command.frame))
+            self._held.append(Answer(k, measurement.frame, command.frame, codes))
 
     def passed_over(self, k: int, measurement: Seen) -> None:
         """The controller never saw it."""
@@ -98,11 +112,11 @@ class Replayer(Pairing):
 
     def _begin(self, telemetry: Telemetry) -> None:
         tick = telemetry.tick
-        held = next((pair for pair in self._held if pair[0] == tick), None)
+        held = next((answer for answer in self._held if answer.k == tick), None)
         if held is None:
             return
         self._follow(tick)
-        computed = self._controller.tick(held[1], tick)
+        computed = self._controller.tick(held.measurement, tick)
         told = telemetry.damping_estimate, telemetry.attitude_error, telemetry.sign
         controller = self._controller
         if held is self._held[0] and told == (
@@ -111,14 +125,16 @@ class Replayer(Pairing):
             controller.sign,
         ):
             self.first_tick = tick  # the session's very first: nothing had been computed before it
-            self._count(tick, computed, held[2])
+            self._count(tick, computed, held.logged, held.codes)
         else:
-            controller.resume(held[1], tick, telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error)
+            controller.resume(
+                held.measurement, tick, telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error
+            )
             self.first_tick = tick + 1
         self._begun = True
-        for k, measurement, command in self._held:
-            if k > tick:
-                self._compare(k, measurement, command)
+        for answer in self._held:
+            if answer.k > tick:
+                self._compare(*answer)
         self._held.clear()
 
     def result(self, vehicle: str, session: str) -> SessionReplay:
@@ -141,33 +157,37 @@ class Replayer(Pairing):
         while self._changes and self._changes[0].tick <= k:
             self._controller.apply(self._changes.popleft())
 
-    def _compare(self, k: int, measurement: bytes, logged: bytes) -> None:
-        self._follow(k)
-        self._count(k, self._controller.tick(measurement, k), logged)
+    def _compare(self, k: int, measurement: bytes, logged: bytes, codes: tuple[float, ...]) -> None:
+        if self._changes:
+            self._follow(k)
+        self._count(k, self._controller.tick(measurement, k), logged, codes)
 
-    def _count(self, k: int, computed: bytes | None, logged: bytes) -> None:
+    def _count(self, k: int, computed: bytes | None, logged: bytes, codes: tuple[float, ...]) -> None:
+        theirs = self._volts(codes)
+        square = sum([u * u for u in theirs])
         self.commands += 1
-        if computed != logged:
-            self.differing += 1
-            if self.first_difference is None:
-                self.first_difference = Difference(
-                    tick=k,
-                    time_s=round(k * self._period, 9),
-                    logged=logged.hex(),
-                    computed=computed.hex() if computed is not None else "",
-                )
-        ours, theirs = self._volts(computed), self._volts(logged)
+        self._logged += square
+        if computed == logged:
+            self._computed += square
+            return
+        self.differing += 1
+        if self.first_difference is None:
+            self.first_difference = Difference(
+                tick=k,
+                time_s=round(k * self._period, 9),
+                logged=logged.hex(),
+                computed=computed.hex() if computed is not None else "",
+            )
+        read = None if computed is None else self._read_command(computed)
+        ours = self._volts(read[1] if read else (0,) * len(codes))
         self._computed += sum(u * u for u in ours)
-        self._logged += sum(u * u for u in theirs)
         differences = [abs(a - b) for a, b in zip(ours, theirs, strict=True)]
         self._square += sum(d * d for d in differences)
         self._largest = max(self._largest, *differences)
 
-    def _volts(self, frame: bytes | None) -> list[float]:
-        read = None if frame is None else self._wire.command.unpack(frame)
-        if read is None:
-            return [0.0] * self._wire.actuators
-        return [volts if (volts := self._level(code)) == volts else 0.0 for code in read[1]]
+    def _volts(self, codes: Sequence[float]) -> list[float]:
+        """What a plant makes of a command; 0 V of a code without a valid value."""
+        return [volts if (volts := self._level(code)) == volts else 0.0 for code in codes]
 
 
 def replay(
@@ -189,26 +209,18 @@ def replay(
     settings = load_over(files.settings, overrides)
     own_gains = any(override.startswith("law.") for override in overrides)
     own_reference = any(override.startswith("reference") for override in overrides)
-    sessions: dict[tuple[str, str], Replayer] = {}
-    for address, payload, published_ns in files.messages(("measurement", "command", "telemetry"), progress):
-        if address.session is not None:
-            which = address.vehicle, address.session
-            if which not in sessions:
-                changes = files.changes.get(which, [])
-                if own_gains:
-                    changes = [change.model_copy(update={"gains": None}) for change in changes]
-                if own_reference:
-                    changes = [change.model_copy(update={"reference": None}) for change in changes]
-                sessions[which] = Replayer(settings, changes)
-            seen = Seen(payload, published_ns)
-            if address.topic.name == "measurement":
-                sessions[which].measurement(seen)
-            else:
-                sessions[which].command(seen)
-        else:
-            telemetry = Telemetry.model_validate_json(payload)
-            if replayer := sessions.get((address.vehicle, telemetry.session)):
-                replayer.telemetry(telemetry, published_ns)
-    for replayer in sessions.values():
-        replayer.finish()
-    return [replayer.result(vehicle, session) for (vehicle, session), replayer in sessions.items()]
+
+    def replayer(which: Which) -> Replayer:
+        changes = files.changes.get(which, [])
+        if own_gains:
+            changes = [change.model_copy(update={"gains": None}) for change in changes]
+        if own_reference:
+            changes = [change.model_copy(update={"reference": None}) for change in changes]
+        return Replayer(settings, changes)
+
+    sessions = Sessions(replayer)
+    for take, payload, published_ns in files.routed(sessions.route, progress):
+        take(Seen(payload, published_ns))
+    for session in sessions.values():
+        session.finish()
+    return [session.result(vehicle, name) for (vehicle, name), session in sessions.items()]
