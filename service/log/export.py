@@ -1,8 +1,8 @@
-"""Export: a log as a table, for programs that know nothing of frames.
+"""Export: a log for programs that know nothing of frames, as a table or as a log with everything decoded.
 
-The log is read twice. First the review's own reader tells every tick of every session, so that what is exported is what
-is judged; only then is it known which session is the longest. Then comes what stands beside the ticks. Both are put
-aside on disk, and written out as a table from there, so that memory does not grow with the log.
+For a table the log is read twice. First the review's own reader tells every tick of every session, so that what is
+exported is what is judged; only then is it known which session is the longest. Then comes what stands beside the ticks.
+Both are put aside on disk, and written out as a table from there, so that memory does not grow with the log.
 """
 
 from __future__ import annotations
@@ -18,17 +18,26 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from protocol.host import versions
 from protocol.messages import Telemetry, Truth
-from service.config import Settings
+from service.config import ConfigError, Settings
 from service.log.files import LogFiles, ReviewError, Which
+from service.log.mcap_records import Damage
 from service.log.review import Tick, read
 from service.log.spool import Pile, Records, Spool, Window
 from service.log.table import Rows, groups, telemetry_fields, tick_fields, truth_fields
 from service.log.table_files import FILES, ExportError
 
-Format = Literal["parquet", "csv", "mat"]
+Format = Literal["parquet", "csv", "mat", "mcap"]
 Progress = Callable[[float], None]
 
 ALL: Final = "all"
+
+ENDINGS: Final[dict[Format, str]] = {
+    "parquet": ".parquet",
+    "csv": ".csv",
+    "mat": ".mat",
+    "mcap": "-decoded.mcap",
+}
+"""What the name of a new file ends in."""
 
 
 class Exported(BaseModel):
@@ -38,9 +47,9 @@ class Exported(BaseModel):
 
     out: str
     format: str
-    sessions: list[str] = Field(description="`vehicle/session`, in the order of the rows")
-    rows: int
-    columns: list[str]
+    sessions: list[str] | None = Field(description="`vehicle/session`, in the order of the rows; null of a log")
+    rows: int = Field(description="rows of a table, messages of a log")
+    columns: list[str] = Field(description="names of a table's columns, topics of a log's channels")
     bytes: int
     damages: list[str] = Field(description="what of the log could not be read")
 
@@ -53,21 +62,49 @@ def export(
     session: str | None = None,
     progress: Progress | None = None,
 ) -> Exported:
-    """Write a run's ticks as a table.
+    """Write a run's ticks as a table, or all of it as a log with everything decoded.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         to: What kind of file.
-        out: The file, which must not exist; the first log's name with another suffix if None.
-        session: Its name, alone or as `vehicle/session`; `all`; the longest if None.
+        out: The file, which must not exist; the first log's name with another ending if None.
+        session: Whose ticks: a name, alone or as `vehicle/session`; `all`; the longest session if None.
         progress: Called now and then with the share that is done, 0…1.
 
     Raises:
         ExportError: There is nothing to export, or it cannot be written.
         ReviewError: The log cannot be read.
     """
-    out = out or beside(paths[0], f".{to}")
-    with writing(out) as part, Spool(out.parent) as spool:
+    out = out or beside(paths[0], ENDINGS[to])
+    try:
+        with writing(out) as part:
+            exported = (
+                _log(paths, part, session, progress) if to == "mcap" else _table(paths, to, part, session, progress)
+            )
+    except ConfigError as error:
+        raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
+    return exported.model_copy(update={"out": str(out)})
+
+
+def _log(paths: Sequence[Path], part: Path, session: str | None, progress: Progress | None) -> Exported:
+    from service.log.decoded_log import write_decoded
+
+    if session is not None:
+        raise ExportError("--session chooses the rows of a table; --to mcap writes the log with all its sessions")
+    written = write_decoded(LogFiles(paths), part, _share(progress, 0.0, 1.0))
+    return Exported(
+        out=str(part),
+        format="mcap",
+        sessions=None,
+        rows=written.messages,
+        columns=written.topics,
+        bytes=part.stat().st_size,
+        damages=_lines(written.damages),
+    )
+
+
+def _table(paths: Sequence[Path], to: Format, part: Path, session: str | None, progress: Progress | None) -> Exported:
+    with Spool(part.parent) as spool:
         ticks = _Ticks(spool)
         longest = read(*paths, watch=ticks.watch, progress=_share(progress, 0.0, 0.7)).which
         files = LogFiles(paths)
@@ -86,19 +123,26 @@ def export(
                 written(done / total)
         file.close()
     return Exported(
-        out=str(out),
+        out=str(part),
         format=to,
         sessions=sessions,
         rows=done,
         columns=[column.name for group in table for column in group.columns],
-        bytes=out.stat().st_size,
-        damages=[f"{path}: {damage.what}" for path, found in files.damages.items() for damage in found],
+        bytes=part.stat().st_size,
+        damages=_lines(files.damages),
     )
 
 
-def beside(log: Path, suffix: str) -> Path:
-    """A log's name, or its folder's, with another suffix."""
-    return log.with_name(f"{log.resolve().name}{suffix}") if log.is_dir() else log.with_suffix(suffix)
+def _lines(damages: dict[Path, list[Damage]]) -> list[str]:
+    return [f"{path}: {damage.what}" for path, found in damages.items() for damage in found]
+
+
+def beside(log: Path, ending: str) -> Path:
+    """A log's name, or its folder's, with another ending."""
+    if log.is_dir():
+        log = log.resolve()  # of "." there is no name
+        return log.with_name(log.name + ending)
+    return log.with_name(log.stem + ending)
 
 
 @contextmanager
