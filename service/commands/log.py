@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,6 +21,7 @@ from service.commands.common import (
 if TYPE_CHECKING:
     from threading import Event
 
+    from service.log.export import Exported
     from service.log.recover import Recovery
     from service.log.replay import SessionReplay
     from service.log.report import Report
@@ -153,3 +154,38 @@ def live(
         serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
 
     run_alone(run, quiet=False, log_format="text", with_parent=False)
+
+
+@group.command()
+def export(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="What kind of file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The new file; the log's name with another suffix if left out.", show_default=False),
+    ] = None,
+    session: Annotated[
+        str | None,
+        typer.Option("--session", metavar="NAME|all", help="The longest one if left out.", show_default=False),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write a log as a table, a row a tick, for other programs; or, --to mcap, with everything decoded beside it."""
+
+    def run() -> Exported:
+        from service.display import share_bar
+        from service.log.export import export
+
+        with share_bar("exporting", hidden=json) as update:
+            return export(logs, to, out, session=session, progress=update)
+
+    exported = guarded(run)
+    if json:
+        typer.echo(exported.model_dump_json(indent=2))
+    else:
+        if exported.sessions is None:
+            typer.echo(f"{exported.out}: {exported.rows} messages on {len(exported.columns)} channels")
+        else:
+            typer.echo(f"{exported.out}: {exported.rows} ticks of {', '.join(exported.sessions)}")
+        for line in exported.damages:
+            typer.echo(f"not read, {line}")
