@@ -100,7 +100,7 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         if count:
             yield f"invalid {name}s", str(count)
     lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
-    yield "lost to the recorder", lost or "none that it knows of"
+    yield "messages lost", lost or "none that the recorder knows of"
     began = findings.started.replace("T", " ").replace("+00:00", " UTC")
     others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
     yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"

@@ -102,9 +102,12 @@ class Told:
 
     def add(self, at: float, values: tuple[float, ...]) -> None:
         """Told at a place on an axis that rises."""
-        if not self._at or at > self._at[-1]:
-            self._at.append(at)
-            self._values.append(values)
+        if self._at and at <= self._at[-1]:
+            return
+        if len(self._at) >= 2 * BLOCK:  # it goes on while there are no ticks: forget the older half
+            del self._at[:BLOCK], self._values[:BLOCK]
+        self._at.append(at)
+        self._values.append(values)
 
     def on(self, at: Array) -> Array:
         """The values at places that rise, NaN before the first; forgets what lies before them. Shape (n, columns)."""
@@ -138,8 +141,8 @@ class Observer:
         self._outermost = {name: Outermost(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
         self._period_ns, self._latency_ns = Durations(), Durations()
         self._longest: list[tuple[int, int]] = []
-        self._last_measured: int | None = None
-        self._last_answer: int | None = None
+        self._last_measured: Integers = np.empty(0, dtype=np.int64)
+        self._last_answer: Integers = np.empty(0, dtype=np.int64)
         self._last_tick_ns = nan
         self._start_ns: int | None = None
         self.gap_count = 0
@@ -161,6 +164,8 @@ class Observer:
     def answered(self, k: int) -> None:
         """Tick k was answered, be it by a command without a valid value."""
         self._answers.append(k)
+        if len(self._answers) >= BLOCK:
+            self._reduce_gaps()
 
     def tick(self, tick: Tick) -> None:
         """A tick that is judged."""
@@ -182,6 +187,7 @@ class Observer:
         for name in self._frames:
             self._reduce_frames(name)
         self._reduce_ticks()
+        self._reduce_gaps()
 
     # ── what it has found ──
 
@@ -252,9 +258,9 @@ class Observer:
     def _reduce_frames(self, name: str) -> None:
         if name == "measurement":
             times = np.array(self._measured, dtype=np.int64)
-            before = [] if self._last_measured is None else [self._last_measured]
-            self._period_ns.add(np.diff(times, prepend=before))
-            self._last_measured = int(times[-1]) if len(times) else self._last_measured
+            times = np.concatenate([self._last_measured, times])
+            self._period_ns.add(np.diff(times))
+            self._last_measured = times[-1:]
             self._measured.clear()
         unpack, frames = self._formats[name].unpack, self._frames[name]
         codes = np.array([read[1] for frame in frames if (read := unpack(frame)) is not None], dtype=np.float64)
@@ -270,7 +276,6 @@ class Observer:
         ticks = self._ticks
         if not ticks:
             return
-        self._reduce_gaps(ticks[0].k)
         k = np.array([tick.k for tick in ticks], dtype=np.float64)
         assert self._start_ns is not None  # set by the first measurement
         published = np.array([tick.published_ns for tick in ticks], dtype=np.int64) - self._start_ns
@@ -303,17 +308,14 @@ class Observer:
         )
         ticks.clear()
 
-    def _reduce_gaps(self, first: int) -> None:
-        answers = np.array(self._answers, dtype=np.int64)
+    def _reduce_gaps(self) -> None:
+        answers = np.concatenate([self._last_answer, np.array(self._answers, dtype=np.int64)])
         self._answers.clear()
-        if not len(answers):
-            return
-        before = min(first, int(answers[0])) - 1 if self._last_answer is None else self._last_answer
-        missing = np.diff(answers, prepend=before) - 1
-        self._last_answer = int(answers[-1])
-        where = np.flatnonzero(missing > 0)
+        self._last_answer = answers[-1:]
+        missing = np.diff(answers) - 1
+        where = np.flatnonzero(missing)
         self.gap_count += len(where)
-        found = [(int(missing[i]), int(answers[i] - missing[i])) for i in where]
+        found = [(int(missing[i]), int(answers[i]) + 1) for i in where]
         self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
 
 

@@ -113,7 +113,7 @@ class Story:
         name = address.topic.name if address else loss.key
         self._losses[vehicle][name] += loss.count
         text = f"{loss.count} of {name} lost: {_WHERE[loss.reason]}"
-        self._kinds[vehicle, "recorder", f"loss of {name}"].add(Happening(loss.until_ns, "loss", "recorder", text))
+        self._kinds[vehicle, "recorder", f"loss of {name}"].add(Happening(loss.until_ns, "lost", "recorder", text))
 
     def losses(self, vehicle: str) -> dict[str, int]:
         """Messages lost, by topic."""
