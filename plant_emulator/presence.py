@@ -182,6 +182,7 @@ class Presence(Front):
             receive_key=topics.key("command", vehicle, session=session),
             lossless=self._loop.lockstep,
             mailbox=Mailbox(self._changed),
+            numbers=self._role.numbers,
         )
 
     def tell(self) -> None:

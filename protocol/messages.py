@@ -73,6 +73,7 @@ class Contract(Message):
     vehicle: str
     host: str
     versions: dict[str, str]
+    facts: dict[str, str] = Field(default_factory=dict, description="the machine, and what of it bears on time")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
 
 

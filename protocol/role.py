@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import platform
 import signal
 import socket
 import threading
@@ -17,7 +16,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from importlib.metadata import version
 from types import FrameType, TracebackType
 from typing import Any, Final, Self, TypeVar
 
@@ -27,6 +25,8 @@ from pydantic import ValidationError
 from protocol import topics
 from protocol.clock import Throttle
 from protocol.errors import AeroloopError
+from protocol.host import host_facts, versions
+from protocol.links import Numbered
 from protocol.messages import Contract, Event, EventKind, Status
 from protocol.network import NetworkSettings, join
 from protocol.verbs import Answer, Message
@@ -37,12 +37,6 @@ log: Final = logging.getLogger("aeroloop")
 M = TypeVar("M", bound=Message)
 Action = Callable[[], object]
 """Something to do between two ticks."""
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computes the figures in a log."""
-    packages = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pydantic")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 def notify_systemd(state: str) -> None:
@@ -64,6 +58,9 @@ class Role:
         config: Its effective configuration, for the contract.
         name: Name of its liveliness token; the role's name if None.
 
+    Attributes:
+        numbers: Whether what it publishes is numbered.
+
     Raises:
         NetworkError: The network cannot be joined.
     """
@@ -77,7 +74,8 @@ class Role:
         self.stop = threading.Event()
         self.zenoh = join(network)
         self._status = b""
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._publishers: dict[str, Numbered] = {}
+        self.numbers = network.timestamps
         self._inbox: deque[Action] = deque()
         self._throttle = Throttle()
         self._started = time.monotonic()
@@ -127,7 +125,12 @@ class Role:
     def configured(self, config: dict[str, Any]) -> None:
         """Answer questions for the contract with this configuration from now on."""
         self._contract = Contract(
-            role=self.role, vehicle=self.vehicle, host=socket.gethostname(), versions=versions(), config=config
+            role=self.role,
+            vehicle=self.vehicle,
+            host=socket.gethostname(),
+            versions=versions(),
+            facts=host_facts(),
+            config=config,
         ).encode()
 
     @property
@@ -202,10 +205,10 @@ class Role:
         """Publish a message on one of the table's JSON topics."""
         publisher = self._publishers.get(topic)
         if publisher is None:
-            publisher = self.zenoh.declare_publisher(
+            declared = self.zenoh.declare_publisher(
                 topics.key(topic, self.vehicle, role=self.role), encoding=zenoh.Encoding.APPLICATION_JSON
             )
-            self._publishers[topic] = publisher
+            publisher = self._publishers[topic] = Numbered(declared, numbers=self.numbers)
         publisher.put(message.encode())
 
     def event(self, kind: EventKind, text: str, session: str | None = None) -> None:

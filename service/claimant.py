@@ -60,6 +60,7 @@ class Claimant:
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lossless=self._loop.lockstep,
+            numbers=role.numbers,
         )
         answer = self._ask(claim)
         if isinstance(answer, Grant):

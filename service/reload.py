@@ -24,7 +24,7 @@ LIVE: Final = {
         "controller.auto_arm",
     ),
     "plant": ("plant.limits", "plant.watchdog_s", "plant.truth_rate_hz"),
-    "recorder": ("recorder.chunk_s",),
+    "recorder": ("recorder.chunk_s", "recorder.max_file_mb", "recorder.max_file_s", "recorder.keep_gb"),
 }
 """By role, the keys and sections that take effect at once."""
 

@@ -47,5 +47,25 @@ class RecorderSettings(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     directory: Path = Field(default=Path("logs"), description="folder for logs that are not given a name")
-    path: Path | None = Field(default=None, description="the log's file; a new one named by the time if left out")
-    chunk_s: float = Field(default=1.0, gt=0, le=60, description="the most that a crash of the recorder costs [s]")
+    path: Path | None = Field(
+        default=None, description="the log's first file; a new one named by the time if left out"
+    )
+    chunk_s: float = Field(
+        default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut costs [s]"
+    )
+    batch_s: float = Field(
+        default=0.05,
+        ge=0,
+        le=0.5,
+        description="let messages gather this long before they are taken in; log times are exact to this [s]",
+    )
+    decoded_hz: float = Field(
+        default=25.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"
+    )
+    max_file_mb: float = Field(default=256.0, gt=0, description="go on in a new file after this size [MB]")
+    max_file_s: float = Field(default=3600.0, gt=0, description="go on in a new file after this time [s]")
+    keep_gb: float | None = Field(
+        default=None,
+        gt=0,
+        description="remove the oldest logs of the recorder's when all are larger than this; none if left out [GB]",
+    )

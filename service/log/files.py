@@ -18,6 +18,7 @@ from service.config import Settings, from_contract
 from service.log.mcap_index import skim
 from service.log.mcap_records import (
     CHANNEL,
+    CHANGE_METADATA,
     CONTRACT_METADATA,
     MESSAGE,
     METADATA,
@@ -130,10 +131,7 @@ class LogFiles:
                         message = Message.read(record.content)
                         first = first or message.publish_time
                         if message.channel in changes:
-                            change = Change.model_validate_json(message.data)
-                            known = self.changes.setdefault((changes[message.channel], change.session), [])
-                            if change not in known:
-                                known.append(change)
+                            self._follows(changes[message.channel], message.data)
                 elif record.opcode == CHANNEL:
                     channel = Channel.read(record.content)
                     key = topics.read_key(channel.topic)
@@ -144,6 +142,9 @@ class LogFiles:
                     if name == CONTRACT_METADATA:
                         contract = Contract.model_validate_json(entries["json"])
                         self.contracts[contract.role] = contract
+                    elif name == CHANGE_METADATA:
+                        if key := topics.read_key(entries["key"]):
+                            self._follows(key.vehicle, entries["json"])
                     elif name.startswith(METADATA_PREFIX) and "json" in entries:
                         said = json.loads(entries["json"])
                         self.metadata[name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
@@ -156,6 +157,13 @@ class LogFiles:
         if damages:
             self.damages[path] = damages
         return first
+
+    def _follows(self, vehicle: str, text: str | bytes) -> None:
+        """Add a change; the files of a rotated run tell the same one again."""
+        change = Change.model_validate_json(text)
+        known = self.changes.setdefault((vehicle, change.session), [])
+        if change not in known:
+            known.append(change)
 
 
 def _is_change(key: str) -> bool:

@@ -119,6 +119,8 @@ class Network:
 class Publisher:
     """Puts on the network."""
 
+    id = None
+
     def __init__(self, network: Network, key: str) -> None:
         self.network = network
         self.key = key
@@ -152,7 +154,7 @@ class Loop:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(role, "join", lambda _: self.network)
-            self.role = Role("controller", "aero", NetworkSettings(), {}, name="controller-7")
+            self.role = Role("controller", "aero", NetworkSettings(timestamps=False), {}, name="controller-7")
         self.configured = reference
         self.live = Live(self.role, LAW, reference, settings, rolls=rolls)
         self.live.serve()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 from plant_emulator.endpoint import Endpoint
@@ -10,7 +11,9 @@ from protocol.messages import Claim, Contract, Telemetry
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
-from service.log.recorder import LogFile, Taken
+from service.log.intake import Taken
+from service.log.mcap_records import CONTRACT_METADATA
+from service.log.writer import LogFile
 from service.reference import Plan
 
 START_NS = 1_800_000_000_000_000_000
@@ -49,14 +52,18 @@ def make_log(
         Claim(controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
     )
     controller = Controller(wire, settings.law, settings.reference, loop.period)
-    log = LogFile(path, chunk_s=3600)
+    path.unlink(missing_ok=True)
+    log = LogFile(path)
+    sequences: Counter[str] = Counter()
 
     def write(name: str, payload: bytes, at_ns: int) -> None:
         key = topics.key(name, VEHICLE, session=SESSION, role="controller")
-        log.add(Taken(key, payload, at_ns, at_ns))
+        sequences[key] += 1
+        log.add(Taken(key, payload, at_ns, at_ns), sequences[key])
 
     contract = Contract(role="controller", vehicle=VEHICLE, host="h", versions={}, config=settings.contract())
-    log.add_contract(topics.key("contract", VEHICLE, role="controller"), contract.encode())
+    key = topics.key("contract", VEHICLE, role="controller")
+    log.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract.model_dump_json()})
     first = Change(session=SESSION, tick=0, gains=controller.gains, reference=settings.reference)
     write("change", first.encode(), START_NS - 1)
     measurement = endpoint.tick(None, 0)
@@ -81,9 +88,8 @@ def make_log(
                 write("telemetry", _telemetry(controller).encode(), at + 300_001)
         measurement = endpoint.tick(command, k + 1)
         if k % chunk_every == chunk_every - 1:
-            log.chunk_s = 0
-            log.flush_when_due()
-    log.close()
+            log.commit()
+    log.end()
 
 
 def _telemetry(controller: Controller) -> Telemetry:

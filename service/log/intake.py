@@ -1,0 +1,161 @@
+"""How messages come in: from Zenoh's receiving thread into a queue, many at a time.
+
+A message at a time, most of what recording costs is waking up: some 100 µs of a core each, before a byte is written. So
+the receiving thread is put to sleep where a pause begins, and what came meanwhile waits in the kernel's socket buffers
+and is read in one go, at a tenth of that cost. For it all links share one thread (`one_thread`, called before the
+network is joined). Nothing else is done in that thread: whoever writes takes from the queue. While little comes,
+nothing waits: a handshake with somebody who joins takes several messages each way.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import stat
+import sys
+import termios
+import threading
+import time
+from collections import Counter, deque
+from contextlib import suppress
+from typing import Final, NamedTuple
+
+import zenoh
+
+from protocol.links import published_ns
+
+MOST_WAITING: Final = 200_000
+"""Messages that may wait to be written: over a minute of a loop at 1 kHz, in some 100 MB."""
+
+CLOSING_NS: Final = 5_000_000_000
+"""A network that does not fall silent is closed after this all the same [ns]."""
+
+_PAUSE_NS: Final = 300_000
+"""A message this long after the last one may have found the sockets empty: what is buffered comes ten times as fast."""
+
+_BUSY_PER_S: Final = 200
+"""Messages a second from which on it pays to let them gather."""
+
+
+class Taken(NamedTuple):
+    """A message as it came.
+
+    Attributes:
+        key: Its key.
+        payload: Its bytes.
+        published_ns: When it was published, on its sender's wall clock [ns since 1970].
+        arrived_ns: When it was taken in, on ours [ns since 1970].
+        source: Who numbered it and its number; None if nobody did.
+    """
+
+    key: str
+    payload: bytes
+    published_ns: int
+    arrived_ns: int
+    source: zenoh.SourceInfo | None = None
+
+
+def one_thread() -> None:
+    """Let all of Zenoh run in one thread of this process; for nothing but a process that only listens."""
+    if "ZENOH_RUNTIME" not in os.environ:
+        handed_over = ", ".join(f"{name}: (handover: app)" for name in ("rx", "tx", "acc", "net"))
+        os.environ["ZENOH_RUNTIME"] = f"(app: (worker_threads: 1), {handed_over})"
+
+
+class _Sockets:
+    """The sockets of this process, as they were when it was asked for them."""
+
+    def __init__(self) -> None:
+        self._open = [int(fd) for fd in os.listdir("/proc/self/fd") if _is_socket(int(fd))]
+
+    def waiting(self) -> bool:
+        """Whether the kernel holds bytes that nobody has read: whoever was kept from reading must not rest now."""
+        for fd in self._open:
+            with suppress(OSError):  # it listens only, or is closed by now
+                if int.from_bytes(fcntl.ioctl(fd, termios.FIONREAD, b"\0" * 4), sys.byteorder):
+                    return True
+        return False
+
+
+def _is_socket(fd: int) -> bool:
+    try:
+        return stat.S_ISSOCK(os.fstat(fd).st_mode)
+    except OSError:
+        return False
+
+
+class Intake:
+    """Takes in every message of a key expression until it is closed.
+
+    Args:
+        session: An open session.
+        key: What to listen to.
+        batch_s: How long messages may wait in the kernel before they are taken in [s]; 0: not at all.
+        most: How many may wait here.
+
+    Attributes:
+        refused: Messages that found the queue full, by key; whoever tells of them clears it.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, batch_s: float, most: int = MOST_WAITING) -> None:
+        self.refused: Counter[str] = Counter()
+        self._batch_s = batch_s
+        self._most = most
+        self._queue: deque[Taken] = deque()
+        self._receiving: set[int] = set()  # threads
+        self._own = threading.get_ident()  # what we publish ourselves is taken in by the thread that publishes
+        self._last_ns = 0
+        self._second_ns = 0  # when the running second began
+        self._second_count = 0
+        self._busy = False  # as the last second was
+        self._sockets = _Sockets()
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._take, indirect=False))
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def next(self) -> Taken | None:
+        """The message that has waited longest, or None."""
+        return self._queue.popleft() if self._queue else None
+
+    def close(self) -> None:
+        """Take in what is on its way, and then no more. What is in the queue stays there."""
+        batch_s, self._batch_s, self._busy = self._batch_s, 0.0, False
+        deadline = time.monotonic_ns() + CLOSING_NS
+        time.sleep(batch_s)  # the receiving thread wakes from its last pause
+        while (quiet_from := self._last_ns + 20_000_000) > time.monotonic_ns() < deadline:
+            time.sleep(max(0.0, (quiet_from - time.monotonic_ns()) * 1e-9))
+        self._subscriber.undeclare()
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        thread = threading.get_ident()
+        if thread != self._own:
+            if thread not in self._receiving:
+                self._keep(thread)
+            if self._busy and time.monotonic_ns() - self._last_ns > _PAUSE_NS and not self._sockets.waiting():
+                time.sleep(self._batch_s)
+        now = time.time_ns()
+        self._second_count += 1
+        if now - self._second_ns > 1_000_000_000:
+            self._busy = bool(self._batch_s) and self._second_count > _BUSY_PER_S
+            self._second_ns, self._second_count = now, 0
+            self._sockets = _Sockets()
+        if len(self._queue) < self._most:
+            self._queue.append(
+                Taken(
+                    str(sample.key_expr),
+                    sample.payload.to_bytes(),
+                    published_ns(sample, now),
+                    now,
+                    sample.source_info,
+                )
+            )
+        else:
+            self.refused[str(sample.key_expr)] += 1
+        self._last_ns = time.monotonic_ns()
+
+    def _keep(self, thread: int) -> None:
+        """Keep Python's state of a thread of Zenoh's. It would be made and freed for every message, for 25 µs."""
+        self._receiving.add(thread)
+        ctypes.pythonapi.PyGILState_Ensure()
