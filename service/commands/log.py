@@ -17,6 +17,7 @@ from service.commands.common import (
     run_alone,
     settings_of,
 )
+from service.commands.compare import Html, compare, write_html
 
 if TYPE_CHECKING:
     from threading import Event
@@ -44,6 +45,7 @@ def review(
             show_default=False,
         ),
     ] = None,
+    html: Html = None,
     json: Json = False,
 ) -> None:
     """Say everything that logs tell of a run, hold its figures to limits, draw the paper's figures."""
@@ -63,7 +65,10 @@ def review(
 
             for path in draw_figures(judged.session.settings, kept[judged.which], figures):
                 typer.echo(f"aeroloop: drew {path}", err=True)
-        return judged.report(limits)
+        report = judged.report(limits)
+        if html is not None:
+            write_html([report], html)
+        return report
 
     findings = guarded(run).findings
     if json:
@@ -75,6 +80,9 @@ def review(
     broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
     if broken:
         fail("; ".join(broken), 1)
+
+
+group.command()(compare)
 
 
 @group.command()
@@ -162,7 +170,7 @@ def export(
     to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="What kind of file.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="The new file; the log's name with another suffix if left out.", show_default=False),
+        typer.Option("--out", help="The new file; the log's name with another ending if left out.", show_default=False),
     ] = None,
     session: Annotated[
         str | None,

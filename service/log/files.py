@@ -17,8 +17,8 @@ from protocol.verbs import Change
 from service.config import Settings, from_contract
 from service.log.mcap_index import skim
 from service.log.mcap_records import (
-    CHANNEL,
     CHANGE_METADATA,
+    CHANNEL,
     CONTRACT_METADATA,
     MESSAGE,
     METADATA,

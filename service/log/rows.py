@@ -54,7 +54,7 @@ def micros(value: float) -> str:
 
 def seconds(value: float) -> str:
     """A time on the law's clock or its length, to the millisecond: `12.346`."""
-    return f"{value:,.3f}"
+    return f"{value:,.3f}".replace("-", "−")
 
 
 def percent(share: float) -> str:

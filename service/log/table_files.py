@@ -18,7 +18,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
-import scipy.io
 
 from protocol.errors import AeroloopError
 from service.log.table import Array, Group, Rows
@@ -146,6 +145,8 @@ class MatFile(TableFile):
 
     def close(self) -> None:
         """See `TableFile.close`."""
+        import scipy.io  # slow, and not for the others
+
         if self._bytes > MAT_LIMIT:
             raise ExportError(
                 f"a MATLAB file holds 2 GiB, and these rows take {self._bytes / 2**30:.1f} GiB; use --to parquet, "

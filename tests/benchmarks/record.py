@@ -55,8 +55,7 @@ def settings_for(log: Path, *overrides: str) -> Settings:
 
 def send(rendezvous: str, name: str, rate_hz: float, seconds: float, flood: bool) -> None:
     """Publish as a plant or a controller does, or as many as it takes; in a process of its own."""
-    from protocol.links import ZenohLink
-    from protocol.role import Numbered
+    from protocol.links import Numbered, ZenohLink
 
     with join(NetworkSettings(rendezvous=rendezvous)) as session:
         if flood:

@@ -23,6 +23,9 @@ for (const group of data.groups)
       delete line.values;
     }
 
+/** A number with a true minus sign. */
+const signed = (text) => text.replace("-", "−");
+
 /** A colour of the style sheet as the present theme has it, such as `--ink`. */
 function colour(name) {
   const probe = document.createElement("i");
@@ -54,10 +57,10 @@ function durationTicks(from, to) {
 
 /** A key beside a drawing's title: what each colour means. */
 function showKey(figure, entries) {
-  const items = entries.map(([name, line]) => {
+  const items = entries.map(([name, line, dash]) => {
     const item = document.createElement("span");
     const swatch = document.createElement("i");
-    swatch.className = "swatch";
+    swatch.className = `swatch ${dash ?? ""}`;
     swatch.style.setProperty("--line", `var(${line})`);
     item.append(swatch, name);
     return item;

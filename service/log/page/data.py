@@ -17,8 +17,8 @@ import numpy as np
 from service.log.report import Array, Line, Mark, Panel, Report
 
 SPREADS: Final = {
-    "latency": "Loop latency: from a measurement to the command that answers it",
-    "period": "Period: between measurements",
+    "latency": "Latency as published: from a measurement to its command",
+    "period": "Period as published: between measurements",
 }
 """Which distributions are drawn, in this order, and what they are called."""
 
@@ -30,9 +30,8 @@ Spoken = dict[str, Any]
 
 def page_data(reports: Sequence[Report]) -> str:
     """Everything that is drawn, as JSON that may stand in a script element."""
-    ends = [(report.time[0], report.time[-1]) for report in reports if len(report.time)]
     data = {
-        "span": [float(min(end[0] for end in ends)), float(max(end[1] for end in ends))] if ends else [0.0, 1.0],
+        "span": _span(reports),
         "runs": [_run(report) for report in reports],
         "groups": list(_groups(reports)),
         "spreads": [
@@ -68,6 +67,15 @@ def period_s(report: Report) -> float | None:
     """The loop's period [s], as configured; None if the log does not say."""
     rate = report.settings.get("loop", {}).get("rate_hz")
     return 1 / rate if isinstance(rate, int | float) and rate > 0 else None
+
+
+def _span(reports: Sequence[Report]) -> tuple[float, float]:
+    """The time that the whole page is about, with a little room, so that nothing hides in its edges."""
+    times = [float(time) for report in reports for time in (*report.time[:1], *report.time[-1:])]
+    times += [mark.time_s for report in reports for mark in report.findings.marks if mark.time_s is not None]
+    start, end = (min(times), max(times)) if times else (0.0, 1.0)
+    room = 0.01 * (end - start) or 0.5
+    return start - room, end + room
 
 
 def _run(report: Report) -> Spoken:
@@ -116,13 +124,25 @@ def _lines(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> Ite
             if not line.desired or len(reports) == 1:
                 yield run, nth, line, line.desired
                 continue
-            others = [(reports[r].time, other) for r, p in alike for other in p.lines if other.desired]
+            others = [(reports[r].time, other.values) for r, p in alike for other in p.lines if other.desired]
             same = len(others) == len(alike) and all(
-                np.array_equal(time, reports[run].time) and np.array_equal(other.values, line.values, equal_nan=True)
-                for time, other in others
+                _agree(reports[run].time, line.values, time, values) for time, values in others
             )
-            if not same or run == alike[0][0]:
+            longest = max(alike, key=lambda one: reports[one[0]].findings.duration_s)[0]
+            if not same or run == longest:
                 yield run, nth, line, same
+
+
+def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
+    """Whether two lines are the same, as far as can be seen, for as long as both last.
+
+    They need not be the same to the last bit: each was sampled, and perhaps thinned out, in its own way.
+    """
+    both = (time >= other_time[:1].sum()) & (time <= other_time[-1:].sum())
+    if not both.any():
+        return False
+    apart = np.abs(np.interp(time[both], other_time, other_values) - values[both])
+    return bool(np.nanmax(apart, initial=0.0) <= 0.02 * np.nanmax(np.abs(values), initial=1e-12))
 
 
 def _sparse(values: Array) -> bool:

@@ -48,6 +48,7 @@ def page(reports: Sequence[Report]) -> str:
         style=tag("style", Html("\n" + _read("page.css"))),
         masthead=verdict.masthead(reports),
         navigation=_navigation(sections := _sections(reports)),
+        runs="several" if len(reports) > 1 else "one",
         verdict=tag("div", verdict.verdict(reports), class_="verdicts"),
         sections=joined(_section(*section) for section in sections),
         data=tag("script", Html(page_data(reports)), type="application/json", id="data"),
@@ -83,8 +84,8 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
     ])  # fmt: skip
     return [
         ("figures", "Figures of merit", verdict.figures(reports)),
-        *([("broken", "What is missing from the log", broken)] if broken else []),
         *([("differences", "What differs in the configurations", setup.differing(reports))] if several else []),
+        *([("broken", "What is missing from the log", broken)] if broken else []),
         ("tracking", "Tracking", joined([_thinned(reports), drawn])),
         ("events", "Events", happenings.events(reports)),
         ("timing", "Timing", timing),

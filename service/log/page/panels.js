@@ -9,6 +9,14 @@ function lineColour(line) {
   return line.nth ? "--other" : "--measured";
 }
 
+/** Whether it is a run's own desired line, beside others. */
+const isOwn = (line) => several && line.desired && !line.shared;
+
+function lineDash(line) {
+  if (isOwn(line)) return "dot";
+  return several && line.nth ? "dash" : "solid";
+}
+
 function lineName(line) {
   const run = data.runs[line.run].name;
   if (!several || line.shared) return line.label;
@@ -27,8 +35,8 @@ function traces(group) {
       name: plain(group.panels.length > 1 ? `${panel.label} ${lineName(line)}` : lineName(line)),
       line: {
         color: colour(lineColour(line)),
-        width: line.desired ? 2.5 : 1.1,
-        dash: several && line.nth ? "dash" : "solid",
+        width: line.desired && !isOwn(line) ? 2.5 : 1.1,
+        dash: lineDash(line),
       },
       hovertemplate: `%{y:.${panel.decimals}f}${panel.unit && ` ${panel.unit}`}`,
     })),
@@ -118,6 +126,7 @@ function timeLayout(group) {
     layout.annotations.push({
       text: plain(panel.unit ? `${panel.label} [${panel.unit}]` : panel.label), showarrow: false, xref: "paper", x: 0,
       xanchor: "left", xshift: 2, yref: `${axisOf(row)} domain`, y: 1, yanchor: "bottom", font: { color: colour("--ink"), size: 12.5 },
+      bgcolor: colour("--paper"), borderpad: 0,
     });
   });
   return layout;
@@ -138,5 +147,5 @@ async function drawGroup(figure) {
   const lines = group.panels.flatMap((panel) => panel.lines).sort((one, other) => one.desired - other.desired);
   const meanings = new Map(lines.map((line) => [lineName(line), line]));
   if (meanings.size > 1 || several)
-    showKey(figure, [...meanings].map(([name, line]) => [name, lineColour(line)]));
+    showKey(figure, [...meanings].map(([name, line]) => [name, lineColour(line), lineDash(line)]));
 }

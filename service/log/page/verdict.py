@@ -22,14 +22,14 @@ def judgement(run: Findings) -> Judgement:
     """By the limits that were asked for; without any, by what happened."""
     broken = [check for check in run.checks if not check.holds]
     if broken:
-        return Judgement("Not held", False, f"{len(broken)} of {_count(len(run.checks), 'limit')} broken")
+        return Judgement("Not held", False, f"{len(broken)} of {_count(len(run.checks), 'limit')} broken.")
     if run.checks:
-        return Judgement("Held", True, f"{_count(len(run.checks), 'limit')} asked for, none broken")
+        return Judgement("Held", True, f"{_count(len(run.checks), 'limit')} asked for, none broken.")
     if run.z_track is None:
         return Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
     if run.trips:
-        return Judgement("Tripped", False, f"the plant went to 0 V by itself {_times(len(run.trips))}")
-    return Judgement("Tracked", None, "the plant never went to 0 V by itself; no limit was asked for")
+        return Judgement("Tripped", False, f"The plant went to 0 V by itself {_times(len(run.trips))}.")
+    return Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was asked for.")
 
 
 def run_name(report: Report, index: int, of: int) -> Html:
@@ -102,7 +102,7 @@ def figures(reports: Sequence[Report]) -> Html:
 
 def _card(row: Row) -> Html:
     value = row.values[0]
-    unit = f" {row.unit}" if row.unit and value.text != "–" else None
+    unit = None if value.text == "–" else row.unit if row.unit == "°" else f" {row.unit}"
     return tag(
         "div",
         tag("dt", row.name),

@@ -40,7 +40,7 @@ function moveTime(how) {
 function tellTime() {
   const [from, to] = timeWindow.shown;
   const digits = Math.min(3, Math.max(0, 2 - Math.floor(Math.log10(to - from))));
-  document.getElementById("shown").value = `${from.toFixed(digits)} – ${to.toFixed(digits)} s`;
+  document.getElementById("shown").value = signed(`${from.toFixed(digits)} – ${to.toFixed(digits)} s`);
 }
 
 const moves = { ArrowLeft: "earlier", ArrowRight: "later", "+": "in", "=": "in", "-": "out", 0: "whole", Home: "whole" };

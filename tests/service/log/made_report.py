@@ -28,6 +28,7 @@ def made_report(
     settings: dict[str, Any] | None = None,
     thinned: int = 1,
     phase: float = 0.0,
+    turned: bool = False,
 ) -> Report:
     """Ten seconds of sines, with one trip and one gap.
 
@@ -38,10 +39,11 @@ def made_report(
         damages: What could not be read.
         settings: Sections of the configuration over the usual ones.
         thinned: Ticks behind two points.
-        phase: Of the measured lines [rad]; the desired ones are the same in every report.
+        phase: Of the measured lines [rad]; the desired ones do not change with it.
+        turned: Whether they are turned around.
     """
     time = np.linspace(0.0, 10.0, 501)
-    desired, measured = np.sin(time), np.sin(time - phase) + 0.02 * np.cos(31 * time)
+    desired, measured = np.sin(time) * (-1.0 if turned else 1.0), np.sin(time - phase) + 0.02 * np.cos(31 * time)
     tenth = np.where(np.arange(501) % 10 == 0, measured, np.nan)
     panels = [
         *(
@@ -53,7 +55,8 @@ def made_report(
               [Line("measured", measured)]),
         Panel("input", "Figure C.11: Input with quantization", "u₂", "V", [Line("commanded", 20 * measured)]),
         Panel("damping_estimate", "Damping estimate", "θ̂₁", "N·m·s/rad", [Line("estimated", tenth)]),
-        Panel("latency", "Loop latency", "latency", "µs", [Line("latency", np.where(measured > 1.01, 90_000.0, 600.0))]),
+        Panel("latency", "Loop latency", "latency", "µs",
+              [Line("latency", np.where(measured > 1.01, 90_000.0, 600.0))]),
     ]  # fmt: skip
     spread = Spread(count=854, p50=640.0, p90=690.0, p99=2400.0, p999=5900.0, max=6011.0, bins=BINS)
     findings = Findings(

@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -110,6 +112,12 @@ class Viewer:
         """Listen until all of these have been advertised."""
         while not set(topics) <= set(self.channels):
             self._hear()
+
+    def await_closed(self) -> None:
+        """Listen until the server has closed the connection."""
+        with suppress(ConnectionClosed):
+            while True:
+                self._hear()
 
     def subscribe(self, *topics: str) -> None:
         """Ask for what has been advertised; ids of subscriptions are those of channels and 1000."""
