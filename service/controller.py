@@ -7,7 +7,7 @@ run this one code path. The law's time is k times the period.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
 from protocol.frames import WireSpec
@@ -83,13 +83,23 @@ class Controller:
         if read is None:
             self.refused += 1
             return None
-        counter, codes = read
+        return self.answer(*read, k)
+
+    def answer(self, counter: int, codes: Sequence[float], k: int) -> bytes:
+        """The command frame that answers a measurement with this counter and these codes; see `tick`."""
+        voltages = self.compute(counter, codes, k)
+        if voltages is None:
+            return self._write(counter, self._no_command)
+        return self._write(counter, [encode(u) for encode, u in zip(self._encode, voltages, strict=True)])
+
+    def compute(self, counter: int, codes: Sequence[float], k: int) -> list[float] | None:
+        """What `answer` sends, before quantization [V]; None if that has no valid value. Shape (actuators,)."""
         attitude, rate = self._attitude_level, self._rate_level
         x, y, z = attitude(codes[0]), attitude(codes[1]), attitude(codes[2])
         wx, wy, wz = rate(codes[3]), rate(codes[4]), rate(codes[5])
         if (total := x + y + z + wx + wy + wz) != total:  # NaN: no valid value
             self.invalid += 1
-            return self._write(counter, self._no_command)
+            return None
         self._attitude = received_quaternion(x, y, z, self._attitude)
         self._q[0], self._q[1], self._q[2], self._q[3] = self._attitude
         self._omega[0], self._omega[1], self._omega[2] = wx, wy, wz
@@ -102,9 +112,9 @@ class Controller:
         voltages: list[float] = self._u.tolist()[self._first_motor :]  # type: ignore[assignment]  # doubles
         if (total := sum(voltages)) != total:
             self.failed = True
-            return self._write(counter, self._no_command)
+            return None
         self.voltages = voltages
-        return self._write(counter, [encode(u) for encode, u in zip(self._encode, voltages, strict=True)])
+        return voltages
 
     def attitude_of(self, frame: bytes) -> Quaternion | None:
         """The attitude that a measurement frame says; None if it is malformed or says no valid value."""

@@ -12,7 +12,7 @@ from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
 from service.log.intake import Taken
-from service.log.mcap_records import CONTRACT_METADATA
+from service.log.mcap_records import CHANGE_METADATA, CONTRACT_METADATA
 from service.log.writer import LogFile
 from service.reference import Plan
 
@@ -65,7 +65,11 @@ def make_log(
     key = topics.key("contract", VEHICLE, role="controller")
     log.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract.model_dump_json()})
     first = Change(session=SESSION, tick=0, gains=controller.gains, reference=settings.reference)
-    write("change", first.encode(), START_NS - 1)
+    if begin:  # as in a file that another one has gone before
+        key = topics.key("change", VEHICLE)
+        log.add_metadata(CHANGE_METADATA, {"key": key, "json": first.model_dump_json()})
+    else:
+        write("change", first.encode(), START_NS - 1)
     measurement = endpoint.tick(None, 0)
     for k in range(ticks):
         assert measurement is not None
