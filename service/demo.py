@@ -15,10 +15,11 @@ import zenoh
 from protocol import topics
 from protocol.attitude import angle
 from protocol.messages import Status, Telemetry
-from service.bench import Bench, free_rendezvous, private_bus
+from service.bench import Bench, BenchError, free_rendezvous, private_bus
 from service.config import Settings
 from service.figures import Figures
 from service.log.review import review
+from service.log.rolling import parts
 
 REFRESH_S = 0.1
 
@@ -79,10 +80,12 @@ def run_demo(
         The figures, and whether it ran to the end (False after ^C).
 
     Raises:
-        BenchError: A process did not start, or failed.
+        BenchError: A process did not start, or failed, or the log exists.
         ReviewError: The log cannot be judged.
     """
     path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
+    if parts(path):
+        raise BenchError(f"{path} exists, and a log is never written over; name another with --log PATH")
     settings = settings.model_copy(
         update={
             "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
@@ -108,7 +111,7 @@ def run_demo(
             if show is not None:
                 show(progress)
         bench.check()
-    return review(path), not interrupted.is_set()
+    return review(*parts(path)), not interrupted.is_set()
 
 
 @contextmanager

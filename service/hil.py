@@ -139,6 +139,8 @@ class Hil:
         ours = {
             "network.rendezvous": free_rendezvous(),
             "recorder.path": str(log),
+            "recorder.max_file_mb": 1e6,  # a test looks into one file
+            "recorder.max_file_s": 1e6,
             "controller.require_recorder": True,
             "loop.lockstep": self._lockstep,
             "plant.steps_on_request": self._lockstep and self._via == "emulator",

@@ -16,8 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from protocol import topics
 from protocol.messages import Percentiles, Status
-from service.bench import Bench, RoleName, free_rendezvous, private_bus
+from service.bench import Bench, BenchError, RoleName, free_rendezvous, private_bus
 from service.config import Settings
+from service.log.rolling import parts
 
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 WARM_UP: Final = 0.1
@@ -75,8 +76,10 @@ def run_soak(
         progress: Called once a sample with the seconds reached and the sample.
 
     Raises:
-        BenchError: A process did not start, or failed.
+        BenchError: A process did not start, or failed, or the log exists.
     """
+    if parts(log):
+        raise BenchError(f"{log} exists, and a log is never written over; name another with --log PATH")
     settings = settings.model_copy(
         update={
             "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
@@ -116,7 +119,7 @@ def run_soak(
         minutes=samples,
         findings=_findings(samples, sessions),
         log=str(log),
-        log_mb=round(log.stat().st_size / 1e6, 2),
+        log_mb=round(sum(path.stat().st_size for path in parts(log)) / 1e6, 2),
     )
 
 

@@ -39,6 +39,13 @@ class RecorderError(AeroloopError):
     """The log cannot be written; one line that says why and what to do."""
 
 
+def parts(path: Path) -> list[Path]:
+    """The files of a run that began with this one, in their order."""
+    numbered = re.compile(re.escape(path.stem) + r"-\d{4,}\.mcap")
+    followed = sorted(other for other in path.parent.glob("*.mcap") if numbered.fullmatch(other.name))
+    return [path, *followed] if path.exists() else followed
+
+
 class _Entry(NamedTuple):
     taken: Taken
     sequence: int
