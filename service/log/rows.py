@@ -54,7 +54,7 @@ def micros(value: float) -> str:
 
 def seconds(value: float) -> str:
     """A time on the law's clock or its length, to the millisecond: `12.346`."""
-    return f"{value:,.3f}".replace("-", "−")
+    return f"{round(value, 3) + 0.0:,.3f}".replace("-", "−")  # + 0.0: no minus before a zero
 
 
 def percent(share: float) -> str:

@@ -95,10 +95,11 @@ def _groups(reports: Sequence[Report]) -> Iterator[Spoken]:
             for panel in report.panels:
                 if panel.group == group:
                     panels.setdefault(panel.label, []).append((run, panel))
-        yield {"id": group, "panels": [_panel(label, alike, reports) for label, alike in panels.items()]}
+        shared = all(_desired_agree(alike, reports) for alike in panels.values())
+        yield {"id": group, "panels": [_panel(label, alike, reports, shared) for label, alike in panels.items()]}
 
 
-def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> Spoken:
+def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool) -> Spoken:
     least, most = _extent([line.values for _, panel in alike for line in panel.lines])
     unit = alike[0][1].unit
     return {
@@ -107,30 +108,31 @@ def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Rep
         "decimals": _decimals(max(abs(least), abs(most))),
         "log": unit in {"µs", "ms", "s"} and least > 0 and most > 30 * least,
         "lines": [
-            {"run": run, "label": line.label, "desired": line.desired, "shared": shared, "nth": nth,
+            {"run": run, "label": line.label, "desired": line.desired, "shared": shared and line.desired, "nth": nth,
              "sparse": _sparse(line.values), "values": _packed(line.values, "<f4")}
-            for run, nth, line, shared in _lines(alike, reports)
+            for run, nth, line in _lines(alike, reports, shared)
         ],
     }  # fmt: skip
 
 
-def _lines(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> Iterator[tuple[int, int, Line, bool]]:
-    """Run, how manieth of its kind, line, and whether it stands for every run: a desired value all have in common."""
+def _lines(
+    alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool
+) -> Iterator[tuple[int, int, Line]]:
+    """Run, how manieth of its kind, line; of desired ones that are shared, the longest."""
+    longest = max((run for run, _ in alike), key=lambda run: reports[run].findings.duration_s)
     for run, panel in alike:
         count = {True: 0, False: 0}
         for line in panel.lines:
-            nth = count[line.desired]
+            if not (line.desired and shared) or run == longest:
+                yield run, count[line.desired], line
             count[line.desired] += 1
-            if not line.desired or len(reports) == 1:
-                yield run, nth, line, line.desired
-                continue
-            others = [(reports[r].time, other.values) for r, p in alike for other in p.lines if other.desired]
-            same = len(others) == len(alike) and all(
-                _agree(reports[run].time, line.values, time, values) for time, values in others
-            )
-            longest = max(alike, key=lambda one: reports[one[0]].findings.duration_s)[0]
-            if not same or run == longest:
-                yield run, nth, line, same
+
+
+def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> bool:
+    """Whether every run desires the same here, so that one line can stand for all."""
+    desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
+    one_each = len(desired) in (0, len(alike)) and len(alike) == len(reports)
+    return one_each and all(_agree(*desired[0], *other) for other in desired[1:])
 
 
 def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
@@ -138,11 +140,12 @@ def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -
 
     They need not be the same to the last bit: each was sampled, and perhaps thinned out, in its own way.
     """
-    both = (time >= other_time[:1].sum()) & (time <= other_time[-1:].sum())
-    if not both.any():
+    if not (len(time) and len(other_time)):
         return False
+    both = (time >= other_time[0]) & (time <= other_time[-1]) & np.isfinite(values)
     apart = np.abs(np.interp(time[both], other_time, other_values) - values[both])
-    return bool(np.nanmax(apart, initial=0.0) <= 0.02 * np.nanmax(np.abs(values), initial=1e-12))
+    apart = apart[np.isfinite(apart)]
+    return bool(len(apart) and apart.max() <= 0.02 * np.abs(values[both]).max())
 
 
 def _sparse(values: Array) -> bool:

@@ -17,16 +17,18 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
-from service.log.compare import Comparison, broken_limits, named_apart
 from service.log.files import ReviewError
 from service.log.page.data import page_data
 from service.log.page.markup import tag
 from service.log.page.page import page, write_page
-from service.log.report import Check, Mark, Report
+from service.log.report import Check, Mark, Panel, Report
 from service.log.rows import figure_rows, micros, percent
 from tests.service.log.made_report import MARKS, made_report
 
 HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""
+PATIENCE_MS = 120_000
+"""Nothing here is about speed; a browser on a busy machine may take its time."""
+
 HELD = Check(text="z_track ≤ 0.005 s", holds=True, found="0.00458 s")
 BROKEN = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
 
@@ -94,6 +96,10 @@ def test_data_cannot_end_its_script_and_comes_back_as_it_was() -> None:
     assert loads(data)["runs"][0]["name"] == HOSTILE
 
 
+def shortened(panel: Panel, n: int) -> Panel:
+    return replace(panel, lines=[replace(line, values=line.values[:n]) for line in panel.lines])
+
+
 def test_a_desired_line_that_runs_share_is_drawn_once() -> None:
     def desired(*reports: Report) -> list[dict[str, Any]]:
         (group,) = [group for group in loads(page_data(reports))["groups"] if group["id"] == "attitude"]
@@ -103,6 +109,8 @@ def test_a_desired_line_that_runs_share_is_drawn_once() -> None:
     assert [line["shared"] for line in desired(one, later)] == [True]
     other = made_report("c", turned=True)
     assert [line["shared"] for line in desired(one, other)] == [False, False]
+    short = replace(later, time=later.time[:300], panels=[shortened(panel, 300) for panel in later.panels])
+    assert [line["shared"] for line in desired(one, short)] == [True]
 
 
 def test_a_run_without_values_has_a_page() -> None:
@@ -129,15 +137,6 @@ def test_numbers_have_sensible_digits() -> None:
     assert (z_track.values[0].text, z_track.unit) == ("45.80", "10⁻⁴ s")
 
 
-def test_a_comparison_names_runs_apart_and_says_what_differs() -> None:
-    runs = named_apart([made_report(), made_report(checks=[BROKEN], settings={"law": {"C2": [0.3, 0.3, 0.3]}})])
-    compared = Comparison.of(runs)
-    assert list(compared.runs) == ["a.mcap", "a.mcap (2)"]
-    (differs,) = compared.differences
-    assert (differs.key, list(differs.values.values())) == ("law.C2", [[0.15, 0.15, 0.15], [0.3, 0.3, 0.3]])
-    assert broken_limits(runs) == ["a.mcap (2): skipped_ticks ≤ 0 does not hold: 50"]
-
-
 # in a browser
 
 Open = Callable[..., Page]
@@ -152,7 +151,7 @@ def browser() -> Iterator[Browser]:
     arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
                  "--disable-component-update", "--disable-sync"]  # fmt: skip
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=arguments)
+        browser = playwright.chromium.launch(executable_path=found, args=arguments, timeout=PATIENCE_MS)
         yield browser
         browser.close()
 
@@ -171,6 +170,7 @@ def open_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Ite
         context = browser.new_context(
             viewport={"width": 1280, "height": 900}, color_scheme="light", reduced_motion="reduce"
         )
+        context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
         opened = context.new_page()
         opened.on("request", lambda request: None if request.url == out.as_uri() else asked.append(request.url))
