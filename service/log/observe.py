@@ -7,8 +7,9 @@ Durations go into histograms, lines into buckets (thin.py), and of gaps the long
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from itertools import chain
 from math import nan
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.attitude import Quaternion
-from protocol.frames import FrameFormat, SignalSpec
+from protocol.frames import SignalSpec
 from protocol.messages import Telemetry
 from service.config import Settings
 from service.log.panels import columns_of, panels_of
@@ -133,8 +134,7 @@ class Observer:
         self._columns = columns_of(settings)
         self._lines = ThinnedLines(2 + len(self._columns))  # k and time of publication, then what is drawn
         self._ticks: list[Tick] = []
-        self._frames: dict[str, list[bytes]] = {"measurement": [], "command": []}
-        self._formats: dict[str, FrameFormat] = {"measurement": wire.measurement, "command": wire.command}
+        self._codes: dict[str, list[tuple[float, ...]]] = {"measurement": [], "command": []}
         self._measured: list[int] = []
         self._answers: list[int] = []
         self._damping, self._truth = Told(3), Told(4)
@@ -150,16 +150,16 @@ class Observer:
 
     # ── what it is told ──
 
-    def measurement(self, frame: bytes, published_ns: int) -> None:
-        """A measurement frame, answered or not."""
+    def measurement(self, codes: tuple[float, ...], published_ns: int) -> None:
+        """A measurement, answered or not."""
         if self._start_ns is None:
             self._start_ns = published_ns
         self._measured.append(published_ns)
-        self._frame("measurement", frame)
+        self._frame("measurement", codes)
 
-    def command(self, frame: bytes) -> None:
-        """A command frame."""
-        self._frame("command", frame)
+    def command(self, codes: tuple[float, ...]) -> None:
+        """A command."""
+        self._frame("command", codes)
 
     def answered(self, k: int) -> None:
         """Tick k was answered, be it by a command without a valid value."""
@@ -184,7 +184,7 @@ class Observer:
 
     def finish(self) -> None:
         """No more is to come."""
-        for name in self._frames:
+        for name in self._codes:
             self._reduce_frames(name)
         self._reduce_ticks()
         self._reduce_gaps()
@@ -249,9 +249,9 @@ class Observer:
 
     # ── a block at a time ──
 
-    def _frame(self, name: str, frame: bytes) -> None:
-        frames = self._frames[name]
-        frames.append(frame)
+    def _frame(self, name: str, codes: tuple[float, ...]) -> None:
+        frames = self._codes[name]
+        frames.append(codes)
         if len(frames) >= BLOCK:
             self._reduce_frames(name)
 
@@ -262,9 +262,8 @@ class Observer:
             self._period_ns.add(np.diff(times))
             self._last_measured = times[-1:]
             self._measured.clear()
-        unpack, frames = self._formats[name].unpack, self._frames[name]
-        codes = np.array([read[1] for frame in frames if (read := unpack(frame)) is not None], dtype=np.float64)
-        frames.clear()
+        codes = _rows(self._codes[name])
+        self._codes[name].clear()
         if len(codes):
             if name == "measurement":
                 wrong = self._outermost["attitude"].add(codes[:, :3]) | self._outermost["rate"].add(codes[:, 3:])
@@ -285,7 +284,8 @@ class Observer:
         self._last_tick_ns = float(published[-1])
         seconds = np.asarray(published * 1e-9, dtype=np.float64)
         attitude, desired, rate, desired_rate, error, rate_error, voltages = (
-            np.array([tick[i] for tick in ticks], dtype=np.float64) for i in range(3, 10)
+            _rows([tick[i] for tick in ticks])  # type: ignore[misc]  # from the third on they are rows
+            for i in range(3, 10)
         )
         attitude = _beside(attitude, desired)
         self._lines.add(
@@ -317,6 +317,12 @@ class Observer:
         self.gap_count += len(where)
         found = [(int(missing[i]), int(answers[i]) + 1) for i in where]
         self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
+
+
+def _rows(rows: Sequence[tuple[float, ...]]) -> Array:
+    """Rows of equal length as a matrix; three times as fast as `np.array`. Shape (n, columns)."""
+    columns = len(rows[0]) if rows else 0
+    return np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * columns).reshape(len(rows), columns)
 
 
 def _beside(attitude: Array, desired: Array) -> Array:

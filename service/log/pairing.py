@@ -33,14 +33,21 @@ class Seen(NamedTuple):
     published_ns: int
 
 
-class Pair(NamedTuple):
-    """A measurement, the command that answered it, and the measurements before it that none did, with counters."""
+class Read(NamedTuple):
+    """A frame out of the log, and what it says."""
 
     counter: int
-    measurement: Seen
-    command: Seen
     codes: tuple[float, ...]
-    before: list[tuple[int, Seen]]
+    frame: bytes
+    published_ns: int
+
+
+class Pair(NamedTuple):
+    """A measurement, the command that answered it, and the measurements before it that none did."""
+
+    measurement: Read
+    command: Read
+    before: list[Read]
 
 
 class Pairing(ABC):
@@ -58,8 +65,8 @@ class Pairing(ABC):
         self._wire = wire
         self._read_measurement, self._read_command = wire.measurement.unpack, wire.command.unpack
         self._loop = loop
-        self._measured: deque[tuple[int, Seen]] = deque(maxlen=MAX_WAITING)  # not answered yet, with their counters
-        self._commands: deque[Seen] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
+        self._measured: deque[Read] = deque(maxlen=MAX_WAITING)  # not answered yet
+        self._commands: deque[Read] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
         self._pairs: deque[Pair] = deque(maxlen=MAX_WAITING)  # whose tick is not known yet
         self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
         self._ticks: TickCounter | None = None  # once it is known where it starts
@@ -71,11 +78,11 @@ class Pairing(ABC):
         return self._ticks is None
 
     @abstractmethod
-    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
-        """A measurement that a command answered, at tick k; the command and its codes."""
+    def answered(self, k: int, measurement: Read, command: Read) -> None:
+        """A measurement that a command answered, at tick k."""
 
     @abstractmethod
-    def passed_over(self, k: int, measurement: Seen) -> None:
+    def passed_over(self, k: int, measurement: Read) -> None:
         """A measurement that no command answered, while one answered a later one."""
 
     def measurement(self, seen: Seen) -> None:
@@ -83,14 +90,26 @@ class Pairing(ABC):
         read = self._read_measurement(seen.frame)
         if read is None:
             self.malformed += 1
-            return
-        if self._commands:
-            self._answer(seen.published_ns)
-        self._measured.append((read[0], seen))
+        else:
+            self.measured(Read(*read, *seen))
 
     def command(self, seen: Seen) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
-        self._commands.append(seen)
+        read = self._read_command(seen.frame)
+        if read is None:
+            self.malformed += 1
+        else:
+            self.commanded(Read(*read, *seen))
+
+    def measured(self, measurement: Read) -> None:
+        """A measurement that could be read."""
+        if self._commands:
+            self._answer(measurement.published_ns)
+        self._measured.append(measurement)
+
+    def commanded(self, command: Read) -> None:
+        """A command that could be read."""
+        self._commands.append(command)
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
         """Which tick a counter stood for; the first that can be matched tells it for the whole session."""
@@ -109,19 +128,15 @@ class Pairing(ABC):
         """
         commands, measured = self._commands, self._measured
         while commands and commands[0].published_ns < until_ns:
-            seen = commands.popleft()
-            read = self._read_command(seen.frame)
-            if read is None:
-                self.malformed += 1
-                continue
-            echo, codes = read
+            command = commands.popleft()
+            echo, published_ns = command.counter, command.published_ns
             found = len(measured) - 1
-            while found >= 0 and (measured[found][0] != echo or measured[found][1].published_ns >= seen.published_ns):
+            while found >= 0 and (measured[found].counter != echo or measured[found].published_ns >= published_ns):
                 found -= 1
             if found < 0:
                 continue  # answers what the log does not have, or repeats an answer
             before = [measured.popleft() for _ in range(found)]
-            pair = Pair(*measured.popleft(), seen, codes, before)
+            pair = Pair(measured.popleft(), command, before)
             if self._ticks is not None:
                 self._place(pair, self._ticks)
             else:
@@ -134,10 +149,13 @@ class Pairing(ABC):
             telemetry, published_ns = self._anchors.popleft()
             pairs = list(self._pairs)
             for i in reversed(range(len(pairs))):
-                if pairs[i].measurement.published_ns < published_ns and pairs[i].counter == telemetry.counter:
+                if (
+                    pairs[i].measurement.published_ns < published_ns
+                    and pairs[i].measurement.counter == telemetry.counter
+                ):
                     first = telemetry.tick
                     for pair in reversed(pairs[:i]):
-                        first = _before(first, pair.counter)
+                        first = _before(first, pair.measurement.counter)
                     loop = self._loop
                     self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep, tick=max(0, first) - 1)
                     self._pairs.clear()
@@ -149,19 +167,19 @@ class Pairing(ABC):
     def _place(self, pair: Pair, ticks: TickCounter) -> None:
         """Find the tick as the controller did: it, too, saw the measurements that it answered, and no others."""
         last = ticks.tick
-        k = ticks.advance(pair.counter, pair.measurement.published_ns)
+        k = ticks.advance(pair.measurement.counter, pair.measurement.published_ns)
         if k is None:
             return
         if pair.before:
             tick, over = k, []
-            for counter, seen in reversed(pair.before):
-                tick = _before(tick, counter)
+            for read in reversed(pair.before):
+                tick = _before(tick, read.counter)
                 if tick <= last:
                     break
-                over.append((tick, seen))
-            for missed, seen in reversed(over):
-                self.passed_over(missed, seen)
-        self.answered(k, pair.measurement, pair.command, pair.codes)
+                over.append((tick, read))
+            for missed, read in reversed(over):
+                self.passed_over(missed, read)
+        self.answered(k, pair.measurement, pair.command)
 
 
 def _before(tick: int, counter: int) -> int:

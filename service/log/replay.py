@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from math import sqrt
 from pathlib import Path
-from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -20,7 +19,7 @@ from protocol.verbs import Change
 from service.config import Settings, load_over
 from service.controller import Controller
 from service.log.files import LogFiles, Which
-from service.log.pairing import MAX_WAITING, Pairing, Seen, Sessions
+from service.log.pairing import MAX_WAITING, Pairing, Read, Seen, Sessions
 
 
 class Difference(BaseModel):
@@ -51,15 +50,6 @@ class SessionReplay(BaseModel):
     u_total_computed: float
 
 
-class Answer(NamedTuple):
-    """A measurement at tick k and the command that was logged for it, with its codes."""
-
-    k: int
-    measurement: bytes
-    logged: bytes
-    codes: tuple[float, ...]
-
-
 class Replayer(Pairing):
     """Replays one session.
 
@@ -76,7 +66,7 @@ class Replayer(Pairing):
         self._period = settings.loop.period
         self._begun = False
         self._unplaced: deque[Telemetry] = deque(maxlen=MAX_WAITING)
-        self._held: deque[Answer] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
+        self._held: deque[tuple[int, Read, Read]] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
         self.first_tick: int | None = None
         self.first_difference: Difference | None = None
         self.commands = self.differing = 0
@@ -87,14 +77,14 @@ class Replayer(Pairing):
         """Until it is known where to begin."""
         return not self._begun
 
-    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
+    def answered(self, k: int, measurement: Read, command: Read) -> None:
         """Compute the command of tick k again."""
         if self._begun:
-            self._compare(k, measurement.frame, command.frame, codes)
+            self._compare(k, measurement, command)
         else:
-            self._held.append(Answer(k, measurement.frame, command.frame, codes))
+            self._held.append((k, measurement, command))
 
-    def passed_over(self, k: int, measurement: Seen) -> None:
+    def passed_over(self, k: int, measurement: Read) -> None:
         """The controller never saw it."""
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
@@ -112,29 +102,24 @@ class Replayer(Pairing):
 
     def _begin(self, telemetry: Telemetry) -> None:
         tick = telemetry.tick
-        held = next((answer for answer in self._held if answer.k == tick), None)
+        held = next((pair for pair in self._held if pair[0] == tick), None)
         if held is None:
             return
+        _, measurement, command = held
         self._follow(tick)
-        computed = self._controller.tick(held.measurement, tick)
-        told = telemetry.damping_estimate, telemetry.attitude_error, telemetry.sign
+        computed = self._controller.tick(measurement.frame, tick)
         controller = self._controller
-        if held is self._held[0] and told == (
-            controller.damping_estimate,
-            controller.attitude_error,
-            controller.sign,
-        ):
+        told = telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error
+        if held is self._held[0] and told == (controller.sign, controller.damping_estimate, controller.attitude_error):
             self.first_tick = tick  # the session's very first: nothing had been computed before it
-            self._count(tick, computed, held.logged, held.codes)
+            self._count(tick, computed, command)
         else:
-            controller.resume(
-                held.measurement, tick, telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error
-            )
+            controller.resume(measurement.frame, tick, *told)
             self.first_tick = tick + 1
         self._begun = True
-        for answer in self._held:
-            if answer.k > tick:
-                self._compare(*answer)
+        for k, measurement, command in self._held:
+            if k > tick:
+                self._compare(k, measurement, command)
         self._held.clear()
 
     def result(self, vehicle: str, session: str) -> SessionReplay:
@@ -157,17 +142,17 @@ class Replayer(Pairing):
         while self._changes and self._changes[0].tick <= k:
             self._controller.apply(self._changes.popleft())
 
-    def _compare(self, k: int, measurement: bytes, logged: bytes, codes: tuple[float, ...]) -> None:
+    def _compare(self, k: int, measurement: Read, logged: Read) -> None:
         if self._changes:
             self._follow(k)
-        self._count(k, self._controller.tick(measurement, k), logged, codes)
+        self._count(k, self._controller.answer(measurement.counter, measurement.codes, k), logged)
 
-    def _count(self, k: int, computed: bytes | None, logged: bytes, codes: tuple[float, ...]) -> None:
-        theirs = self._volts(codes)
+    def _count(self, k: int, computed: bytes | None, logged: Read) -> None:
+        theirs = self._volts(logged.codes)
         square = sum([u * u for u in theirs])
         self.commands += 1
         self._logged += square
-        if computed == logged:
+        if computed == logged.frame:
             self._computed += square
             return
         self.differing += 1
@@ -175,11 +160,11 @@ class Replayer(Pairing):
             self.first_difference = Difference(
                 tick=k,
                 time_s=round(k * self._period, 9),
-                logged=logged.hex(),
+                logged=logged.frame.hex(),
                 computed=computed.hex() if computed is not None else "",
             )
         read = None if computed is None else self._read_command(computed)
-        ours = self._volts(read[1] if read else (0,) * len(codes))
+        ours = self._volts(read[1] if read else (0,) * len(theirs))
         self._computed += sum(u * u for u in ours)
         differences = [abs(a - b) for a, b in zip(ours, theirs, strict=True)]
         self._square += sum(d * d for d in differences)

@@ -24,7 +24,7 @@ from service.log.files import LogFiles, ReviewError, Which
 from service.log.findings import facts_of, findings_of, name_of
 from service.log.limits import Limit
 from service.log.observe import Observer
-from service.log.pairing import Pairing, Seen
+from service.log.pairing import Pairing, Read, Seen
 from service.log.report import Findings, Report
 from service.log.story import Story
 
@@ -72,46 +72,49 @@ class Session(Pairing):
         super().__init__(settings.wire, settings.loop)
         self._controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._level = settings.wire.voltage.quantizer().level
-        self._passed_over: list[tuple[int, Seen]] = []
+        self._passed_over: list[tuple[int, Read]] = []
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
         self._watch = watch
 
-    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
+    def answered(self, k: int, measurement: Read, command: Read) -> None:
         """Score the error at tick k, and the command."""
-        voltages = [self._level(code) for code in codes]
-        for tick, seen in self._passed_over:
-            self._score(tick, seen, None, voltages)
-        self._passed_over.clear()
+        level = self._level
+        voltages = tuple([level(code) for code in command.codes])
+        if self._passed_over:
+            for tick, read in self._passed_over:
+                self._score(tick, read, None, voltages)
+            self._passed_over.clear()
         self._score(k, measurement, command.published_ns - measurement.published_ns, voltages)
         self.score.command(k, voltages)
 
-    def passed_over(self, k: int, measurement: Seen) -> None:
+    def passed_over(self, k: int, measurement: Read) -> None:
         """It was not answered, but its error counts."""
         self._passed_over.append((k, measurement))
 
-    def _score(self, k: int, seen: Seen, latency_ns: int | None, voltages: list[float]) -> None:
+    def _score(self, k: int, read: Read, latency_ns: int | None, voltages: tuple[float, ...]) -> None:
         controller = self._controller
         while self._changes and self._changes[0].tick <= k:
             controller.apply(self._changes.popleft())
-        controller.tick(seen.frame, k)
+        controller.compute(read.counter, read.codes, k)
         if controller.tick_index != k:
             return  # a measurement without a valid value
-        self.score.error(k, controller.attitude_error)
+        attitude_error = controller.attitude_error
+        self.score.error(k, attitude_error)
         if self._watch is not None:
             rate, rate_error = controller.rate, controller.rate_error
             desired_rate = rate[0] - rate_error[0], rate[1] - rate_error[1], rate[2] - rate_error[2]
             self._watch(
                 Tick(
                     k,
-                    seen.published_ns,
+                    read.published_ns,
                     latency_ns,
                     controller.attitude,
                     controller.desired,
                     rate,
                     desired_rate,
-                    controller.attitude_error,
+                    attitude_error,
                     rate_error,
-                    tuple(voltages),
+                    voltages,
                 )
             )
 
@@ -134,25 +137,25 @@ class ObservedSession(Session):
         self.observer = Observer(settings)
         super().__init__(settings, changes, self.observer.tick if watch is None else self._both(watch))
 
-    def measurement(self, seen: Seen) -> None:
-        """See `Pairing.measurement`."""
-        self.observer.measurement(seen.frame, seen.published_ns)
-        super().measurement(seen)
+    def measured(self, measurement: Read) -> None:
+        """See `Pairing.measured`."""
+        self.observer.measurement(measurement.codes, measurement.published_ns)
+        super().measured(measurement)
 
-    def command(self, seen: Seen) -> None:
-        """See `Pairing.command`."""
-        self.observer.command(seen.frame)
-        super().command(seen)
+    def commanded(self, command: Read) -> None:
+        """See `Pairing.commanded`."""
+        self.observer.command(command.codes)
+        super().commanded(command)
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
         """See `Pairing.telemetry`."""
         self.observer.telemetry(telemetry)
         super().telemetry(telemetry, published_ns)
 
-    def answered(self, k: int, measurement: Seen, command: Seen, codes: tuple[float, ...]) -> None:
+    def answered(self, k: int, measurement: Read, command: Read) -> None:
         """See `Pairing.answered`."""
         self.observer.answered(k)
-        super().answered(k, measurement, command, codes)
+        super().answered(k, measurement, command)
 
     def finish(self) -> None:
         """See `Pairing.finish`."""

@@ -177,7 +177,7 @@ def test_without_quantization_a_value_at_the_limit_is_saturated() -> None:
     settings = load(overrides=["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"])
     observer = Observer(settings)
     for volts in (24.0, -24.0, 23.9, nan):
-        observer.command(settings.wire.command.pack(0, (volts, 1.0)))
+        observer.command((volts, 1.0))
     observer.finish()
     assert observer.saturated == {"voltage": 2 / 7}
     assert observer.invalid["command"] == 1
@@ -409,7 +409,7 @@ def feed(
     """Let an observer see a tick, with its measurement."""
     at = START_NS + k * PERIOD_NS
     zero = (0.0, 0.0, 0.0)
-    observer.measurement(bytes([k % 16 << 4, 0, 0, 0, 0, 0, 0]), at)
+    observer.measurement((0, 0, 0, 0, 0, 0), at)
     observer.tick(Tick(k, at, LATENCY_NS, attitude, desired, zero, zero, zero, zero, (0.0, 0.0)))
 
 
