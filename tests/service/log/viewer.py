@@ -94,19 +94,21 @@ class Viewer:
     """
 
     def __init__(self, url: str, max_queue: int | None = None) -> None:
-        self._socket = connect(url, subprotocols=[SUBPROTOCOL], max_queue=max_queue)
-        assert self._socket.subprotocol == SUBPROTOCOL
-        self.info: dict[str, Any] = json.loads(self._socket.recv(PATIENCE_S))
+        self._connecting = connect(url, subprotocols=[SUBPROTOCOL], max_queue=max_queue, close_timeout=0.5)
+        self.info: dict[str, Any] = {}
         self.channels: dict[str, dict[str, Any]] = {}
         self._topics: dict[int, str] = {}
 
     def __enter__(self) -> Self:
+        self._socket = self._connecting.__enter__()
+        assert self._socket.subprotocol == SUBPROTOCOL
+        self.info = json.loads(self._socket.recv(PATIENCE_S))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._socket.close()
+        self._connecting.__exit__(kind, error, trace)
 
     def await_topics(self, *topics: str) -> None:
         """Listen until all of these have been advertised."""
