@@ -24,12 +24,22 @@ from typing import Final, NamedTuple
 import zenoh
 
 from protocol.links import published_ns
+from service.log.losses import Numbers
 
 MOST_WAITING: Final = 200_000
 """Messages that may wait to be written: over a minute of a loop at 1 kHz, in some 100 MB."""
 
-CLOSING_NS: Final = 5_000_000_000
-"""A network that does not fall silent is closed after this all the same [ns]."""
+SETTLING_S: Final = 5.0
+"""A backlog that does not end is left after this [s]."""
+
+_QUIET_NS: Final = 50_000_000
+"""A network from which nothing has come for so long has nothing more on its way."""
+
+_GOES_ON_S: Final = 0.25
+"""A network that is not silent after this goes on for good, and only a backlog is still waited for [s]."""
+
+_BACKLOG: Final = 16 * 1024
+"""More than a loop at 1 kHz sends in 100 ms [B]."""
 
 _PAUSE_NS: Final = 300_000
 """A message this long after the last one may have found the sockets empty: what is buffered comes ten times as fast."""
@@ -46,14 +56,26 @@ class Taken(NamedTuple):
         payload: Its bytes.
         published_ns: When it was published, on its sender's wall clock [ns since 1970].
         arrived_ns: When it was taken in, on ours [ns since 1970].
-        source: Who numbered it and its number; None if nobody did.
+        missing: How many before it, of the same sender and key, never came.
     """
 
     key: str
     payload: bytes
     published_ns: int
     arrived_ns: int
-    source: zenoh.SourceInfo | None = None
+    missing: int = 0
+
+
+class Refusals(NamedTuple):
+    """What found the queue full, by key.
+
+    Attributes:
+        messages: How many.
+        missing: How many of the same senders' never came, before those.
+    """
+
+    messages: Counter[str]
+    missing: Counter[str]
 
 
 def one_thread() -> None:
@@ -69,13 +91,13 @@ class _Sockets:
     def __init__(self) -> None:
         self._open = [int(fd) for fd in os.listdir("/proc/self/fd") if _is_socket(int(fd))]
 
-    def waiting(self) -> bool:
-        """Whether the kernel holds bytes that nobody has read: whoever was kept from reading must not rest now."""
+    def waiting(self) -> int:
+        """Bytes that the kernel holds and nobody has read: whoever was kept from reading must not rest now."""
+        size = 0
         for fd in self._open:
             with suppress(OSError):  # it listens only, or is closed by now
-                if int.from_bytes(fcntl.ioctl(fd, termios.FIONREAD, b"\0" * 4), sys.byteorder):
-                    return True
-        return False
+                size += int.from_bytes(fcntl.ioctl(fd, termios.FIONREAD, b"\0" * 4), sys.byteorder)
+        return size
 
 
 def _is_socket(fd: int) -> bool:
@@ -95,11 +117,13 @@ class Intake:
         most: How many may wait here.
 
     Attributes:
-        refused: Messages that found the queue full, by key; whoever tells of them clears it.
+        numbers: Follows the numbers of all that comes, whether there is room for it or not.
     """
 
     def __init__(self, session: zenoh.Session, key: str, batch_s: float, most: int = MOST_WAITING) -> None:
-        self.refused: Counter[str] = Counter()
+        self.numbers = Numbers()
+        self._refusals = Refusals(Counter(), Counter())
+        self._refusing = threading.Lock()
         self._batch_s = batch_s
         self._most = most
         self._queue: deque[Taken] = deque()
@@ -119,13 +143,26 @@ class Intake:
         """The message that has waited longest, or None."""
         return self._queue.popleft() if self._queue else None
 
-    def close(self) -> None:
-        """Take in what is on its way, and then no more. What is in the queue stays there."""
+    def refusals(self) -> Refusals:
+        """What found no room since this was last asked."""
+        with self._refusing:
+            refusals, self._refusals = self._refusals, Refusals(Counter(), Counter())
+        return refusals
+
+    def settle(self) -> None:
+        """Wait until what is on its way has been taken in: for silence or, where others go on, for no backlog."""
         batch_s, self._batch_s, self._busy = self._batch_s, 0.0, False
-        deadline = time.monotonic_ns() + CLOSING_NS
+        begun = time.monotonic()
         time.sleep(batch_s)  # the receiving thread wakes from its last pause
-        while (quiet_from := self._last_ns + 20_000_000) > time.monotonic_ns() < deadline:
-            time.sleep(max(0.0, (quiet_from - time.monotonic_ns()) * 1e-9))
+        while (lasts_s := time.monotonic() - begun) < SETTLING_S:
+            backlog = _Sockets().waiting()
+            silent = not backlog and time.monotonic_ns() - self._last_ns > _QUIET_NS
+            if silent or (lasts_s > _GOES_ON_S and backlog < _BACKLOG):
+                return
+            time.sleep(0.005)
+
+    def close(self) -> None:
+        """Take in no more. What is in the queue stays there."""
         self._subscriber.undeclare()
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -141,18 +178,14 @@ class Intake:
             self._busy = bool(self._batch_s) and self._second_count > _BUSY_PER_S
             self._second_ns, self._second_count = now, 0
             self._sockets = _Sockets()
+        key, source = str(sample.key_expr), sample.source_info
+        missing = 0 if source is None else self.numbers.missing(key, source)
         if len(self._queue) < self._most:
-            self._queue.append(
-                Taken(
-                    str(sample.key_expr),
-                    sample.payload.to_bytes(),
-                    published_ns(sample, now),
-                    now,
-                    sample.source_info,
-                )
-            )
+            self._queue.append(Taken(key, sample.payload.to_bytes(), published_ns(sample, now), now, missing))
         else:
-            self.refused[str(sample.key_expr)] += 1
+            with self._refusing:
+                self._refusals.messages[key] += 1
+                self._refusals.missing[key] += missing
         self._last_ns = time.monotonic_ns()
 
     def _keep(self, thread: int) -> None:

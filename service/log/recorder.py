@@ -22,7 +22,6 @@ from protocol.messages import Contract, Loss, Status
 from protocol.role import Role
 from service.log.decoded import Decoded, Decoder
 from service.log.intake import Intake, Taken
-from service.log.losses import Numbers
 from service.log.rolling import RollingLog
 from service.settings import RecorderSettings
 
@@ -54,7 +53,6 @@ class Recorder:
         self._addresses: dict[str, topics.Address | None] = {}
         self._appeared: deque[str] = deque()
         self._ask_again = False
-        self._numbers = Numbers()
         self._lost: Counter[str] = Counter()  # by reason
         self._status_due = 0.0
         self._status_written = 0
@@ -73,13 +71,13 @@ class Recorder:
             while not self._role.stop.wait(max(self._batch_s, DRAIN_WAIT_S)):
                 self._work()
         finally:
+            self._intake.settle()
+            self.log.try_again()
             self._status_due = 0.0
             self._work()
             self._intake.close()
             self._drain()
-            if unwritten := len(self._intake):
-                log.error("recorder: %d messages could not be written", unwritten)
-            self.log.close()
+            self.log.close(len(self._intake))
 
     def reconfigure(self, settings: RecorderSettings) -> None:
         """Take over what can change while recording."""
@@ -90,7 +88,7 @@ class Recorder:
         self._role.take_inbox()
         self._fetch_contracts()
         if time.monotonic() >= self._status_due:
-            self._numbers.settled = self._role.uptime_s > SETTLED_S
+            self._intake.numbers.settled = self._role.uptime_s > SETTLED_S
             self._tell_losses()
             self._publish_status()
         self.log.tend()
@@ -101,8 +99,8 @@ class Recorder:
             self._take(taken)
 
     def _take(self, taken: Taken) -> None:
-        if taken.source is not None and (missing := self._numbers.missing(taken.key, taken.source)):
-            self._lose(taken.key, missing, "network", taken.published_ns)
+        if taken.missing:
+            self._lose(taken.key, taken.missing, "network", taken.published_ns)
         address = self._address(taken.key)
         decoded: list[Decoded] = []
         if address is not None:
@@ -126,11 +124,15 @@ class Recorder:
 
     def _tell_losses(self) -> None:
         """Tell what found no room, once there is room to tell it."""
-        if self.log.writable and self._intake.refused:
-            refused, self._intake.refused = self._intake.refused, Counter()
-            for key, count in refused.items():
-                self._lose(key, count, "disk" if self._disk_failed else "queue", time.time_ns())
-            self._disk_failed = False
+        if not self.log.writable:
+            return
+        refusals, now = self._intake.refusals(), time.time_ns()
+        for key, count in refusals.messages.items():
+            self._lose(key, count, "disk" if self._disk_failed else "queue", now)
+        for key, count in refusals.missing.items():
+            if count:
+                self._lose(key, count, "network", now)
+        self._disk_failed = False
 
     def _fetch_contracts(self) -> None:
         """Ask who appeared for its contract; every role answers for itself."""

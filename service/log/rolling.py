@@ -11,11 +11,11 @@ from __future__ import annotations
 import errno
 import json
 import re
+import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from itertools import count
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -25,7 +25,15 @@ from protocol.errors import AeroloopError
 from protocol.verbs import Change
 from service.log.decoded import Decoded
 from service.log.intake import Taken
-from service.log.mcap_records import CHANGE_METADATA, CONTRACT_METADATA, RECORDER_METADATA
+from service.log.mcap_records import (
+    CHANGE_METADATA,
+    CONTRACT_METADATA,
+    HEADER,
+    METADATA,
+    RECORDER_METADATA,
+    metadata,
+    records,
+)
 from service.log.writer import LogFile
 from service.settings import RecorderSettings
 
@@ -78,7 +86,7 @@ class RollingLog:
         self._changes: dict[str, list[bytes]] = {}  # of the last session of each key
         self._change_sessions: dict[str, str] = {}
         self._unwritten: list[_Entry] = []
-        self._parts = count()
+        self._part = 0  # of the next file
         self._began = 0.0
         self._due = self._look_due = self._retry_due = 0.0
         try:
@@ -105,7 +113,7 @@ class RollingLog:
         sequence = self._sequences[taken.key] = self._sequences.get(taken.key, 0) + 1
         self._unwritten.append(_Entry(taken, sequence, decoded))
         self.written += 1
-        self._put(self._unwritten[-1])
+        self._put(self._file, self._unwritten[-1])
         if self._file.full:
             self._commit()
 
@@ -139,24 +147,40 @@ class RollingLog:
                 self._look_due = now + LOOK_S
                 self._turn_when_due(now)
 
-    def close(self) -> None:
+    def try_again(self) -> None:
+        """Try a disk that has refused, though it is not yet due."""
+        if self.trouble:
+            self._retry()
+
+    def close(self, waiting: int = 0) -> None:
         """Write what there is, with the index, and close the file.
 
+        Args:
+            waiting: Messages that were not added because the disk refused.
+
         Raises:
-            RecorderError: The disk refuses; what had been written before is whole.
+            RecorderError: Not all could be written; what had been written before is whole.
         """
         try:
+            self._file.commit()
+            self._unwritten.clear()
             self._file.end()
         except OSError as error:
+            self._file.abandon()
+            lost = waiting + len(self._unwritten)
+            what = f"{lost} messages and the index" if lost else "the index"
             raise RecorderError(
-                f"the end of {self.path} could not be written: {error.strerror}; "
+                f"{what} of {self.path} could not be written: {error.strerror}; "
                 "what came before is whole, and `aeroloop log recover` gives it an index"
             ) from None
+        if waiting:
+            raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
 
-    def _put(self, entry: _Entry) -> None:
-        self._file.add(entry.taken, entry.sequence)
+    @staticmethod
+    def _put(file: LogFile, entry: _Entry) -> None:
+        file.add(entry.taken, entry.sequence)
         for decoded in entry.decoded:
-            self._file.add_decoded(decoded)
+            file.add_decoded(decoded)
 
     def _commit(self) -> None:
         try:
@@ -189,10 +213,16 @@ class RollingLog:
 
     def _begin_again(self) -> None:
         """A new file with what the last one has not got to the disk."""
-        self._file = self._begin()
-        for entry in self._unwritten:
-            self._put(entry)
-        self._file.commit()
+        file = self._begin()
+        try:
+            for entry in self._unwritten:
+                self._put(file, entry)
+            file.commit()
+        except OSError:
+            file.remove()
+            raise
+        self._file.abandon()
+        self._file = file
 
     def _turn_when_due(self, now: float) -> None:
         settings = self.settings
@@ -210,6 +240,7 @@ class RollingLog:
         try:
             last.end()
         except OSError as error:
+            last.abandon()
             self._tell(
                 f"the index of {last.path} could not be written: {error.strerror}; `aeroloop log recover` gives it one",
                 True,
@@ -218,7 +249,7 @@ class RollingLog:
 
     def _begin(self) -> LogFile:
         """The next file that does not exist yet, with its header on the disk. Raises OSError."""
-        path = next(path for path in self._names() if not path.exists())
+        path = self._next_path()
         file = LogFile(path)
         try:
             started = datetime.now(UTC)
@@ -232,28 +263,28 @@ class RollingLog:
                     file.add_metadata(CHANGE_METADATA, {"key": key, "json": change.decode()})
             file.commit()
         except OSError:
-            with suppress(OSError):
-                path.unlink()
+            file.remove()
             raise
         self._began = time.monotonic()
+        self._part += 1  # even if somebody removes the file: a run uses no number twice
         return file
 
-    def _names(self) -> Iterator[Path]:
-        """Names for files, the base's own first; a number is never used again by the same run."""
-        for part in self._parts:
-            yield self._base if part == 0 else self._base.with_stem(f"{self._base.stem}-{part:04}")
+    def _next_path(self) -> Path:
+        """The next name that nobody has; the base's own comes first."""
+        while True:
+            part = self._part
+            path = self._base.with_stem(f"{self._base.stem}-{part:04}") if part else self._base
+            if not path.exists():
+                return path
+            self._part += 1
 
     def _forget(self) -> None:
         """Remove the oldest files while all together are too large; never the one that is written."""
         if self.settings.keep_gb is None:
             return
-        if self.settings.path is None:
-            mine = re.compile(r"aeroloop-\d{8}-\d{6}(-\d{4,})?\.mcap")
-        else:
-            mine = re.compile(re.escape(self._base.stem) + r"(-\d{4,})?\.mcap")
         found = []
         for path in self._base.parent.glob("*.mcap"):
-            if mine.fullmatch(path.name) and path != self.path:
+            if path != self.path and self._is_own(path):
                 with suppress(OSError):
                     stat = path.stat()
                     found.append((stat.st_mtime_ns, stat.st_size, path))
@@ -265,3 +296,16 @@ class RollingLog:
                 path.unlink()
                 room += size
                 self._tell(f"removed {path}, the oldest, to keep logs under {self.settings.keep_gb:g} GB", False)
+
+    def _is_own(self, path: Path) -> bool:
+        """Whether a file says of itself that it is of this run, or, if we name ours by the time, of another such."""
+        with suppress(OSError, ValueError, KeyError, TypeError, struct.error):
+            head = next((record for record in records(path) if record.opcode != HEADER), None)
+            if head is None or head.opcode != METADATA:
+                return False
+            name, entries = metadata(head.content)
+            if name == RECORDER_METADATA:
+                said = json.loads(entries["json"])
+                runs = re.escape(self._base.stem) if self.settings.path else r"aeroloop-\d{8}-\d{6}"
+                return said["part"] == path.stem and re.fullmatch(runs, said["run"]) is not None
+        return False

@@ -53,12 +53,11 @@ class _WholeChunks:
             with memoryview(self._pending) as pending:
                 written = 0
                 while written < len(pending):
-                    written += self._file.write(pending[written:])
+                    written += os.pwrite(self._file.fileno(), pending[written:], self.size + written)
             os.fdatasync(self._file.fileno())
         except OSError:
             with suppress(OSError):
                 self._file.truncate(self.size)
-                self._file.seek(self.size)
             raise
         self.size += len(self._pending)
         self._pending.clear()
@@ -157,6 +156,16 @@ class LogFile:
             self._ended = True
         self._out.commit()
         self._out.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is on the disk, without what was not written."""
+        self._out.close()
+
+    def remove(self) -> None:
+        """Close the file and remove it."""
+        self._out.close()
+        with suppress(OSError):
+            self.path.unlink()
 
     def _raw_channel(self, key: str) -> int:
         address = topics.read_key(key)

@@ -14,9 +14,10 @@ from protocol.attitude import Quaternion
 from protocol.messages import Event, Loss, Percentiles, Status, Truth
 from service.cli import execute
 from service.config import load
+from service.log.display import sparkline
 from service.log.limits import Limit
 from service.log.observe import Observer, Told
-from service.log.report import Check, Findings, Mark
+from service.log.report import Check, Findings, Mark, Spread
 from service.log.review import Kept, Tick, read, report, review
 from service.log.thin import ThinnedLines
 from tests.service.log.made_log import AN_OPERATORS_WORDS, START_NS, make_log
@@ -506,6 +507,13 @@ def test_the_keys_of_the_json_are_stable_and_the_exit_code_says_whether_limits_h
     output = capsys.readouterr()
     assert json.loads(output.out)["checks"][0]["holds"] is False
     assert output.err == "aeroloop: latency.p50 is 297.9, more than 1\n"
+
+
+def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:
+    bins = [(1000.0, 500_000), (1044.0, 500_000), (64_000.0, 1)]
+    bars = sparkline(Spread(count=1_000_001, p50=1000, p90=1000, p99=1000, p999=1000, max=64_000, bins=bins), width=12)
+    assert bars == "█          ▁"
+    assert sparkline(Spread(count=1, p50=9, p90=9, p99=9, p999=9, max=9, bins=[(9.0, 1)])) == "█"
 
 
 def test_the_account_tells_timing_gaps_what_happened_and_what_does_not_hold(
