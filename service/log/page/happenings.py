@@ -31,7 +31,6 @@ def table(columns: Sequence[Column], rows: Sequence[Sequence[Html | str]], *, ta
         "div",
         tag("table", tag("thead", tag("tr", head)), tag("tbody", body)),
         class_="scroll tall" if tall else "scroll",
-        tabindex=0,
     )
 
 

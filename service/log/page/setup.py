@@ -65,4 +65,4 @@ def _keys(reports: Sequence[Report], rows: Sequence[tuple[str, Sequence[Any]]], 
         cells = [tag("td", shown(value)) for value in values]
         name = tag("th", tag("code", key.removeprefix(prefix)), scope="row", title=key)
         body.append(tag("tr", name, cells, data_key=key.lower(), class_="differs" if differs and prefix else None))
-    return tag("div", tag("table", head, tag("tbody", body)), class_="scroll", tabindex=0)
+    return tag("div", tag("table", head, tag("tbody", body)), class_="scroll")

@@ -133,7 +133,6 @@ def _table(reports: Sequence[Report], rows: Sequence[Row]) -> Html:
             ]),
         ),
         class_="scroll",
-        tabindex=0,
     )  # fmt: skip
 
 
