@@ -36,7 +36,7 @@ _QUIET_NS: Final = 50_000_000
 """A network from which nothing has come for so long has nothing more on its way."""
 
 _GOES_ON_S: Final = 0.25
-"""A network that is not silent after this goes on for good, and only a backlog is still waited for [s]."""
+"""A network in which nothing has piled up for so long goes on as fast as it is taken in, and may do so for good [s]."""
 
 _BACKLOG: Final = 16 * 1024
 """More than a loop at 1 kHz sends in 100 ms [B]."""
@@ -150,16 +150,20 @@ class Intake:
         return refusals
 
     def settle(self) -> None:
-        """Wait until what is on its way has been taken in: for silence or, where others go on, for no backlog."""
+        """Wait until what is on its way has been taken in: for silence or, where others go on, for nothing piled up."""
         batch_s, self._batch_s, self._busy = self._batch_s, 0.0, False
-        begun = time.monotonic()
         time.sleep(batch_s)  # the receiving thread wakes from its last pause
-        while (lasts_s := time.monotonic() - begun) < SETTLING_S:
+        now = piled_up = time.monotonic()
+        deadline = now + SETTLING_S
+        while now < deadline:
             backlog = _Sockets().waiting()
+            if backlog > _BACKLOG:
+                piled_up = now
             silent = not backlog and time.monotonic_ns() - self._last_ns > _QUIET_NS
-            if silent or (lasts_s > _GOES_ON_S and backlog < _BACKLOG):
+            if silent or now - piled_up > _GOES_ON_S:
                 return
             time.sleep(0.005)
+            now = time.monotonic()
 
     def close(self) -> None:
         """Take in no more. What is in the queue stays there."""
