@@ -64,7 +64,7 @@ class Feed:
     def take(self) -> Iterator[Decoded]:
         """What came since the last time: the newest of what streams, and all of what happens once. Never waits."""
         while (token := self._tokens.try_recv()) is not None:
-            if False:
+            if token.kind == zenoh.SampleKind.PUT:
                 self._ask()
         self._hear_contracts()
         for subscriber, room in self._subscribers.items():
