@@ -367,6 +367,14 @@ def test_any_bytes_at_any_time_give_something_or_nothing_and_never_raise(name: s
     assert bool(decoder.take(address(name), payload, at_ns)) != bool(decoder.malformed)
 
 
+@pytest.mark.parametrize("name", sorted(RAW))
+def test_a_time_beyond_what_viewers_can_hold_is_the_last_they_can(name: str) -> None:
+    for shown in configured().take(address(name), RAW[name], 2**64 - 1):
+        assert shown.at_ns == 2**64 - 1
+        if shown.shape.name == "foxglove.PoseInFrame":
+            assert fields(fields(shown.data)[1][0])[1] == [2**32 - 1]
+
+
 def test_numbers_beyond_all_bounds_are_shown_or_null() -> None:
     text = telemetry(about(1, 0.1)).encode().replace(b"[0.0,0.0349", b"[1e999,0.0349")
     for shown in configured().take(address("telemetry"), text, NOW):
