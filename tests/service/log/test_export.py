@@ -20,6 +20,7 @@ from mcap.writer import Writer
 
 from protocol import topics
 from protocol.attitude import to_euler
+from protocol.frames import WireSpec
 from protocol.messages import Telemetry, Truth
 from service.cli import execute
 from service.config import Settings, from_contract, load
@@ -28,7 +29,7 @@ from service.log.decoded import Decoder
 from service.log.export import export
 from service.log.files import LogFiles
 from service.log.review import review
-from service.log.table import euler_deg
+from service.log.table import Rows, euler_deg, groups, telemetry_fields, tick_fields, truth_fields
 from service.log.table_files import ExportError, ParquetFile
 from tests.service.log.made_log import SESSION, START_NS, VEHICLE, make_log
 
@@ -210,6 +211,39 @@ def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, set
         }
     assert any(parquet["saturated_voltage_3"])  # the first of them are
     assert not any(parquet["saturated_rate_x"] + parquet["saturated_attitude_x"])
+
+
+def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded(tmp_path: Path) -> None:
+    wire = WireSpec(actuators=3)
+    top = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
+    with spool.Spool(tmp_path) as piles:
+        dtypes = [piles.pile(fields(3)).dtype for fields in (tick_fields, telemetry_fields, truth_fields)]
+    ticks, telemetry, truth = (np.zeros(3, dtype) for dtype in dtypes)
+    ticks["attitude"] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    ticks["rate"][0] = top["rate"], -top["rate"], 0.99 * top["rate"]
+    ticks["voltages"] = (top["voltage"], -top["voltage"], 0.0), (nan, nan, nan), (top["voltage"], 0.0, 0.0)
+    ticks["latency_ns"] = 1, 1, -1
+    rows = Rows(VEHICLE, SESSION, ticks, telemetry, truth)
+    found = {
+        column.name: list(values)
+        for group in groups(wire, 0.002)
+        for column, values in zip(group.columns, group.of(rows).T, strict=True)
+        if column.name.startswith("saturated")
+    }
+    np.testing.assert_equal(
+        found,
+        {
+            "saturated_attitude_x": [1, nan, 0],
+            "saturated_attitude_y": [1, nan, 0],
+            "saturated_attitude_z": [0, nan, 0],
+            "saturated_rate_x": [1, 0, 0],
+            "saturated_rate_y": [1, 0, 0],
+            "saturated_rate_z": [0, 0, 0],
+            "saturated_voltage_1": [1, nan, nan],
+            "saturated_voltage_2": [1, nan, nan],
+            "saturated_voltage_3": [0, nan, nan],
+        },
+    )
 
 
 def test_every_kind_of_file_says_the_same(log: Path, tmp_path: Path, parquet: Table) -> None:
