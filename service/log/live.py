@@ -106,7 +106,7 @@ class Outlet:
     """
 
     def __init__(self, vehicle: str, address: str, port: int) -> None:
-        logging.getLogger("foxglove").setLevel(logging.WARNING)  # who comes and goes is no news
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # who comes and goes, and how, is no news
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         for name, shape in SHAPES.items():
