@@ -29,6 +29,9 @@ log: Final = logging.getLogger("aeroloop")
 
 DRAIN_WAIT_S: Final = 0.02
 STATUS_EVERY_S: Final = 1.0
+ASK_EVERY_S: Final = 1.0
+CHANGED: Final = "?"
+"""Somebody whose configuration was read again and so has another contract; nobody's name."""
 SETTLED_S: Final = 3.0
 """After this everybody who was there before the recorder has been heard: statuses come once a second."""
 
@@ -51,8 +54,9 @@ class Recorder:
         self._role = role
         self._batch_s = settings.batch_s
         self._addresses: dict[str, topics.Address | None] = {}
-        self._appeared: deque[str] = deque()
-        self._ask_again = False
+        self._tokens: deque[tuple[str, bool]] = deque()  # who has come or gone
+        self._silent: set[str] = set()  # who has appeared and not yet told its contract
+        self._ask_due = 0.0
         self._lost: Counter[str] = Counter()  # by reason
         self._status_due = 0.0
         self._status_written = 0
@@ -64,7 +68,7 @@ class Recorder:
     def run(self) -> None:
         """Record until the role is told to stop; then take what is still on its way and close the log."""
         self._intake = Intake(self._role.zenoh, topics.EVERYTHING, self._batch_s)
-        self._role.watch_tokens(lambda name, came: self._appeared.append(name) if came else None)
+        self._role.watch_tokens(lambda name, came: self._tokens.append((name, came)))
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
         try:
@@ -109,7 +113,7 @@ class Recorder:
             if address.topic.name == "change":
                 self.log.add_change(taken)
             elif address.topic.name == "event" and b'"changed"' in taken.payload:
-                self._ask_again = True  # a configuration that was read again is another contract
+                self._tokens.append((CHANGED, True))
         self.log.add(taken, decoded)
 
     def _address(self, key: str) -> topics.Address | None:
@@ -135,22 +139,33 @@ class Recorder:
         self._disk_failed = False
 
     def _fetch_contracts(self) -> None:
-        """Ask who appeared for its contract; every role answers for itself."""
-        if not self._appeared and not self._ask_again:
+        """Ask who appeared for its contract, until each has told it; every role answers for itself."""
+        while self._tokens:
+            name, came = self._tokens.popleft()
+            if came:
+                self._silent.add(name)
+                self._ask_due = 0.0
+            else:
+                self._silent.discard(name)
+        now = time.monotonic()
+        if not self._silent or now < self._ask_due:
             return
-        self._appeared.clear()
-        self._ask_again = False
+        self._ask_due = now + ASK_EVERY_S
         for reply in self._role.zenoh.get(topics.key("contract", "*"), timeout=1.0):
             if reply.ok is not None:
-                key, payload = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
-                try:
-                    contract = Contract.model_validate_json(payload)
-                except ValidationError:
-                    self._role.event("fault", f"{key} does not answer with a contract of this version: not recorded")
-                    continue
-                self.log.add_contract(key, payload)
-                if self._decoder is not None:
-                    self._decoder.configure(contract)
+                self._hear(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        """A role's contract."""
+        try:
+            contract = Contract.model_validate_json(payload)
+        except ValidationError:
+            self._role.warn(key, "fault", f"{key} does not answer with a contract of this version: not recorded")
+            return
+        self._silent = {name for name in self._silent if name.partition("-")[0] not in (contract.role, CHANGED)}
+        self.log.add_contract(key, payload)
+        if self._decoder is not None:
+            self._decoder.configure(contract)
 
     def _tell(self, text: str, bad: bool) -> None:
         if bad:

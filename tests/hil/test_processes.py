@@ -24,6 +24,7 @@ from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
 from service.log.files import ReviewError
+from service.log.mcap_records import CHANNEL, Channel, records
 from service.log.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
@@ -51,7 +52,7 @@ def events(log: Path) -> list[Event]:
         return [
             Event.model_validate_json(message.data)
             for _, channel, message in make_reader(file).iter_messages()
-            if channel.topic.endswith("/event")
+            if channel.topic == topics.key("event", "aero")
         ]
 
 
@@ -143,8 +144,15 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def grown(log: Path) -> Callable[[], bool]:
-    """Whether a log holds frames: it is past its header once a chunk was closed, every second."""
-    return lambda: log.exists() and log.stat().st_size > 20_000
+    """Whether a log holds frames; a chunk is closed every second."""
+
+    def holds_frames() -> bool:
+        if not log.exists() or not log.stat().st_size:
+            return False
+        topics_in_it = {Channel.read(record.content).topic for record in records(log) if record.opcode == CHANNEL}
+        return any(topic.startswith("aeroloop/") and topic.endswith("/command") for topic in topics_in_it)
+
+    return holds_frames
 
 
 def said(folder: Path, part: str, text: str) -> Callable[[], bool]:
@@ -224,8 +232,9 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
         time.sleep(0.5)  # five watchdogs, and all the time there is for a wrong plant to go on at its last command
     with log.open("rb") as file:
         messages = [(channel.topic, message) for _, channel, message in make_reader(file).iter_messages()]
-    last_command = max(m.publish_time for topic, m in messages if topic.endswith("/command"))
-    truths = [(m.publish_time, json.loads(m.data)) for topic, m in messages if topic.endswith("/truth")]
+    commands = [m.publish_time for topic, m in messages if topics.read_key(topic) and topic.endswith("/command")]
+    last_command = max(commands)
+    truths = [(m.publish_time, json.loads(m.data)) for topic, m in messages if topic == topics.key("truth", "aero")]
     driven = [time_ns for time_ns, truth in truths if any(truth["voltages"])]
     # The watchdog's 100 ms; 100 ms of slack for a grid that is kept waiting by other work on the machine.
     assert driven

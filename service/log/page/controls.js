@@ -43,14 +43,13 @@ document.addEventListener("click", ({ target }) => {
   document.getElementById("tracking").scrollIntoView({ behavior: calm ? "auto" : "smooth" });
 });
 
-// light and dark
+// light and dark: the system's, or the other until the button is pressed again
 
 const prefersDark = matchMedia("(prefers-color-scheme: dark)");
 prefersDark.addEventListener("change", redrawAll);
 document.getElementById("theme").addEventListener("click", () => {
-  const root = document.documentElement;
-  const dark = root.style.colorScheme ? root.style.colorScheme === "dark" : prefersDark.matches;
-  root.style.colorScheme = dark ? "light" : "dark";
+  const { style } = document.documentElement;
+  style.colorScheme = style.colorScheme ? "" : prefersDark.matches ? "light" : "dark";
   redrawAll();
 });
 

@@ -341,13 +341,24 @@ def test_drawings_have_the_colours_of_the_theme(one: Page) -> None:
     drawing.scroll_into_view_if_needed()
     label = drawing.locator(".annotation-text").first
     label.wait_for()
-    colour = "(text) => getComputedStyle(text).fill"
-    before = label.evaluate(colour)
+    light = label.evaluate("(text) => getComputedStyle(text).fill")
+
+    def wait(same: bool) -> None:
+        one.wait_for_function(
+            """([light, same]) => {
+                const label = document.querySelector(".group .annotation-text");
+                return label && (getComputedStyle(label).fill === light) === same;
+            }""",
+            arg=[light, same],
+        )
+
+    one.emulate_media(color_scheme="dark")
+    wait(same=False)
     one.locator("#theme").click()
-    one.wait_for_function(
-        "(before) => getComputedStyle(document.querySelector('.group .annotation-text')).fill !== before", arg=before
-    )
+    wait(same=True)
     one.locator("#theme").click()
+    wait(same=False)
+    one.emulate_media(color_scheme="light")
 
 
 def test_hostile_text_of_a_log_is_text(two: Page) -> None:
