@@ -232,8 +232,8 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
         time.sleep(0.5)  # five watchdogs, and all the time there is for a wrong plant to go on at its last command
     with log.open("rb") as file:
         messages = [(channel.topic, message) for _, channel, message in make_reader(file).iter_messages()]
-    commands = [m.publish_time for topic, m in messages if topics.read_key(topic) and topic.endswith("/command")]
-    last_command = max(commands)
+    answered = [m.publish_time for topic, m in messages if topics.read_key(topic) and topic.endswith("/command")]
+    last_command = max(answered)
     truths = [(m.publish_time, json.loads(m.data)) for topic, m in messages if topic == topics.key("truth", "aero")]
     driven = [time_ns for time_ns, truth in truths if any(truth["voltages"])]
     # The watchdog's 100 ms; 100 ms of slack for a grid that is kept waiting by other work on the machine.

@@ -16,7 +16,7 @@ from service.cli import execute
 from service.config import load
 from service.log.display import sparkline
 from service.log.limits import Limit
-from service.log.observe import Observer, Told
+from service.log.observe import BLOCK, Observer, Told
 from service.log.report import Check, Findings, Mark, Spread
 from service.log.review import Kept, Tick, read, report, review
 from service.log.thin import ThinnedLines
@@ -78,10 +78,10 @@ def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None
 def test_gaps_are_seen_where_sensors_give_no_valid_value() -> None:
     """Such measurements are answered, but there is no tick to judge."""
     observer = Observer(load())
-    for k in (7, 8, 12, *range(13, 6000)):
+    for k in (*range(7, 9), *range(12, BLOCK + 10), *range(BLOCK + 14, 6000)):  # with a gap where a block ends
         observer.answered(k)
     observer.finish()
-    assert [(gap.tick, gap.ticks) for gap in observer.gaps] == [(9, 3)]
+    assert [(gap.tick, gap.ticks) for gap in observer.gaps] == [(9, 3), (BLOCK + 10, 4)]
 
 
 def test_what_is_told_while_there_are_no_ticks_is_forgotten_but_for_the_last() -> None:
@@ -113,7 +113,8 @@ def test_latency_and_period_are_those_of_the_times_of_publication(whole: Path, t
     assert latency.p50 == pytest.approx(300, rel=0.044)
     assert latency.p99 == pytest.approx(1300, rel=0.044)
     assert (latency.max, period.max) == (1300, 2200)
-    assert period.p50 == pytest.approx(2000, rel=0.044)
+    assert (period.p50, period.p99) == (pytest.approx(2000, rel=0.044), pytest.approx(2000, rel=0.044))
+    assert period.p999 == pytest.approx(2200, rel=0.044)
     assert [count for edge, count in period.bins if edge < 1900 or edge > 2100] == [1, 1]
     slow = [count for edge, count in latency.bins if edge > 1000]
     assert (sum(slow), sum(count for _, count in latency.bins)) == (10, TICKS)
@@ -188,8 +189,15 @@ def test_without_quantization_a_value_at_the_limit_is_saturated() -> None:
 
 
 def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
+    """The controller tells of it in words, too, but only the change itself has the tick."""
     make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
-    marks = [(mark.time_s, mark.text) for mark in found(tmp_path / "a.mcap").marks if mark.kind == "change"]
+    more = [
+        told("event", Event(role="controller", kind="changed", text=text, session=session), START_NS + 240_000_000)
+        for text, session in (("gains set", "s1"), ("configuration read again", None))
+    ]
+    happened = found(retell(tmp_path / "a.mcap", tmp_path / "b.mcap", more=more)).marks
+    assert [mark.text for mark in happened if mark.kind == "changed"] == ["configuration read again"]
+    marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
     assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
     assert "C2 = diag(0.2, 0.2, 0.2)" in marks[1][1]
     assert "0°, 5°, -10°" in marks[2][1]
@@ -210,6 +218,7 @@ def test_events_are_marks_in_order_on_the_sessions_clock_by_their_times_of_publi
         event(-7.0, "plant", "started", "waits"),
         event(60.0, "plant", "stopped", "at 0 V"),
         event(0.5, "controller", "fault", "16 ticks missed"),
+        event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event"),
     ]
     findings = found(retell(whole, tmp_path / "a.mcap", more=more))
     marks = [mark for mark in findings.marks if mark.kind != "change"]
@@ -339,6 +348,18 @@ def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_pa
     assert panel.lines[1].values[1:-10] == pytest.approx(10.0, abs=0.05)  # interpolated while q_d turns
 
 
+def test_the_true_error_is_that_of_the_law_however_far_the_body_is_turned() -> None:
+    desired = 0.5, -0.5, 0.5, 0.5
+    observer = Observer(load())
+    for k in range(3):
+        feed(observer, k, desired=desired)
+        observer.truth(product(desired, (cos(radians(15)), sin(radians(15)), 0.0, 0.0)), START_NS + k * PERIOD_NS)
+    observer.finish()
+    _, panels = observer.lines()
+    (true,) = (line.values for panel in panels for line in panel.lines if line.label == "true")
+    assert true == pytest.approx([30.0] * 3)
+
+
 def test_the_damping_estimate_is_what_telemetry_told(whole: Path) -> None:
     values = {
         panel.label: panel.lines[0].values for panel in report([whole]).panels if panel.group == "damping_estimate"
@@ -398,6 +419,7 @@ def test_an_observer_holds_a_bounded_number_of_points_however_many_ticks_come() 
     time, panels = observer.lines()
     assert 1024 < len(time) <= 4096
     assert observer.thinned == 16
+    assert observer.timing["period"].count == 20_000 - 1
     assert len(panels[0].lines[0].values) == len(time)
 
 
