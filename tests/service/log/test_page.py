@@ -277,8 +277,10 @@ def test_a_click_on_an_event_or_a_gap_shows_what_was_around_it(one: Page) -> Non
 
 
 def test_keys_move_the_time_that_is_shown(one: Page) -> None:
-    one.locator(".group[data-name=input] .main-svg").first.wait_for(state="attached")
-    one.locator(".group[data-name=input] .plot").focus()
+    drawing = one.locator(".group[data-name=input]")
+    drawing.scroll_into_view_if_needed()
+    drawing.locator(".main-svg").first.wait_for(state="attached")
+    drawing.locator(".plot").focus()
     for key in ("+", "+", "ArrowRight"):
         one.keyboard.press(key)
     shows(one, "input", (4.3, 7.0))
