@@ -7,9 +7,11 @@ say which measurement a command answers: the latest before it that had its echo 
 
 from __future__ import annotations
 
+import gc
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
@@ -185,6 +187,18 @@ class Pairing(ABC):
 def _before(tick: int, counter: int) -> int:
     """The last tick before this one that has a counter."""
     return tick - ((tick - counter) % COUNTERS or COUNTERS)
+
+
+@contextmanager
+def without_collections() -> Iterator[None]:
+    """No garbage is collected meanwhile: reading makes no cycles, and ticks in their thousands wait to be looked at."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 P = TypeVar("P", bound=Pairing)

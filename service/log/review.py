@@ -24,7 +24,7 @@ from service.log.files import LogFiles, ReviewError, Which
 from service.log.findings import facts_of, findings_of, name_of
 from service.log.limits import Limit
 from service.log.observe import Observer
-from service.log.pairing import Pairing, Read, Seen
+from service.log.pairing import Pairing, Read, Seen, without_collections
 from service.log.report import Findings, Report
 from service.log.story import Story
 
@@ -224,6 +224,7 @@ def report(
     return read(*paths, progress=progress).report(limits)
 
 
+@without_collections()
 def read(
     *paths: Path,
     watch: Callable[[Which, Settings], Callable[[Tick], None]] | None = None,
