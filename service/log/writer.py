@@ -6,7 +6,6 @@ written is taken back, stays in memory and can be tried again, so that a full di
 
 from __future__ import annotations
 
-import json
 import os
 from contextlib import suppress
 from importlib.resources import files
@@ -18,9 +17,10 @@ from mcap.writer import CompressionType, Writer
 from protocol import topics
 from protocol.host import versions
 from protocol.messages import model_of
-from service.log.decoded import Decoded, Shape
+from service.log.decoded import Decoded
 from service.log.intake import Taken
 from service.log.mcap_records import CHUNK_BYTES
+from service.log.schemas import Shape, json_shape
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
 PAST_EVERY_CHUNK: Final = 1 << 62
@@ -186,5 +186,4 @@ def _raw_shape(topic: topics.Topic) -> Shape:
             f"{topic.model} frame: bits as in the attachment protocol/SPEC.md, by the wire spec in the plant's contract"
         )
         return Shape(f"aeroloop.{topic.model}", FRAME_ENCODING, text.encode(), FRAME_ENCODING)
-    schema = json.dumps(model_of(topic).model_json_schema()).encode()
-    return Shape(f"aeroloop.{topic.model}", "jsonschema", schema, "json")
+    return json_shape(f"aeroloop.{topic.model}", model_of(topic))
