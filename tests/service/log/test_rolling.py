@@ -386,7 +386,11 @@ def test_the_oldest_of_ones_own_go_and_nobody_elses(
         (tmp_path / name).write_bytes(content)
     another = Recording(clock, story, path=tmp_path / "another.mcap")
     another.log.close()
-    (tmp_path / "another.mcap").rename(tmp_path / "a-0400.mcap")  # somebody's copy
+    (tmp_path / "another.mcap").rename(tmp_path / "a-0400.mcap")
+    ours = Recording(clock, story, path=tmp_path / "a.mcap")
+    ours.log.close()
+    (tmp_path / "a.mcap").rename(tmp_path / "a-kept.mcap")  # somebody puts it aside
+    others |= {name: (tmp_path / name).read_bytes() for name in ("a-0400.mcap", "a-kept.mcap")}
     for path in tmp_path.iterdir():
         os.utime(path, (0, 0))  # older than any of ours
 
@@ -398,9 +402,8 @@ def test_the_oldest_of_ones_own_go_and_nobody_elses(
         os.utime(recording.log.path, (1000 + i, 1000 + i))  # by the test's clock
     recording.log.close()
 
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left > {*others, "a-0400.mcap"}
-    own = [path for path in in_order(tmp_path) if path.name not in {*others, "a-0400.mcap"}]
+    assert {name: (tmp_path / name).read_bytes() for name in others} == others
+    own = [path for path in in_order(tmp_path) if path.name not in others]
     numbers = [int(path.stem.removeprefix("a-")) for path in own]
     assert numbers == list(range(numbers[0], numbers[0] + len(own)))
     assert numbers[0] > 1, "the first ones are gone"
