@@ -5,78 +5,29 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import random
 from collections.abc import Iterator
 from math import isnan, nan, radians
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet
 import pytest
 import scipy.io
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
-from protocol import topics
 from protocol.attitude import to_euler
 from protocol.frames import WireSpec
-from protocol.messages import Telemetry, Truth
+from protocol.messages import Telemetry
 from service.cli import execute
 from service.config import Settings, from_contract, load
 from service.log import spool
-from service.log.decoded import Decoder
 from service.log.export import export
 from service.log.files import LogFiles
 from service.log.review import review
 from service.log.table import Rows, euler_deg, groups, telemetry_fields, tick_fields, truth_fields
 from service.log.table_files import ExportError, ParquetFile
-from tests.service.log.made_log import SESSION, START_NS, VEHICLE, make_log
-
-PERIOD_NS = 2_000_000
-TICKS = 400
-LOST = range(100, 148)
-"""Neither their measurements nor their commands were recorded: three times round the counter."""
-UNANSWERED = range(200, 204)
-"""Only their commands are missing."""
-TRUTHS = [START_NS + k * PERIOD_NS + (k % 3) * 1_000_000 - 1_000_000 for k in range(20, TICKS, 10)]
-"""When the truth was published: a millisecond before a tick's measurement, with it, and a millisecond after it."""
-SHORT = "s2"
-"""A second session, of 50 ticks."""
-
-
-class Read(NamedTuple):
-    """A message as the mcap package's reader has it."""
-
-    topic: str
-    sequence: int
-    log_time: int
-    publish_time: int
-    data: bytes
-
-
-def read(path: Path) -> list[Read]:
-    with path.open("rb") as file:
-        return [
-            Read(channel.topic, message.sequence, message.log_time, message.publish_time, message.data)
-            for _, channel, message in make_reader(file).iter_messages()
-        ]
-
-
-def write(path: Path, messages: list[tuple[str, int, bytes]], contract: str) -> None:
-    """A log of (topic, time, content)."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata(
-            "aeroloop.contract", {"key": topics.key("contract", VEHICLE, role="plant"), "json": contract}
-        )
-        channels: dict[str, int] = {}
-        for i, (topic, at_ns, data) in enumerate(sorted(messages, key=lambda message: message[1])):
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "json", 0)
-            writer.add_message(channels[topic], at_ns + 5, data, at_ns, i)
-        writer.finish()
+from tests.service.log.losing_log import LOST, PERIOD_NS, SHORT, TICKS, TRUTHS, UNANSWERED, make_losing_log
+from tests.service.log.made_log import SESSION, START_NS, VEHICLE
 
 
 @pytest.fixture(scope="module")
@@ -86,29 +37,7 @@ def settings() -> Settings:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory, settings: Settings) -> Path:
-    """Two sessions with telemetry and truth, of which the recorder has lost something."""
-    folder = tmp_path_factory.mktemp("log")
-    make_log(folder / "made.mcap", TICKS, settings=settings)
-    frames = {topics.key(name, VEHICLE, session=SESSION): name for name in ("measurement", "command")}
-    messages = []
-    for message in read(folder / "made.mcap"):
-        tick = (message.publish_time - START_NS) // PERIOD_NS
-        name = frames.get(message.topic)
-        if not (name and tick in LOST) and not (name == "command" and tick in UNANSWERED):
-            messages.append((message.topic, message.publish_time, message.data))
-        if name and tick < 50:  # again an hour later, as another session
-            key = topics.key(name, VEHICLE, session=SHORT)
-            messages.append((key, message.publish_time + 3_600_000_000_000, message.data))
-        elif message.topic == topics.key("telemetry", VEHICLE) and tick < 50:
-            told = Telemetry.model_validate_json(message.data).model_copy(update={"session": SHORT})
-            messages.append((message.topic, message.publish_time + 3_600_000_000_000, told.encode()))
-    for i, at_ns in enumerate(TRUTHS):
-        truth = Truth(tick=i, attitude=(0.5, 0.5, 0.5, 0.5), rate=(float(i), 0.0, 0.0), voltages=(1.0, -1.0))
-        messages.append((topics.key("truth", VEHICLE), at_ns, truth.encode()))
-    contract = next(iter(LogFiles([folder / "made.mcap"]).contracts.values()))
-    write(folder / "log.mcap", messages, contract.model_dump_json())
-    (folder / "made.mcap").unlink()
-    return folder / "log.mcap"
+    return make_losing_log(tmp_path_factory.mktemp("log"), settings)
 
 
 Table = dict[str, list[Any]]
@@ -377,33 +306,3 @@ def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.Captu
         out = Path(told["out"])
         assert (out, told["bytes"]) == (log.with_name(name), out.stat().st_size)
         out.unlink()
-
-
-def test_a_log_with_everything_decoded_has_every_raw_message_and_each_frame_decoded(log: Path, tmp_path: Path) -> None:
-    """Also where the recorder has decoded some already: those are made again, not doubled."""
-    contract = next(iter(LogFiles([log]).contracts.values()))
-    raw, rng = read(log), random.Random(3)
-    decoder = Decoder(rate_hz=10)
-    decoder.configure(contract)
-    recorded = [(message.topic, message.publish_time, message.data) for message in raw]
-    for message in raw:
-        address = topics.read_key(message.topic)
-        assert address is not None
-        recorded += [(d.topic, d.at_ns, d.data) for d in decoder.take(address, message.data, message.publish_time)]
-    rng.shuffle(recorded)
-    write(tmp_path / "recorded.mcap", recorded, contract.model_dump_json())
-    exported = export([tmp_path / "recorded.mcap"], "mcap", tmp_path / "out.mcap")
-    found = read(tmp_path / "out.mcap")
-    assert exported.rows == len(found)
-    assert sorted((m.topic, m.publish_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
-        (m.topic, m.publish_time, m.data) for m in raw
-    )
-    given = {m for m in read(tmp_path / "recorded.mcap") if m.topic.startswith("aeroloop/")}
-    assert given <= set(found)  # with their sequence and both times
-    for name, key in (("measurement", "measurement"), ("pose", "measurement"), ("command", "command")):
-        times = sorted(m.publish_time for m in raw if m.topic.endswith(f"/{key}"))
-        assert sorted(m.publish_time for m in found if m.topic == f"/{VEHICLE}/{name}") == times
-    assert LogFiles([tmp_path / "out.mcap"]).contracts == LogFiles([log]).contracts
-    assert review(tmp_path / "out.mcap").z_track == review(log).z_track
-    with pytest.raises(ExportError, match="--session"):
-        export([log], "mcap", tmp_path / "other.mcap", session=SHORT)
