@@ -49,7 +49,8 @@ function duration(us) {
 
 /** Ticks of a logarithmic axis of durations [µs], from one exponent of ten to another. */
 function durationTicks(from, to) {
-  const digits = to - from > 2.5 ? [1] : [1, 2, 5];
+  const room = innerWidth < 600 ? 1.2 : 2.5; // decades whose ticks can be told apart
+  const digits = to - from > 2 * room ? [1] : to - from > room ? [1, 3] : [1, 2, 5];
   const tickvals = [];
   for (let power = Math.floor(from); power <= to; power++) tickvals.push(...digits.map((digit) => digit * 10 ** power));
   return { tickvals, ticktext: tickvals.map(duration) };

@@ -83,7 +83,7 @@ def _run(report: Report) -> Spoken:
     return {
         "name": report.name,
         "time": _packed(report.time, "<f8"),
-        "marks": [[m.time_s, grave(m)] for m in report.findings.marks if m.time_s is not None],
+        "marks": sorted([m.time_s, grave(m)] for m in report.findings.marks if m.time_s is not None),
         "gaps": [[gap.time_s, gap.time_s + gap.ticks * period] for gap in report.findings.gaps],
     }
 

@@ -74,30 +74,33 @@ function firstAt(times, time) {
   return low;
 }
 
-/** Events as lines across all panels, gaps as bands. */
+/** Events as lines across all panels, gaps as bands: a shape for all of a kind, since there may be hundreds. */
 function marks() {
   const [from, to] = timeWindow.shown;
-  const across = { yref: "paper", y0: 0, y1: 1, layer: "below" };
+  const apart = (to - from) / MARKS_ACROSS;
+  const across = { type: "path", yref: "paper", layer: "below" };
   const shapes = [];
+  if (timeWindow.marked !== null)
+    shapes.push({ ...across, path: `M${timeWindow.marked},0 L${timeWindow.marked},1`, opacity: 0.35,
+      line: { color: colour("--accent"), width: 9 } });
   data.runs.forEach((run, index) => {
     const own = several ? colour(`--run-${index % 8}`) : null;
-    for (const [start, end] of run.gaps)
-      if (end >= from && start <= to)
-        shapes.push({ ...across, type: "rect", x0: start, x1: end, line: { width: 0 }, opacity: 0.16,
-          fillcolor: own ?? colour("--grave") });
-    let last = -Infinity;
-    for (const [time, grave] of run.marks) {
-      if (time < from || time > to || (!grave && time - last < (to - from) / MARKS_ACROSS)) continue;
-      last = time;
-      shapes.push({ ...across, type: "line", x0: time, x1: time,
+    const gaps = run.gaps.filter(([start, end]) => end >= from && start <= to);
+    const bands = gaps.map(([start, end]) => `M${start},0 L${end},0 L${end},1 L${start},1 Z`);
+    shapes.push({ ...across, path: bands.join(" "), line: { width: 0 }, opacity: 0.16, fillcolor: own ?? colour("--grave") });
+    for (const grave of [false, true]) {
+      const seen = [];
+      for (const [time, isGrave] of run.marks)
+        if (isGrave === grave && time >= from && time <= to && !(time - seen.at(-1) < apart)) seen.push(time);
+      shapes.push({ ...across, path: seen.map((time) => `M${time},0 L${time},1`).join(" "), opacity: crowded(seen.length),
         line: { color: own ?? colour(grave ? "--grave" : "--mark"), width: grave ? 1.4 : 1, dash: grave ? "solid" : "dot" } });
     }
   });
-  if (timeWindow.marked !== null)
-    shapes.push({ ...across, type: "line", x0: timeWindow.marked, x1: timeWindow.marked, opacity: 0.35,
-      line: { color: colour("--accent"), width: 7 } });
-  return shapes;
+  return shapes.filter((shape) => shape.path);
 }
+
+/** Many marks are faint, so that what is measured can be seen through them. */
+const crowded = (count) => Math.max(0.2, Math.min(1, 30 / count));
 
 function timeLayout(group) {
   const [grid, quiet] = [colour("--grid"), colour("--quiet")];

@@ -49,7 +49,9 @@ def _sections(reports: Sequence[Report], tables: Sequence[dict[str, Any]]) -> Ht
     for section, found in sorted(sections.items()):
         rows = [(key, [keys.get(key) for keys in flattened]) for key in found]
         prefix = f"{section}." if section else ""
-        title = tag("summary", section or "general", tag("span", f"{len(rows)}", class_="quiet"))
+        title = tag(
+            "summary", section or "general", tag("span", f"{len(rows)} key{'s' * (len(rows) > 1)}", class_="quiet")
+        )
         parts.append(tag("details", title, _keys(reports, rows, prefix), class_="keys"))
     return joined(parts)
 

@@ -63,7 +63,7 @@ async function drawSpread(figure) {
     margin: { l: 54, r: 10, t: 8, b: 36 },
     hovermode: false,
     dragmode: false,
-    xaxis: { ...grid, type: "log", range: [from, to], ...durationTicks(from, to) },
+    xaxis: { ...grid, type: "log", range: [from, to], tickangle: 0, ...durationTicks(from, to) },
     yaxis: { ...grid, type: "log", range: [Math.log10(NONE), Math.log10(Math.max(1, ...counts)) + 0.15], dtick: 1,
       title: { text: "count", standoff: 6 }, exponentformat: "power" },
   };

@@ -246,6 +246,18 @@ def test_every_panel_is_drawn_with_its_lines(one: Page) -> None:
     ]
 
 
+def test_events_and_gaps_stand_across_every_panel(one: Page) -> None:
+    draw_all(one)
+    shapes = """(name) => document.querySelector(`.group[data-name=${name}] .plot`).layout.shapes
+        .map((shape) => [shape.path, shape.yref])"""
+    for name in ("attitude", "latency"):
+        assert one.evaluate(shapes, name) == [
+            ["M7.2,0 L7.3,0 L7.3,1 L7.2,1 Z", "paper"],
+            ["M3,0 L3,1", "paper"],
+            ["M7.25,0 L7.25,1", "paper"],
+        ]
+
+
 def test_zooming_one_panel_moves_every_other_and_a_double_click_shows_all_again(one: Page) -> None:
     draw_all(one)
     whole = ranges(one)["attitude"]
