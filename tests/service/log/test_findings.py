@@ -16,9 +16,10 @@ from service.cli import execute
 from service.config import load
 from service.log.display import sparkline
 from service.log.limits import Limit
-from service.log.observe import BLOCK, Observer, Told
+from service.log.observe import Observer
 from service.log.report import Check, Findings, Mark, Spread
 from service.log.review import Kept, Tick, read, report, review
+from service.log.tallies import BLOCK, Told
 from service.log.thin import ThinnedLines
 from tests.service.log.made_log import AN_OPERATORS_WORDS, START_NS, make_log
 from tests.service.log.retold import Said, retell, told
