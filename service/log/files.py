@@ -175,10 +175,15 @@ def _share_of(progress: Callable[[float], None] | None, before: int, size: int) 
     return None if progress is None else lambda reached: progress((before + reached) / size)
 
 
+def _logs_in(folder: Path) -> list[Path]:
+    """The logs in a folder, but for those that `log export --to mcap` has written beside them."""
+    return sorted(path for path in folder.glob("*.mcap") if not path.stem.endswith("-decoded"))
+
+
 def _files(paths: Sequence[Path]) -> list[Path]:
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        found = _logs_in(path) if path.is_dir() else [path]
         if not found:
             raise ReviewError(f"there is no .mcap file in {path}")
         files += found
