@@ -1,4 +1,7 @@
-"""A log told again with something changed: messages moved, replaced, left out or added, everything else as it was."""
+"""A log told again with something changed: messages moved, replaced, left out or added, everything else as it was.
+
+And ticks made up, for an observer that is fed by hand.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,14 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from protocol import topics
+from protocol.attitude import IDENTITY, Quaternion
 from protocol.verbs import Message as Model
-from tests.service.log.made_log import SESSION, VEHICLE
+from service.log.observe import Observer
+from service.log.review import Tick
+from tests.service.log.made_log import SESSION, START_NS, VEHICLE
+
+PERIOD_NS = 2_000_000
+LATENCY_NS = 300_000  # in the bin from 291.7 to 304.4 µs, whose middle is 297.9
 
 
 class Said(NamedTuple):
@@ -69,3 +78,16 @@ def retell(
             writer.add_message(channels[one.key], one.published_ns, one.data, one.published_ns)
         writer.finish()
     return out
+
+
+def feed(
+    observer: Observer,
+    k: int,
+    attitude: Quaternion = IDENTITY,
+    desired: Quaternion = IDENTITY,
+) -> None:
+    """Let an observer see a tick, with its measurement."""
+    at = START_NS + k * PERIOD_NS
+    zero = (0.0, 0.0, 0.0)
+    observer.measurement((0, 0, 0, 0, 0, 0), at)
+    observer.tick(Tick(k, at, LATENCY_NS, attitude, desired, zero, zero, zero, zero, (0.0, 0.0)))
