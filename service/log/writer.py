@@ -91,7 +91,6 @@ class LogFile:
         self._channels: dict[str, int] = {}
         self._shapes: dict[Shape, int] = {}
         self._gathered = 0
-        self._ended = False
         self._writer = Writer(self._out, chunk_size=PAST_EVERY_CHUNK, compression=CompressionType.ZSTD)  # type: ignore[arg-type]  # it needs write, tell and flush
         self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
 
@@ -144,16 +143,13 @@ class LogFile:
 
     def commit(self) -> None:
         """Close the chunk and write it. Raises OSError; what could not be written is written with the next."""
-        if not self._ended:
-            self._writer.flush()
-            self._gathered = 0
+        self._writer.flush()
+        self._gathered = 0
         self._out.commit()
 
     def end(self) -> None:
-        """Write the last chunk and the index, and close the file. Raises OSError, and can be called again after it."""
-        if not self._ended:
-            self._writer.finish()
-            self._ended = True
+        """Write the last chunk and the index, and close the file. After an OSError it can only be abandoned."""
+        self._writer.finish()
         self._out.commit()
         self._out.close()
 

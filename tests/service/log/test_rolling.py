@@ -24,6 +24,7 @@ from service.log.intake import Taken
 from service.log.mcap_records import (
     CHANGE_METADATA,
     CHANNEL,
+    CHUNK_BYTES,
     CONTRACT_METADATA,
     MESSAGE,
     METADATA,
@@ -81,13 +82,16 @@ class Clock:
 
     def __init__(self) -> None:
         self.now = 1000.0
+        self.logs: list[RollingLog] = []  # that run by it
 
 
 @pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     clock = Clock()
     monkeypatch.setattr(rolling, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    return clock
+    yield clock
+    for log in clock.logs:
+        log._file.abandon()  # of a test that failed, it may be open still
 
 
 class Disk:
@@ -150,6 +154,7 @@ class Recording:
         self._clock = clock
         self.waiting: list[Taken] = []
         self.log = RollingLog(RecorderSettings.model_validate(settings), lambda *told: self.told.append(told))
+        clock.logs.append(self.log)
         self.log.add_contract(story.key, story.contract)
         self._decoder = Decoder(25.0)
         self._decoder.configure(Contract.model_validate_json(story.contract))
@@ -357,6 +362,19 @@ def test_a_crash_costs_what_came_since_the_last_chunk_was_closed(tmp_path: Path,
     recording.log.close()
 
 
+def test_a_chunk_is_closed_when_it_is_large_though_it_is_not_yet_due(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=60)
+    small = next(taken for taken in story.messages if taken.key.endswith("/command"))
+    recording.take([small])  # the very first is written at once
+    before = disk.writes
+    recording.take([small._replace(payload=os.urandom(1000)) for _ in range(1000)])
+    assert (tmp_path / "a.mcap").stat().st_size > 1e6 - CHUNK_BYTES
+    assert disk.writes - before == 1000 * (1000 + 31) // CHUNK_BYTES
+    recording.log.close()
+
+
 def _topics_of_messages(path: Path) -> list[str]:
     channels: dict[int, str] = {}
     found = []
@@ -520,38 +538,41 @@ def test_while_a_disk_is_full_it_is_tried_once_a_second_and_told_of_once(
     recording.log.close()
 
 
-@pytest.mark.parametrize("tail", [False, True], ids=["then it is well", "then it is full for a while"])
+@pytest.mark.parametrize(
+    "first", [None, (errno.EIO, errno.ENOSPC), (errno.EIO, 0, errno.ENOSPC)], ids=["it", "its head", "its messages"]
+)
 def test_a_broken_disk_is_left_for_a_new_file_and_nothing_is_lost_or_doubled(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk, tail: bool
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk, first: tuple[int, ...] | None
 ) -> None:
+    """Even if at first there is no room for the new file: what came to nothing is removed."""
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
     recording.take(story.messages[:330])
     disk.broken = errno.EIO
     recording.take(story.messages[330:500])
     recording.wait(2.0)
     assert not recording.log.writable
-    if tail:
-        _break(disk, 1, errno.ENOSPC)  # the old file is given up, but the head of the new one finds no room
+    if first:
+        _errors(disk, *first)
         recording.wait(1.0)
         assert not recording.log.writable
-        assert [path.name for path in in_order(tmp_path)] == ["a.mcap"], "what came to nothing is removed"
-    _break(disk, 1, 0)
+        assert [path.name for path in in_order(tmp_path)] == ["a.mcap"]
+    _errors(disk, errno.EIO, 0)  # the old file's, and then none
     recording.wait(1.0)
     recording.take(story.messages[500:])
     recording.log.close()
-    assert [path.name for path in in_order(tmp_path)] == ["a.mcap", "a-0001.mcap"]
-    recover(tmp_path / "a.mcap", tmp_path / "recovered")
-    assert every_message([tmp_path / "recovered", tmp_path / "a-0001.mcap"]) == numbered(story.messages)
-    (session,) = replay([tmp_path / "a.mcap", tmp_path / "a-0001.mcap"])
+    old, new = in_order(tmp_path)
+    recover(old, tmp_path / "recovered")
+    assert every_message([tmp_path / "recovered", new]) == numbered(story.messages)
+    (session,) = replay([old, new])
     assert (session.commands, session.differing) == (TICKS, 0)
 
 
-def _break(disk: Disk, writes: int, then: int) -> None:
-    """So many writes fail, and those after them do as `then` says."""
-    last = disk.writes + writes
+def _errors(disk: Disk, *errors: int) -> None:
+    """What the next writes give, and all that follow as the last one does."""
+    coming = list(errors)
 
     def changes(_: int) -> None:
-        disk.broken = errno.EIO if disk.writes <= last else then
+        disk.broken = coming.pop(0) if len(coming) > 1 else coming[0]
 
     disk.changes = changes
 
@@ -584,11 +605,12 @@ def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
     disk.new_files = errno.EACCES
     recording.wait(2.5)
     recording.take(story.messages[100:200])
+    recording.wait(1.5)  # time enough to look again, but not to try again
     assert recording.told_bad() == [
         f"no new file can be begun ({os.strerror(errno.EACCES)}), so {tmp_path / 'a.mcap'} goes on"
     ]
     disk.new_files = 0
-    recording.wait(2.5)
+    recording.wait(1.0)
     recording.take(story.messages[200:300])
     recording.log.close()
     expected = numbered(story.messages[:300])
