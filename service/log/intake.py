@@ -3,8 +3,8 @@
 A message at a time, most of what recording costs is waking up: some 100 µs of a core each, before a byte is written. So
 the receiving thread is put to sleep where a pause begins, and what came meanwhile waits in the kernel's socket buffers
 and is read in one go, at a tenth of that cost. For it all links share one thread (`one_thread`, called before the
-network is joined). Nothing else is done in that thread: whoever writes takes from the queue. While little comes,
-nothing waits: a handshake with somebody who joins takes several messages each way.
+network is joined). That thread looks for gaps, before anything is refused, and does nothing else: whoever writes takes
+from the queue. While little comes, nothing waits: a handshake with somebody who joins takes several messages each way.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ payloads with their time of publication; decoded channels stand beside them at a
 with its effective configuration and the wire spec, is fetched when the role appears and stands in every file, so that
 one file needs nothing else to be read. What was lost is found by its sender's numbers and written into the log.
 
-A crash costs what the open chunk holds: `chunk_s` at the most.
+A crash costs what the open chunk holds, `chunk_s` at the most, and what was on its way there: 0.1 s, or 1 s while a
+role is asked for its contract and does not answer.
 """
 
 from __future__ import annotations
