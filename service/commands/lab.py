@@ -22,6 +22,7 @@ from service.commands.common import (
 
 if TYPE_CHECKING:
     from service.calibrate import Calibration
+    from service.certificate import Certificate
     from service.figures import Figures
     from service.tables import Tables
 
@@ -103,3 +104,45 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
         from service.display import calibration_table
 
         calibration_table(result)
+
+
+@group.command()
+def certify(
+    disturbance: Annotated[float, typer.Option(min=0, help="Largest disturbance to be reckoned with, in N·m.")] = 0.0,
+    attitude_error: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=180,
+            help="Assume that the attitude error stays below this, in degrees; controller.start_within_deg if left "
+            "out, and 180 assumes nothing.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Say whether the paper's theorem holds for the configuration, and what error it then guarantees."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Certificate:
+        from service.certificate import certify
+
+        return certify(
+            settings.wire,
+            settings.law,
+            settings.reference,
+            settings.controller,
+            disturbance=disturbance,
+            attitude_error_deg=attitude_error,
+        )
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from service.certificate_table import certificate_table
+
+        certificate_table(result)
+    raise typer.Exit(0 if result.holds else 1)

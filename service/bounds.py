@@ -1,0 +1,218 @@
+"""The bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper.
+
+    symbol     name in code             symbol     name in code             symbol   name in code
+    ‖δ_ε‖      delta_eps                k_ω_d      k_omega_d                ‖δ_z2‖   delta_z2
+    ‖δ_ω‖      delta_omega              k_ω̇_d      k_omega_d_dot            δ_ᾱ1     delta_alpha1
+    ‖δ_u‖      delta_u                  k_ω_e      k_omega_e                λ_max(J) lambda_J
+    k_θ        k_theta                  ‖δ_ω_e‖    delta_omega_e            C₁ C₂    least and largest element
+
+What each means, with its unit and equation, stands beside it in `Known`, `Lemma` and `Theorem`; a certificate prints it
+from there. The paper weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here.
+
+Where the paper's text cannot be evaluated as it is printed, this is how it is read:
+
+- (C.50), (C.51) and (C.58), (C.59) compare vectors with ≤; they are read with norms. The δ_ωe of (C.58) is then
+  δ_R k_ωd + δ_ω, with the k_ε² of (C.61).
+- k_ε of (C.31) is only said to exceed 1. Here it is the least such constant that serves d_ε, the chord ‖q^Q − q‖ and
+  d_ε̃ of (C.33) alike: near η = 0, ε says little about η, so it follows from how far the body may turn.
+- c₀ of (C.66): GᵀC₁G has rank 3 and the least eigenvalue 0. The proof needs z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃, which is at least
+  λ_min(C₁) (1 + |η̃|)/2 ‖z₁‖².
+- (C.71) has δ_R λ_max(J) k_ωd where the proof has k_ω̇d; the proof is right.
+- Remark 5 says ‖θ̃‖ ≤ k_θ. The projection keeps θ̂, and Assumption 2 θ, within k_θ: that gives 2 k_θ.
+- k of (C.66) is taken as large as it may be: the margin itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import asin, cos, pi, sin, sqrt
+from typing import Annotated, NamedTuple
+
+
+class Term(NamedTuple):
+    """What a field of the classes below stands for: the paper's symbol, where it is from, unit, meaning."""
+
+    symbol: str
+    equation: str
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the theorem takes for granted: of the model, the gains, the wire and the reference; and what is assumed."""
+
+    lambda_J: Annotated[float, Term("λ_max(J)", "C.2", "kg·m²", "largest moment of inertia")]
+    weight: Annotated[float, Term("‖r_g‖ m g", "C.6", "N·m", "largest torque of the weight")]
+    norm_B: Annotated[float, Term("‖B‖", "C.2", "N·m/V", "of the motors that there are")]
+    C1_min: Annotated[float, Term("λ_min(C₁)", "C.20", "1/s", "least gain of the attitude error")]
+    C1_max: Annotated[float, Term("λ_max(C₁)", "C.20", "1/s", "largest gain of the attitude error")]
+    C2_min: Annotated[float, Term("λ_min(C₂)", "C.22", "N·m·s/rad", "least gain of the rate error")]
+    C2_max: Annotated[float, Term("λ_max(C₂)", "C.22", "N·m·s/rad", "largest gain of the rate error")]
+    delta_eps: Annotated[float, Term("‖δ_ε‖", "C.28", "1", "quantization error of ε, from wire.attitude")]
+    delta_omega: Annotated[float, Term("‖δ_ω‖", "C.29", "rad/s", "quantization error of ω, from wire.rate")]
+    delta_u: Annotated[float, Term("‖δ_u‖", "C.30", "V", "quantization error of u, from wire.voltage")]
+    k_omega_d: Annotated[float, Term("k_ω_d", "Assumption 1", "rad/s", "largest ‖ω_d‖ of the reference")]
+    k_omega_d_dot: Annotated[float, Term("k_ω̇_d", "Assumption 1", "rad/s²", "largest ‖ω̇_d‖ of the reference")]
+    half_angle_d: Annotated[float, Term("max ∡q_d/2", "C.16", "rad", "farthest turn of the reference, halved")]
+    half_angle_e: Annotated[
+        float,
+        Term(
+            "max ∡e/2",
+            "Assumption 3",
+            "rad",
+            "assumed: the attitude error stays below twice this; by --attitude-error, else controller.start_within_deg "
+            "within which sessions begin, and at least what is guaranteed in the end",
+        ),
+    ]
+    k_theta: Annotated[
+        float, Term("k_θ", "Assumption 2", "N·m·s/rad", "assumed: ‖θ‖ ≤ law.damping_bound, as the law does")
+    ]
+    k_tau_d: Annotated[
+        float,
+        Term("k_τ_d", "C.78", "N·m", "assumed: ‖τ_d‖ ≤ this, by --disturbance; 0 is Theorem 1, as nothing is known"),
+    ]
+    omega_limit: Annotated[
+        float,
+        Term(
+            "max |ω_k|",
+            "C.29",
+            "rad/s",
+            "assumed: within wire.rate.limit; max ‖ω‖ below is how far ω may get in the end",
+        ),
+    ]
+    u_limit: Annotated[
+        float, Term("max |u_k|", "C.30", "V", "assumed: within wire.voltage.limit; a log counts the commands beyond it")
+    ]
+
+
+@dataclass(frozen=True)
+class Lemma:
+    """The right-hand sides of Lemma 1, (C.50)–(C.57), with (C.75) and the constants they are made of."""
+
+    delta_q: Annotated[float, Term("k_ε‖δ_ε‖", "C.31", "1", "how far q^Q may be from q")]
+    k_eps: Annotated[float, Term("k_ε", "C.31", "1", "what q's error is to that of ε, by how far the body may turn")]
+    k_omega_e: Annotated[float, Term("k_ω_e", "C.26", "1", "‖ω_e‖ ≤ k_ω_e ‖z‖")]
+    delta_R: Annotated[float, Term("δ_R", "C.53, C.61", "1", "‖R_i^Q − R_i^b‖")]
+    delta_omega_e: Annotated[float, Term("‖δ_ω_e‖", "C.50, C.58", "rad/s", "‖ω_e^Q − ω_e‖")]
+    delta_z1: Annotated[float, Term("δ_z1", "C.52, C.60", "1", "‖G z₁ − G^Q z₁^Q‖, acting as N·m")]
+    delta_z2: Annotated[float, Term("‖δ_z2‖", "C.51, C.59", "rad/s", "‖z₂^Q − z₂‖")]
+    delta_Psi1: Annotated[float, Term("δ_Ψ1", "C.54, C.62", "N·m", "‖Ψ − Ψ^Q‖ at z = 0")]
+    delta_Psi2: Annotated[float, Term("δ_Ψ2", "C.54, C.62", "N·m·s/rad", "its growth with ‖z‖")]
+    delta_S1: Annotated[float, Term("δ_S1", "C.55, C.63", "rad/s", "‖S(ω)R_i^b − S(ω^Q)R_i^Q‖ at z = 0")]
+    delta_S2: Annotated[float, Term("δ_S2", "C.55, C.63", "1", "its growth with ‖z‖")]
+    delta_alpha1: Annotated[float, Term("δ_ᾱ1", "C.56, C.64", "rad/s²", "‖ᾱ^Q − α̇‖ at z = 0")]
+    delta_alpha2: Annotated[
+        float, Term("δ_ᾱ2", "C.56, C.64", "1/s", "its growth with ‖z‖; does not vanish without quantization")
+    ]
+    delta_Phi: Annotated[float, Term("δ_ω", "C.57, C.65", "rad/s", "‖Φ − Φ^Q‖")]
+    delta_Bu: Annotated[float, Term("δ_Bu", "C.75", "N·m", "torque of u's quantization error")]
+
+
+@dataclass(frozen=True)
+class Theorem:
+    """What Theorem 1 and Corollary 1 make of Lemma 1. The last four are None where condition (C.66) fails."""
+
+    c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
+    coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
+    alpha: Annotated[float, Term("δ_ᾱ2 λ_max(J)", "C.67", "N·m·s/rad", "δ_V1's part of ᾱ^Q")]
+    delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "what quantization takes of the damping c₀/2")]
+    k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "2 k_θ: θ and θ̂ are both within k_θ")]
+    delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q that θ̃ has")]
+    delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 that θ and θ̃ have")]
+    delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "what quantization adds as a torque")]
+    delta_Q: Annotated[float, Term("δ_Q", "C.69", "W", "what drives V without a disturbance")]
+    delta_Qdist: Annotated[float, Term("δ_Qdist", "C.80", "W", "what drives V under the disturbance")]
+    margin: Annotated[float, Term("c₀/2 − δ_V1", "C.66", "N·m·s/rad", "positive where the theorem holds")]
+    k: Annotated[float | None, Term("k", "C.66", "N·m·s/rad", "rate at which V falls, per ‖z‖²")]
+    radius: Annotated[float | None, Term("√(δ_Q/k)", "C.68, C.79", "1, rad/s", "where ‖z‖ ends, under the disturbance")]
+    end_angle: Annotated[float | None, Term("4 asin(√(δ_Q/k)/2)", "C.19", "rad", "attitude error that ‖z₁‖ is then")]
+    end_rate: Annotated[float | None, Term("max ‖ω‖", "C.27", "rad/s", "k_ω_e √(δ_Q/k) + k_ω_d")]
+
+
+def lemma_1(p: Known) -> Lemma:
+    """The δ of Lemma 1."""
+    delta_q = attitude_error(p.delta_eps, min(pi / 2, p.half_angle_d + p.half_angle_e))  # (C.31), (C.33)
+    k_omega_e = 1 + p.C1_max  # (C.26)
+    delta_R = 2 * (delta_q + delta_q**2)  # (C.61)
+    delta_omega_e = delta_R * p.k_omega_d + p.delta_omega  # (C.58)
+    return Lemma(
+        delta_q=delta_q,
+        k_eps=delta_q / p.delta_eps if p.delta_eps else 1.0,
+        k_omega_e=k_omega_e,
+        delta_R=delta_R,
+        delta_omega_e=delta_omega_e,
+        delta_z1=delta_q,  # (C.60)
+        delta_z2=delta_omega_e + p.C1_max * delta_q,  # (C.59)
+        delta_Psi1=p.lambda_J * (2 * p.k_omega_d * p.delta_omega + p.delta_omega**2) + p.weight * delta_R,  # (C.62)
+        delta_Psi2=2 * p.lambda_J * p.delta_omega * k_omega_e,  # (C.62)
+        delta_S1=p.k_omega_d * delta_R + p.delta_omega,  # (C.63)
+        delta_S2=k_omega_e * delta_R,  # (C.63)
+        delta_alpha1=p.C1_max * delta_omega_e / 2,  # (C.64)
+        delta_alpha2=p.C1_max * k_omega_e,  # (C.64)
+        delta_Phi=p.delta_omega,  # (C.65)
+        delta_Bu=p.delta_u * p.norm_B,  # (C.75)
+    )
+
+
+def attitude_error(delta_eps: float, half_angle: float) -> float:
+    """The largest ‖q^Q − q‖, of which neither d_ε of (C.31) nor d_ε̃ of (C.33) is more.
+
+    η = √(1 − ‖ε‖²) falls ever more steeply, so it errs most where ‖ε‖ is largest and ε^Q lies farther out still. What
+    Remark 2 scales to unit length comes nearer to ε by that.
+
+    Args:
+        delta_eps: ‖δ_ε‖.
+        half_angle: The farthest that the body turns from q = [1, 0], halved; at most π/2 [rad].
+    """
+    outer = min(1.0, sin(half_angle) + delta_eps)
+    inner = max(0.0, outer - delta_eps)
+    return sqrt(delta_eps**2 + (sqrt(1 - inner**2) - sqrt(1 - outer**2)) ** 2)
+
+
+def theorem_1(p: Known, d: Lemma) -> Theorem:
+    """The condition of Theorem 1 and what follows from it; with a disturbance, that of Corollary 1."""
+    least_share = (1 + cos(p.half_angle_e)) / 2  # of ‖z₁‖² that is ‖ε̃‖²: 1 where e is small, ½ where η̃ = 0
+    c0 = min(p.C1_min * least_share, p.C2_min)  # (C.66)
+    coriolis, alpha = d.delta_S2 * p.lambda_J * p.k_omega_d, d.delta_alpha2 * p.lambda_J
+    delta_V1 = d.delta_Psi2 + coriolis + alpha  # (C.67)
+    k_theta_err = 2 * p.k_theta
+    delta_theta1 = k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
+    delta_theta2 = p.k_theta * p.delta_omega + k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
+    delta_V2 = (
+        p.C2_max * d.delta_z2
+        + d.delta_z1
+        + d.delta_Psi1
+        + d.delta_S1 * p.lambda_J * p.k_omega_d
+        + d.delta_R * p.lambda_J * p.k_omega_d_dot
+        + d.delta_alpha1 * p.lambda_J
+        + delta_theta2
+        + d.delta_Bu
+    )  # (C.71)
+    delta_Q = delta_theta1 + delta_V2**2 / (2 * c0)  # (C.69)
+    delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d) ** 2 / (2 * c0)  # (C.80)
+    margin = c0 / 2 - delta_V1  # (C.66)
+    holds = margin > 0
+    radius = sqrt(delta_Qdist / margin) if holds else None  # (C.68), (C.79)
+    return Theorem(
+        c0=c0,
+        coriolis=coriolis,
+        alpha=alpha,
+        delta_V1=delta_V1,
+        k_theta_err=k_theta_err,
+        delta_theta1=delta_theta1,
+        delta_theta2=delta_theta2,
+        delta_V2=delta_V2,
+        delta_Q=delta_Q,
+        delta_Qdist=delta_Qdist,
+        margin=margin,
+        k=margin if holds else None,
+        radius=radius,
+        end_angle=None if radius is None else error_angle(radius),
+        end_rate=None if radius is None else d.k_omega_e * radius + p.k_omega_d,  # (C.27)
+    )
+
+
+def error_angle(z1: float) -> float:
+    """The attitude error [rad] of which ‖z₁‖ is this: by (C.19), ‖z₁‖ = √(2 − 2|η̃|) = 2 sin(angle / 4); at most π."""
+    return min(pi, 4 * asin(min(1.0, z1 / 2)))

@@ -1,0 +1,80 @@
+"""How far and how fast a reference goes: the bounds k_ω_d and k_ω̇_d of Assumption 1, and the farthest turn.
+
+They are taken over the samples that also hold an operator's references to their limits. Samples come within half a
+percent of the extremes, and Assumption 1 asks for bounds that are not reached: half a percent is added. A sinusoid is
+seen over eight turns of its slowest axis, which is all of it where the frequencies have small common multiples.
+"""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from protocol.errors import AeroloopError
+from protocol.verbs import Reference, Stream
+from service.reference import Angles, Floats, Plan
+
+_SLACK: Final = 1.005
+
+
+class UnknownReferenceError(AeroloopError):
+    """A reference that is not known beforehand; one line."""
+
+
+class Extremes(NamedTuple):
+    """What a reference never exceeds.
+
+    Attributes:
+        rate: k_ω_d, largest ‖ω_d‖ [rad/s].
+        acceleration: k_ω̇_d, largest ‖ω̇_d‖ [rad/s²].
+        half_angle: Half the largest angle of q_d from [1, 0], at most π/2 [rad].
+    """
+
+    rate: float
+    acceleration: float
+    half_angle: float
+
+
+def extremes(reference: Reference) -> Extremes:
+    """The extremes of a reference that begins at its own beginning.
+
+    Raises:
+        UnknownReferenceError: A stream, whose set-points are not known beforehand.
+    """
+    if isinstance(reference, Stream):
+        raise UnknownReferenceError(
+            "a stream's set-points are not known beforehand: certify a reference like them, by --set reference.kind=…"
+        )
+    plan = Plan.of(reference)
+    samples = plan.samples()
+    return Extremes(
+        rate=_SLACK * plan.fastest(),
+        acceleration=_SLACK * float(np.linalg.norm(accelerations(samples), axis=1).max()),
+        half_angle=min(pi / 2, _SLACK * float(half_angles(samples).max())),
+    )
+
+
+def accelerations(angles: Angles) -> Floats:
+    """ω̇_d in a frame that yaws with the body, where its norm is the same as in any other [rad/s²]. Shape (n, 3).
+
+    ω_d = ψ̇ z + θ̇ y + φ̇ x for roll φ, pitch θ, yaw ψ about axes of which y turns with the yaw and x with both.
+    """
+    _, pitch, _ = angles.angle.T
+    d_roll, d_pitch, d_yaw = (rate[:, None] for rate in angles.rate.T)
+    dd_roll, dd_pitch, dd_yaw = (acceleration[:, None] for acceleration in angles.acceleration.T)
+    z, y = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 1.0, 0.0]])
+    x = np.stack([np.cos(pitch), np.zeros_like(pitch), -np.sin(pitch)], axis=1)
+    turning = d_yaw * z + d_pitch * y  # of x; the yaw alone turns y
+    turned = d_pitch * d_yaw * np.cross(z, y) + d_roll * np.cross(turning, x)
+    omega_d_dot: Floats = dd_yaw * z + dd_pitch * y + dd_roll * x + turned
+    return omega_d_dot
+
+
+def half_angles(angles: Angles) -> Floats:
+    """Half the angle of each q_d from [1, 0], of whichever of ±q_d is nearer, 0…π/2 [rad]. Shape (n,)."""
+    (a, b, c) = angles.angle.T / 2
+    eta_d = np.cos(a) * np.cos(b) * np.cos(c) + np.sin(a) * np.sin(b) * np.sin(c)
+    nearest: Floats = np.arccos(np.minimum(1.0, np.abs(eta_d)))
+    return nearest
