@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -39,7 +40,15 @@ Frames = dict[str, list[tuple[int, bytes]]]
 def frames(*paths: Path) -> Frames:
     """What logs hold, with or without their end; numbers of each key must go on from file to file."""
     found: Frames = {}
-    following: dict[str, int] = {}
+    for path, key, message in _frames(paths):
+        held = found.setdefault(key, [])
+        held.append((message.publish_time, message.data))
+        assert message.sequence == len(held), f"{key} in {path}"
+    return found
+
+
+def _frames(paths: Sequence[Path]) -> Iterator[tuple[Path, str, Message]]:
+    """File, key and message."""
     for path in paths:
         channels: dict[int, str] = {}
         for record in records(path):
@@ -51,10 +60,7 @@ def frames(*paths: Path) -> Frames:
                 key = channels[message.channel]
                 address = topics.read_key(key)
                 if address is not None and address.topic.carries == "frame":
-                    assert message.sequence == following.get(key, 1), f"{key} in {path}"
-                    following[key] = message.sequence + 1
-                    found.setdefault(key, []).append((message.publish_time, message.data))
-    return found
+                    yield path, key, message
 
 
 class Heard:
@@ -84,13 +90,13 @@ def losses(*paths: Path) -> list[Loss]:
 
 
 def test_a_rotated_run_in_lockstep_holds_every_frame_and_is_reviewed_and_replayed_as_a_whole(tmp_path: Path) -> None:
-    """Eight seconds of the law: as fast as this machine allows, they take more than one of the recorder's files."""
+    """Six seconds of the law: as fast as this machine allows, they take more than one of the recorder's files."""
     with Hil(tmp_path, lockstep=True) as hil:
         hil.start(settings={"recorder.max_file_s": 1.0, "recorder.chunk_s": 0.1})
-        hil.run(8.0)
-    ticks = 4000
+        hil.run(6.0)
+    ticks = 3000
     files = LogFiles([tmp_path]).paths
-    assert len(files) >= 2
+    assert len({path for path, _, _ in _frames(files)}) >= 2, "not in one file, as it is"
     (measurements,), (commands,) = (
         [held for key, held in frames(*files).items() if key.endswith(name)] for name in ("measurement", "command")
     )
@@ -106,15 +112,17 @@ def test_a_rotated_run_in_lockstep_holds_every_frame_and_is_reviewed_and_replaye
 
 
 def test_a_recorder_that_is_killed_costs_a_chunk_and_the_loop_goes_on(tmp_path: Path) -> None:
+    """So slow a loop that a chunk would take ten seconds to be closed by its size."""
     chunk_s = 0.5
+    slow = {"loop.rate_hz": 100, "controller.telemetry_rate_hz": 1, "plant.truth_rate_hz": 1, "recorder.decoded_hz": 0}
     with Hil(tmp_path) as hil:
-        hil.start(settings={"recorder.chunk_s": chunk_s, **PATIENT})
+        hil.start(settings={"recorder.chunk_s": chunk_s, **slow, **PATIENT})
         heard = Heard(hil.bench.zenoh, hil.settings.vehicle)
-        hil.eventually("three seconds", lambda: heard.count() > 3000)
+        hil.eventually("three seconds", lambda: heard.count() > 600)
         killed_ns = time.time_ns()
         hil.kill("recorder")
         before = heard.count()
-        hil.eventually("the loop goes on", lambda: heard.count() > before + 1000)
+        hil.eventually("the loop goes on", lambda: heard.count() > before + 200)
         assert hil.state("plant") == "driven"
         log = tmp_path / "hil-0.mcap"
         assert_held(heard.frames, log, until_ns=killed_ns - round((chunk_s + SLACK_S) * 1e9))
@@ -126,7 +134,7 @@ def assert_held(heard: Frames, *paths: Path, until_ns: int) -> None:
     held = frames(*paths)
     lost = sum(loss.count for loss in losses(*paths) if loss.reason == "network")
     older = {key: {one for one in list(of_key) if one[0] < until_ns} for key, of_key in heard.items()}
-    assert sum(len(of_key) for of_key in older.values()) > 1000
+    assert sum(len(of_key) for of_key in older.values()) > 200
     assert sum(len(of_key.difference(held[key])) for key, of_key in older.items()) <= lost
 
 

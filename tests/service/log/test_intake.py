@@ -132,8 +132,9 @@ def test_messages_gather_where_much_comes_and_none_is_late_where_little_comes(
     pauses = sleeps(monkeypatch)
     intake = Intake(receiver, ALL, 0.017)
     one = publisher(sender, KEYS[0])
-    for number in range(50):  # fewer than 200: not known to be busy, however long it takes
+    for number in range(50):  # one by one, but fewer than 200: not known to be busy, however long it takes
         one.put(payload(number))
+        time.sleep(0.001)
     eventually("all", lambda: len(intake) == 50)
     assert pauses == []
     until = time.monotonic() + 2.5
