@@ -86,7 +86,7 @@ def _by_gains(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy
             yield _gains_remedy(law, {name: factor})
     if found:
         return
-    steps = range(-_MOST_STEPS, _MOST_STEPS + 1, 2)
+    steps = range(-_MOST_STEPS, _MOST_STEPS + 1, 4)  # one gain alone is tried finely, two together coarsely
     for m, n in sorted(product(steps, steps), key=lambda pair: (abs(pair[0]) + abs(pair[1]), pair)):
         factors = {"C1": _STEP**m, "C2": _STEP**n}
         if _allowed(law, factors) and holds(wire, scaled(law, factors)):

@@ -1,0 +1,222 @@
+"""Lemma 1 and the theorem's last step, on random states through the real quantizers: no bound is ever exceeded.
+
+Half of the states are aimed: ε and ω at the corners of the quantizers' cells, as far from [1, 0] as the bounds allow,
+with little error. There a bound that is half as large would be exceeded, so the check is worth something.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import asin, floor, radians, sin, sqrt
+
+import numpy as np
+import pytest
+
+from protocol.attitude import IDENTITY, Vector, received_quaternion, sent_vector
+from protocol.frames import SignalSpec, WireSpec
+from protocol.quantizer import Quantizer
+from protocol.symbolic import Compiled
+from protocol.verbs import Sinusoid
+from service.certificate import Evaluated, evaluate, known
+from service.extremes import extremes
+from service.law import LawSettings
+from service.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
+from service.reference import Plan, reference_function
+from tests.service import numpy_twin as twin
+from tests.service.twin_body import body_of
+
+LAW = LawSettings(
+    inertia=(0.02, 0.03, 0.01),
+    centre_of_mass=(0.03, -0.02, 0.02),
+    allocation=((0.01, 0, 0), (0, 0.02, 0), (0, 0, 0.01)),
+    C1=(0.3, 0.2, 0.25),
+    C2=(0.15, 0.1, 0.12),
+)
+REFERENCE = Sinusoid(amplitude=(5.0, 30.0, 60.0), frequency=(0.5, 0.4, 0.3))
+ERROR = radians(15)
+COUNT = 1500
+DELTAS = {
+    "C.50": ["delta_omega_e"],
+    "C.51": ["delta_z2"],
+    "C.52": ["delta_z1"],
+    "C.53": ["delta_R"],
+    "C.54": ["delta_Psi1", "delta_Psi2"],
+    "C.55": ["delta_S1", "delta_S2"],
+    "C.56": ["delta_alpha1", "delta_alpha2"],
+    "C.57": ["delta_Phi"],
+}
+LEMMA = tuple(DELTAS)
+
+
+def bounds(wire: WireSpec, error: float = ERROR) -> Evaluated:
+    return evaluate(known(wire, LAW, desired=extremes(REFERENCE), disturbance=0.0, error=error))
+
+
+def wire_of(bits: int) -> WireSpec:
+    return WireSpec(actuators=3).with_bits(bits, bits)
+
+
+def product(p: Floats, q: Floats) -> Floats:
+    """Hamilton's, row by row."""
+    eta = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(axis=1, keepdims=True)
+    return np.hstack([eta, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])])
+
+
+def turns(axis: Floats, angle: Floats) -> Floats:
+    """Quaternions of turns by an angle [rad] about an axis, row by row."""
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    return np.hstack([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * axis])
+
+
+def random_samples(wire: WireSpec, b: Evaluated, seed: int) -> tuple[Samples, Floats]:
+    """States along the reference, as far from it as was assumed, and what the law receives of them; and ω̇_d."""
+    rng = np.random.default_rng(seed)
+    motion, desired = Compiled(reference_function()), Plan.of(REFERENCE)
+    rows = []
+    for name in ("amplitude", "frequency"):
+        motion.inputs[name][:] = memoryview(getattr(desired, name)[0].copy())
+    for t in rng.uniform(0, 60, COUNT):
+        motion.inputs["t"][0] = t
+        motion()
+        rows.append([value for name in ("q_d", "omega_d", "omega_d_dot") for value in motion.outputs[name]])
+    q_d, omega_d, omega_d_dot = np.split(np.array(rows), [4, 7], axis=1)
+    errors = turns(rng.standard_normal((COUNT, 3)), 2 * b.known.half_angle_e * rng.uniform(0, 1, COUNT))
+    q = product(q_d, errors)
+    omega = rng.uniform(-0.9, 0.9, (COUNT, 3))
+
+    aimed = rng.random(COUNT) < 0.5
+    diagonals = rng.choice([-1.0, 1.0], (COUNT, 3))
+    q[aimed] = q_d[aimed] = turns(diagonals, np.full(COUNT, 2 * _edge_before(b.known.half_angle_d, wire)))[aimed]
+    # No error at all: z = 0, where what grows with ‖z‖ does not hide the rest. And no faster than the reference.
+    omega[aimed] = _edges(wire, b.known.k_omega_d / sqrt(3), rng)[aimed]
+    omega_d[aimed] = times(rotation(q[aimed]), omega[aimed])
+
+    q *= rng.choice([-1.0, 1.0], (COUNT, 1))  # the truth may be told with either sign
+    attitude, rate = wire.attitude.quantizer(), wire.rate.quantizer()
+    sent = [sent_vector((w, x, y, z)) for w, x, y, z in q.tolist()]
+    q_Q = np.array([received_quaternion(*_quantized(attitude, eps), IDENTITY) for eps in sent])
+    omega_Q = np.array([[rate.quantize(value) for value in row] for row in omega.tolist()])
+    sign = np.where((q * q_d).sum(axis=1) * (q * q_Q).sum(axis=1) >= 0, 1.0, -1.0)
+    return Samples(q, omega, q_Q, omega_Q, q_d, omega_d, sign), omega_d_dot
+
+
+def _quantized(quantizer: Quantizer, vector: Vector) -> Vector:
+    x, y, z = vector
+    return quantizer.quantize(x), quantizer.quantize(y), quantizer.quantize(z)
+
+
+def _edge_before(half_angle: float, wire: WireSpec) -> float:
+    """The largest half-angle up to this one whose ε, along a diagonal, has just left the cell before."""
+    step = 2 * wire.attitude.quantizer().bound
+    return asin(sqrt(3) * (floor(sin(half_angle) / sqrt(3) / step - 0.5) + 0.501) * step)
+
+
+def _edges(wire: WireSpec, most: float, rng: np.random.Generator) -> Floats:
+    """Values beside the edges of the rate's cells, up to ±most [rad/s]. Shape (COUNT, 3)."""
+    step = 2 * wire.rate.quantizer().bound
+    cells = floor(most / step - 0.5)
+    edges: Floats = (rng.integers(-cells, cells + 1, (COUNT, 3)) + rng.choice([-0.499, 0.499], (COUNT, 3))) * step
+    return edges
+
+
+@pytest.mark.parametrize("bits", [3, 6, 8, 12])
+def test_no_random_state_exceeds_a_bound_of_the_lemma(bits: int) -> None:
+    wire = wire_of(bits)
+    b = bounds(wire)
+    samples, _ = random_samples(wire, b, seed=bits)
+    inequalities = lemma_inequalities(samples, LAW, b.known, b.lemma)
+    assert [i.equation for i in inequalities] == ["C.28", "C.29", "C.26", "C.27", *LEMMA]
+    assert {i.equation: int(i.broken.sum()) for i in inequalities if i.broken.any()} == {}
+
+
+@pytest.mark.parametrize("equation", LEMMA)
+def test_half_of_a_bound_is_exceeded(equation: str) -> None:
+    """Of 12 bits, where every bound of the lemma is nearly attained (0.58 of it by (C.57), which holds for ‖d_ω‖)."""
+    wire = wire_of(12)
+    b = bounds(wire)
+    samples, _ = random_samples(wire, b, seed=12)
+    halved = replace(b.lemma, **{name: getattr(b.lemma, name) / 2 for name in DELTAS[equation]})
+    broken = {i.equation for i in lemma_inequalities(samples, LAW, b.known, halved) if i.broken.any()}
+    assert broken == {equation}
+
+
+def test_the_sides_are_what_a_second_implementation_makes_of_them() -> None:
+    wire = wire_of(6)
+    b = bounds(wire)
+    x, omega_d_dot = random_samples(wire, b, seed=3)
+    sides = {i.equation: i for i in lemma_inequalities(x, LAW, b.known, b.lemma)}
+    body, theta = body_of(LAW), np.zeros(3)
+    for i in range(0, COUNT, 50):
+        q = x.q[i] if x.q[i] @ x.q_Q[i] >= 0 else -x.q[i]
+        true = twin.law(body, q, x.omega[i], x.q_d[i], x.omega_d[i], omega_d_dot[i], theta, x.sign[i])
+        seen = twin.law(body, x.q_Q[i], x.omega_Q[i], x.q_d[i], x.omega_d[i], omega_d_dot[i], theta, x.sign[i])
+        R, R_Q = twin.rotation(q).T, twin.rotation(x.q_Q[i]).T
+        expected = {
+            "C.50": seen.omega_e - true.omega_e,
+            "C.51": seen.z2 - true.z2,
+            "C.52": seen.e[1:] - true.e[1:],
+            "C.53": R_Q - R,
+            "C.55": twin.skew(x.omega[i]) @ R - twin.skew(x.omega_Q[i]) @ R_Q,
+            "C.56": seen.alpha_bar - true.alpha_bar,
+            "C.57": np.diag(x.omega_Q[i] - x.omega[i]),
+        }
+        for equation, difference in expected.items():
+            assert sides[equation].left[i] == pytest.approx(np.linalg.norm(difference, 2), abs=1e-12)
+        z = np.concatenate([true.z1, true.z2])
+        assert sides["C.26"].right[i] == pytest.approx(b.lemma.k_omega_e * np.linalg.norm(z), abs=1e-12)
+
+
+def test_v_falls_as_fast_as_the_theorem_says() -> None:
+    """V̇ of the body under the quantized law, with any θ, θ̂ and disturbance in their bounds, by the twin's equations."""
+    wire = wire_of(8).model_copy(update={"voltage": SignalSpec(bits=8, limit=1000.0)})  # no command saturates
+    disturbance = 0.02
+    b = evaluate(known(wire, LAW, desired=extremes(REFERENCE), disturbance=disturbance, error=ERROR))
+    t = b.theorem
+    assert t.k is not None
+    assert t.radius is not None
+    x, omega_d_dot = random_samples(wire, b, seed=5)
+    rng = np.random.default_rng(5)
+    body, voltage = body_of(LAW), wire.voltage.quantizer()
+    theta, estimate, torque = (_within(r, rng) for r in (LAW.damping_bound, LAW.damping_bound, disturbance))
+    q = np.where((x.q * x.q_Q).sum(axis=1, keepdims=True) < 0, -x.q, x.q)
+    c = coordinates(q, x.omega, x.q_d, x.omega_d, x.sign, np.array(LAW.C1))
+    V_dot = np.empty(COUNT)
+    for i in range(COUNT):
+        args = x.q_d[i], x.omega_d[i], omega_d_dot[i], estimate[i], x.sign[i]
+        seen = twin.law(body, x.q_Q[i], x.omega_Q[i], *args)
+        true = twin.law(body, q[i], x.omega[i], *args)
+        u = np.array([voltage.quantize(value) for value in seen.u])
+        R, J, omega = twin.rotation(q[i]).T, body.J, x.omega[i]
+        gravity = np.cross(body.r_g, R @ np.array([0.0, 0.0, -body.m * body.g]))
+        J_omega_dot = -np.cross(omega, J @ omega) + gravity - omega * theta[i] + body.B @ u + torque[i]
+        turning = np.cross(omega, R @ x.omega_d[i]) - R @ omega_d_dot[i] - true.alpha_bar
+        V_dot[i] = (
+            x.sign[i] * true.e[1:] @ true.omega_e  # 2 z₁ᵀż₁ = z₁ᵀGᵀω_e
+            + true.z2 @ (J_omega_dot + J @ turning)
+            - (theta[i] - estimate[i]) @ np.linalg.solve(body.Gamma, seen.theta_dot)
+        )
+    z = c.norm
+    margin = -t.k * z**2 + t.delta_Qdist - V_dot
+    assert margin.min() >= 0
+    assert (V_dot > 0).any()  # a law whose V always fell would need no theorem
+    assert np.all(V_dot[z > t.radius] < 0)
+
+
+def _within(radius: float, rng: np.random.Generator) -> Floats:
+    """Vectors no longer than a radius, half of them as long. Shape (COUNT, 3)."""
+    directions = rng.standard_normal((COUNT, 3))
+    lengths = radius * np.minimum(1.0, 2 * rng.random(COUNT))
+    vectors: Floats = directions / np.linalg.norm(directions, axis=1, keepdims=True) * lengths[:, None]
+    return vectors
+
+
+def test_the_lyapunov_function_adds_its_three_parts() -> None:
+    wire = wire_of(8)
+    x, _ = random_samples(wire, bounds(wire), seed=1)
+    c = coordinates(x.q, x.omega, x.q_d, x.omega_d, x.sign, np.array(LAW.C1))
+    theta_error = np.array([[0.01, 0.02, -0.03]])
+    V = lyapunov(c, theta_error, LAW)
+    for i in (0, 1, 2):
+        by_hand = c.z1[i] @ c.z1[i] + c.z2[i] @ np.diag(LAW.inertia) @ c.z2[i] / 2
+        by_hand += theta_error[0] @ np.linalg.inv(np.diag(LAW.Gamma)) @ theta_error[0] / 2
+        assert V[i] == pytest.approx(by_hand)
