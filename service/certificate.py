@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from math import ceil, degrees, pi, radians, sin, sqrt
+from math import ceil, degrees, inf, pi, radians, sin, sqrt
 from typing import Any, Final, get_type_hints
 
 import numpy as np
@@ -112,7 +112,8 @@ def certify(
         attitude_error_deg: Assumed bound on the attitude error at all times; controller.start_within_deg if None.
 
     Raises:
-        UnknownReferenceError: A live stream, whose set-points are not known beforehand.
+        BoundlessError: A live stream, whose set-points are not known beforehand.
+        ValueError: A disturbance that is no number, or negative.
     """
     known_of = _known_of(reference, controller, disturbance, attitude_error_deg)
     bounds = evaluate(known_of(wire, law))
@@ -153,6 +154,8 @@ def bounds_of(
 def _known_of(
     reference: Reference, controller: ControllerSettings, disturbance: float, attitude_error_deg: float | None
 ) -> Callable[[WireSpec, LawSettings], Known]:
+    if not 0 <= disturbance < inf:
+        raise ValueError(f"a disturbance is 0 or more, in N·m, not {disturbance}")
     start_deg = controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
     return partial(known, desired=extremes(reference), disturbance=disturbance, error=radians(min(180.0, start_deg)))
 

@@ -7,7 +7,7 @@ seen over eight turns of its slowest axis, which is all of it where the frequenc
 
 from __future__ import annotations
 
-from math import pi
+from math import isfinite, pi
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,8 +19,8 @@ from service.reference import Angles, Floats, Plan
 _SLACK: Final = 1.005
 
 
-class UnknownReferenceError(AeroloopError):
-    """A reference that is not known beforehand; one line."""
+class BoundlessError(AeroloopError):
+    """A reference of which no bounds are known; one line."""
 
 
 class Extremes(NamedTuple):
@@ -41,19 +41,20 @@ def extremes(reference: Reference) -> Extremes:
     """The extremes of a reference that begins at its own beginning.
 
     Raises:
-        UnknownReferenceError: A stream, whose set-points are not known beforehand.
+        BoundlessError: A stream, whose set-points are not known beforehand, or one too fast for numbers.
     """
     if isinstance(reference, Stream):
-        raise UnknownReferenceError(
+        raise BoundlessError(
             "a stream's set-points are not known beforehand: certify a reference like them, by --set reference.kind=…"
         )
     plan = Plan.of(reference)
-    samples = plan.samples()
-    return Extremes(
-        rate=_SLACK * plan.fastest(),
-        acceleration=_SLACK * float(np.linalg.norm(accelerations(samples), axis=1).max()),
-        half_angle=min(pi / 2, _SLACK * float(half_angles(samples).max())),
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        samples = plan.samples()
+        rate, acceleration = plan.fastest(), float(np.linalg.norm(accelerations(samples), axis=1).max())
+        half_angle = float(half_angles(samples).max())
+    if not isfinite(rate + acceleration + half_angle):
+        raise BoundlessError("the reference is faster than numbers go: nothing can be certified")
+    return Extremes(_SLACK * rate, _SLACK * acceleration, min(pi / 2, _SLACK * half_angle))
 
 
 def accelerations(angles: Angles) -> Floats:

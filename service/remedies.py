@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import product
-from math import exp, log
+from math import ceil, exp, floor, log, log10
 from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -129,11 +129,6 @@ def _gains_remedy(law: LawSettings, factors: dict[str, float]) -> Remedy:
 
 def _rounded(before: float, after: float) -> float:
     """Four digits, away from what it was, so that rounding does not undo the change."""
-    digits = f"{after:.3e}"
-    unit = 10.0 ** (int(digits.partition("e")[2]) - 3)
-    steps = round(after / unit)
-    if after > before and steps * unit < after:
-        steps += 1
-    if after < before and steps * unit > after:
-        steps -= 1
+    unit = 10.0 ** (floor(log10(after)) - 3)
+    steps = ceil(after / unit) if after > before else floor(after / unit)
     return float(f"{steps * unit:.4g}")

@@ -119,12 +119,14 @@ def certify(
             show_default=False,
         ),
     ] = None,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Say whether the paper's theorem holds for the configuration, and what error it then guarantees."""
-    settings = settings_of(config, overrides)
+    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
 
     def run() -> Certificate:
         from service.certificate import certify

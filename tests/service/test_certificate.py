@@ -19,7 +19,7 @@ from service.certificate import Certificate, bounds_of, certify
 from service.cli import execute as run
 from service.config import Settings, load, load_over
 from service.controller import Controller
-from service.extremes import UnknownReferenceError, extremes
+from service.extremes import BoundlessError, extremes
 from service.law import LawSettings
 from service.lemma import Samples, coordinates, lemma_inequalities
 from service.reference import Plan, reference_function
@@ -225,8 +225,10 @@ def test_the_extremes_of_a_reference_are_those_of_what_the_law_is_given(referenc
 
 
 def test_a_stream_is_not_certified_and_says_why(capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(UnknownReferenceError, match="not known beforehand"):
+    with pytest.raises(BoundlessError, match="not known beforehand"):
         extremes(Stream())
+    with pytest.raises(BoundlessError, match="faster than numbers"):
+        extremes(Sinusoid(amplitude=(0, 1e308, 0), frequency=(0, 100, 0)))
     assert run(("lab", "certify", "--set", "reference.kind=stream")) == 1
     assert capfd.readouterr().err.startswith("aeroloop: a stream's set-points")
 
@@ -276,6 +278,15 @@ def test_a_remedy_by_bits_is_the_fewest_that_do_and_by_gain_the_least_change() -
         assert not certificate(load_over(slow, [f"law.{name}=[{almost}, {almost}, {almost}]"])).holds
 
 
+@pytest.mark.parametrize("gain", [0.0077, 0.0091, 0.0123, 0.0151])
+def test_a_gain_that_is_printed_with_four_digits_still_cures(gain: float) -> None:
+    settings = load_over(PAPER, [f"law.C2=[{gain}, {2 * gain}, {3 * gain}]"])
+    cures = [remedy.overrides for remedy in certificate(settings).remedies if remedy.overrides]
+    assert len(cures) == 2
+    for cure in cures:
+        assert certificate(load_over(settings, cure)).holds, cure
+
+
 def test_where_no_bits_and_no_gains_do_it_says_so() -> None:
     found = certificate(load_over(PAPER, ["law.inertia=[1, 1, 1]"]))
     assert [r.text for r in found.remedies] == ["no number of bits up to 16 would do", "no gains C1 and C2 would do"]
@@ -292,6 +303,7 @@ def test_the_verdict_comes_first_and_the_exit_code_follows_it(capfd: pytest.Capt
     assert shown.startswith("Theorem 1 does not hold: ")
     assert "--set 'law.C1=" in shown
     assert run(("lab", "certify", "--disturbance", "-1")) == 2
+    assert run(("lab", "certify", "--disturbance", "inf")) == 1
 
 
 def test_an_ideal_body_ends_within_the_radius_and_breaks_no_inequality_on_its_way() -> None:
