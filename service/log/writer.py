@@ -12,23 +12,20 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from mcap.writer import CompressionType, Writer
-
 from protocol import topics
 from protocol.host import versions
 from protocol.messages import model_of
 from service.log.decoded import Decoded
 from service.log.intake import Taken
 from service.log.mcap_records import CHUNK_BYTES
+from service.log.mcap_writer import McapWriter
 from service.log.schemas import Shape, json_shape
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
-PAST_EVERY_CHUNK: Final = 1 << 62
-"""Size of a chunk in mcap's writer [B]: it closes none, we do."""
 
 
 class _WholeChunks:
-    """A file that grows by what `commit` can write whole. What mcap's writer wants of a stream."""
+    """A file that grows by what `commit` can write whole."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -41,9 +38,6 @@ class _WholeChunks:
 
     def tell(self) -> int:
         return self.size + len(self._pending)
-
-    def flush(self) -> None:
-        """Nothing: mcap's writer flushes when it has written a chunk, and `commit` follows."""
 
     def commit(self) -> None:
         """Write what is pending to the disk itself, or leave the file as it was and raise OSError."""
@@ -90,9 +84,7 @@ class LogFile:
         self._out = _WholeChunks(path)
         self._channels: dict[str, int] = {}
         self._shapes: dict[Shape, int] = {}
-        self._gathered = 0
-        self._writer = Writer(self._out, chunk_size=PAST_EVERY_CHUNK, compression=CompressionType.ZSTD)  # type: ignore[arg-type]  # it needs write, tell and flush
-        self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
+        self._writer = McapWriter(self._out, library=f"aeroloop {versions()['aeroloop']}")
 
     @property
     def size(self) -> int:
@@ -102,7 +94,7 @@ class LogFile:
     @property
     def full(self) -> bool:
         """Whether the chunk has grown as large as one should be."""
-        return self._gathered >= CHUNK_BYTES
+        return self._writer.gathered >= CHUNK_BYTES
 
     @property
     def replaced(self) -> bool:
@@ -119,8 +111,7 @@ class LogFile:
         channel = self._channels.get(taken.key)
         if channel is None:
             channel = self._channels[taken.key] = self._raw_channel(taken.key)
-        self._writer.add_message(channel, taken.arrived_ns, taken.payload, taken.published_ns, sequence & 0xFFFF_FFFF)
-        self._gathered += len(taken.payload) + 31  # MCAP's head of a message
+        self._writer.add_message(channel, taken.arrived_ns, taken.published_ns, taken.payload, sequence)
 
     def add_decoded(self, decoded: Decoded) -> None:
         """Add what was made from a message, under a topic of its own; its log time is that message's publication."""
@@ -129,8 +120,7 @@ class LogFile:
             shape = self._schema(decoded.shape)
             channel = self._writer.register_channel(decoded.topic, decoded.shape.message_encoding, shape)
             self._channels[decoded.topic] = channel
-        self._writer.add_message(channel, decoded.at_ns, decoded.data, decoded.at_ns)
-        self._gathered += len(decoded.data) + 31
+        self._writer.add_message(channel, decoded.at_ns, decoded.at_ns, decoded.data)
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Add a metadata record."""
@@ -139,12 +129,11 @@ class LogFile:
     def attach_specification(self, at_ns: int) -> None:
         """Attach the wire's specification, by which frames are read."""
         text = files("protocol").joinpath("SPEC.md").read_bytes()
-        self._writer.add_attachment(at_ns, at_ns, "protocol/SPEC.md", "text/markdown", text)
+        self._writer.add_attachment(at_ns, "protocol/SPEC.md", "text/markdown", text)
 
     def commit(self) -> None:
         """Close the chunk and write it. Raises OSError; what could not be written is written with the next."""
-        self._writer.flush()
-        self._gathered = 0
+        self._writer.close_chunk()
         self._out.commit()
 
     def end(self) -> None:
