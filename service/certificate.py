@@ -64,17 +64,21 @@ class Certificate(BaseModel):
     @property
     def verdict(self) -> str:
         """The certificate in a sentence."""
+        disturbance = self.value("k_τ_d")
+        what = f"Corollary 1, with ‖τ_d‖ ≤ {disturbance:g} N·m," if disturbance else "Theorem 1"
         if self.blame is not None:
-            return f"Theorem 1 does not hold: {self.blame}."
+            return f"{what} does not hold: {self.blame}."
         assert self.radius_deg is not None
-        by = f"c₀/2 = {self.c0 / 2:.4g} exceeds δ_V1 = {self.delta_V1:.4g} by {self.margin:.4g} N·m·s/rad"
+        holds = (
+            f"{what} holds: c₀/2 = {self.c0 / 2:.4g} exceeds δ_V1 = {self.delta_V1:.4g} by {self.margin:.4g} N·m·s/rad"
+        )
         if self.radius == 0:
-            return f"Theorem 1 holds: {by}; the error goes to 0."
+            return f"{holds}; the error goes to 0."
         if self.radius_deg >= 180:
-            return f"Theorem 1 holds: {by}; but ‖z‖ ≤ {self.radius:.4g} bounds no attitude error."
+            return f"{holds}; but ‖z‖ ≤ {self.radius:.4g} bounds no attitude error."
         assumed = 2 * degrees(self.value("max ∡e/2") or 0.0)
         return (
-            f"Theorem 1 holds: {by}; in the end ‖z‖ ≤ {self.radius:.4g}, an attitude error of {self.radius_deg:.2f}°, "
+            f"{holds}; in the end ‖z‖ ≤ {self.radius:.4g}, an attitude error of {self.radius_deg:.2f}°, "
             f"provided that it never exceeds {assumed:.2f}°."
         )
 

@@ -296,8 +296,12 @@ def test_where_no_bits_and_no_gains_do_it_says_so() -> None:
 def test_the_verdict_comes_first_and_the_exit_code_follows_it(capfd: pytest.CaptureFixture[str]) -> None:
     assert run(("lab", "certify", "--disturbance", "0.004")) == 0
     shown = capfd.readouterr().out
-    assert shown.startswith("Theorem 1 holds: ")
+    assert shown.startswith("Corollary 1, with ‖τ_d‖ ≤ 0.004 N·m, holds: ")
     assert "Remark 5" in shown
+    assert run(("lab", "certify", "--bits-out", "cont", "--bits-in", "cont")) == 0
+    shown = " ".join(capfd.readouterr().out.split())
+    assert shown.startswith("Theorem 1 holds: ")
+    assert "the error goes to 0." in shown
     assert run(("lab", "certify", "--set", "law.C1=[2, 2, 2]")) == 1
     shown = capfd.readouterr().out
     assert shown.startswith("Theorem 1 does not hold: ")
