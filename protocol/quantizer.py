@@ -21,7 +21,7 @@ from typing import Final
 MIN_BITS: Final = 2
 MAX_BITS: Final = 16
 
-_TIE: Final[float] = 1 - 2.0**-50
+TIE: Final[float] = 1 - 2.0**-50
 """A value within a few units in the last place of an interval's edge lies on the edge: dividing by l rounds."""
 
 
@@ -126,7 +126,7 @@ class UniformQuantizer(Quantizer):
 
     def encode(self, y: float) -> int:
         """The code of a value; see `Quantizer.encode`."""
-        x: float = (abs(y) - self.deadzone) / self.step * _TIE
+        x: float = (abs(y) - self.deadzone) / self.step * TIE
         if x <= 0.0:
             return 0
         if x > self.top:

@@ -9,12 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import degrees
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.attitude import angle
 from protocol.clock import WATCHDOG_S
 from protocol.frames import FrameFormat, WireSpec
 from protocol.messages import Percentiles
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 
 
 class Stream(BaseModel):
@@ -95,6 +100,37 @@ class Score:
         self._command_square = square if square == square else 0.0
         self._commands += 1
 
+    def errors(self, k: Integers, errors: Floats) -> None:
+        """`error` of one tick after another: the same sums, in the same order. Shapes (n,) and (n, 3)."""
+        if self._first is None and len(k):
+            self.error(int(k[0]), errors[0].tolist())
+            k, errors = k[1:], errors[1:]
+        if not len(k):
+            return
+        square = squares(errors)
+        stood = np.append(self._error_square, square[:-1])
+        self._z_track = added(self._z_track, stood * (np.diff(k, prepend=self._error_tick) * self._period))
+        largest = int(np.argmax(np.where(np.isnan(square), -1.0, square)))
+        if square[largest] > self._largest_square:
+            self._largest, self._largest_square = tuple(errors[largest].tolist()), float(square[largest])
+        self._error_tick, self._error_square, self._last = int(k[-1]), float(square[-1]), tuple(errors[-1].tolist())
+        self._errors += len(k)
+
+    def commands(self, k: Integers, voltages: Floats) -> None:
+        """`command` of one tick after another, likewise. Shapes (n,) and (n, actuators)."""
+        if not self._commands and len(k):
+            self.command(int(k[0]), voltages[0].tolist())
+            k, voltages = k[1:], voltages[1:]
+        if not len(k):
+            return
+        square = squares(voltages)
+        square[np.isnan(square)] = 0.0
+        stood = np.append(self._command_square, square[:-1])
+        held = np.minimum(np.diff(k, prepend=self._command_tick), self._longest_hold)
+        self._u_total = added(self._u_total, stood * (held * self._period))
+        self._command_tick, self._command_square = int(k[-1]), float(square[-1])
+        self._commands += len(k)
+
     @property
     def ticks(self) -> int:
         """Ticks from the first to the last error, both counted."""
@@ -132,6 +168,19 @@ class Score:
             damages=list(damages),
             reasons=reasons,
         )
+
+
+def squares(rows: Floats) -> Floats:
+    """vᵀv of every row, its terms added from the first to the last. Shapes (n, columns) and (n,)."""
+    total = np.zeros(len(rows))
+    for column in rows.T:
+        total += column * column
+    return total
+
+
+def added(start: float, terms: Floats) -> float:
+    """A sum and terms, added one after the other; `np.sum` adds pairs of pairs, which rounds otherwise."""
+    return float(np.add.accumulate(np.append(start, terms))[-1])
 
 
 def _stream(frames: int, kind: FrameFormat, duration: float) -> Stream:

@@ -258,18 +258,21 @@ class Motion:
     Args:
         reference: What to follow from t = 0 on.
         shared: Memory for q_d, omega_d and omega_d_dot, where whoever uses them reads them.
+
+    Attributes:
+        plan: What it follows now.
     """
 
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
         self._function = Compiled(reference_function(), shared)
         self._time = self._function.inputs["t"]
-        self._plan = Plan.of(reference)
+        self.plan = Plan.of(reference)
         self._load(0)
 
     def at(self, t: float) -> None:
         """Write what is desired at time t [s]; t does not fall from one call to the next."""
         if t >= self._until:
-            self._load(self._plan.piece(t))
+            self._load(self.plan.piece(t))
         self._time[0] = t
         self._function()
 
@@ -301,7 +304,7 @@ class Motion:
         if limits is not None and within_s:
             way = plan.piece(t + ease_s + within_s) + 1  # pieces, up to the target's first
             replace(plan, **{name: getattr(plan, name)[:way] for name in plan.__annotations__}).check(limits)
-        self._plan = plan
+        self.plan = plan
         self._load(plan.piece(t))
 
     def attitude(self, t: float) -> Quaternion:
@@ -332,13 +335,13 @@ class Motion:
         return within_s, least
 
     def _here(self, t: float) -> Angles:
-        i = self._plan.piece(t)
-        tau = np.zeros((len(self._plan.starts), 1))
-        tau[i] = t - self._plan.starts[i]
-        return Angles(*(part[i] for part in self._plan.at(tau)))
+        i = self.plan.piece(t)
+        tau = np.zeros((len(self.plan.starts), 1))
+        tau[i] = t - self.plan.starts[i]
+        return Angles(*(part[i] for part in self.plan.at(tau)))
 
     def _load(self, i: int) -> None:
-        plan, inputs = self._plan, self._function.inputs
+        plan, inputs = self.plan, self._function.inputs
         self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else float("inf")
         inputs["start"][0] = plan.starts[i]
         inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # a row a power here is a column a power there

@@ -21,10 +21,11 @@ from protocol.messages import Telemetry, Truth
 from service.config import ConfigError, Settings
 from service.log.files import LogFiles, ReviewError, Which
 from service.log.mcap_records import Damage
-from service.log.review import Tick, read
+from service.log.review import read
 from service.log.spool import Pile, Records, Spool, Window
 from service.log.table import Rows, groups, telemetry_fields, tick_fields, truth_fields
 from service.log.table_files import FILES, ExportError
+from service.log.ticks import Tick
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
 Progress = Callable[[float], None]

@@ -66,6 +66,7 @@ class LogFiles:
         self.changes: dict[Which, list[Change]] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
+        self._told: set[tuple[str, bytes]] = set()  # changes, as vehicle and JSON
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
         for changes in self.changes.values():
@@ -160,10 +161,11 @@ class LogFiles:
 
     def _follows(self, vehicle: str, text: str | bytes) -> None:
         """Add a change; the files of a rotated run tell the same one again."""
-        change = Change.model_validate_json(text)
-        known = self.changes.setdefault((vehicle, change.session), [])
-        if change not in known:
-            known.append(change)
+        told = vehicle, text if isinstance(text, bytes) else text.encode()
+        if told not in self._told:
+            self._told.add(told)
+            change = Change.model_validate_json(text)
+            self.changes.setdefault((vehicle, change.session), []).append(change)
 
 
 def _is_change(key: str) -> bool:

@@ -1,30 +1,28 @@
 """What is looked at in a session beside its figures: timing, gaps, saturation, and every quantity over time.
 
-An `Observer` is told frames, ticks and what is told less often, keeps them for a block of a few thousand ticks, and
-reduces each block by numpy; so a tick costs a few microseconds and memory stays bounded however long the session is.
+An `Observer` is told frames, ticks by the block, and what is told less often, keeps them for a few thousand ticks, and
+reduces them by numpy; so a tick costs a few microseconds and memory stays bounded however long the session is.
 Durations go into histograms, lines into buckets (thin.py), and of gaps the longest hundred are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
-from itertools import chain
 from math import nan
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from protocol.attitude import Quaternion
 from protocol.messages import Telemetry
 from service.config import Settings
+from service.log.codes import table
 from service.log.panels import columns_of, panels_of
 from service.log.report import Array, Gap, Panel, Spread
 from service.log.tallies import BLOCK, Durations, Integers, Outermost, Told
 from service.log.thin import ThinnedLines
-
-if TYPE_CHECKING:
-    from service.log.review import Tick
+from service.log.ticks import Ticks
 
 LONGEST_GAPS: Final = 100
 
@@ -41,10 +39,10 @@ class Observer:
         self._period = settings.loop.period
         self._columns = columns_of(settings)
         self._lines = ThinnedLines(2 + len(self._columns))  # k and time of publication, then what is drawn
-        self._ticks: list[Tick] = []
+        self._ticks: list[Ticks] = []
         self._codes: dict[str, list[tuple[float, ...]]] = {"measurement": [], "command": []}
         self._measured: list[int] = []
-        self._answers: list[int] = []
+        self._waiting = 0
         self._damping, self._truth = Told(3), Told(4)
         self._outermost = {name: Outermost(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
         self._period_ns, self._latency_ns = Durations(), Durations()
@@ -69,16 +67,21 @@ class Observer:
         """A command."""
         self._frame("command", codes)
 
-    def answered(self, k: int) -> None:
-        """Tick k was answered, be it by a command without a valid value."""
-        self._answers.append(k)
-        if len(self._answers) >= BLOCK:
-            self._reduce_gaps()
+    def answered(self, k: Integers) -> None:
+        """Ticks that were answered, be it by commands without a valid value. Shape (n,)."""
+        answers = np.concatenate([self._last_answer, k])
+        self._last_answer = answers[-1:]
+        missing = np.diff(answers) - 1
+        where = np.flatnonzero(missing)
+        self.gap_count += len(where)
+        found = [(int(missing[i]), int(answers[i]) + 1) for i in where]
+        self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
 
-    def tick(self, tick: Tick) -> None:
-        """A tick that is judged."""
-        self._ticks.append(tick)
-        if len(self._ticks) >= BLOCK:
+    def ticks(self, ticks: Ticks) -> None:
+        """Ticks that are judged."""
+        self._ticks.append(ticks)
+        self._waiting += len(ticks.k)
+        if self._waiting >= BLOCK:
             self._reduce_ticks()
 
     def telemetry(self, telemetry: Telemetry) -> None:
@@ -95,7 +98,6 @@ class Observer:
         for name in self._codes:
             self._reduce_frames(name)
         self._reduce_ticks()
-        self._reduce_gaps()
 
     # ── what it has found ──
 
@@ -170,7 +172,7 @@ class Observer:
             self._period_ns.add(np.diff(times))
             self._last_measured = times[-1:]
             self._measured.clear()
-        codes = _rows(self._codes[name])
+        codes = table(self._codes[name])
         self._codes[name].clear()
         if len(codes):
             if name == "measurement":
@@ -180,32 +182,28 @@ class Observer:
             self.invalid[name] += int(wrong.sum())
 
     def _reduce_ticks(self) -> None:
-        ticks = self._ticks
-        if not ticks:
+        if not self._waiting:
             return
-        k = np.array([tick.k for tick in ticks], dtype=np.float64)
+        ticks = Ticks.joined(self._ticks)
+        self._ticks.clear()
+        self._waiting = 0
         assert self._start_ns is not None  # set by the first measurement
-        published = np.array([tick.published_ns for tick in ticks], dtype=np.int64) - self._start_ns
-        latency = np.array([nan if tick.latency_ns is None else tick.latency_ns for tick in ticks], dtype=np.float64)
+        published, latency = ticks.published_ns - self._start_ns, ticks.latency_ns
         self._latency_ns.add(latency[~np.isnan(latency)])
         periods = np.diff(published, prepend=self._last_tick_ns)
         self._last_tick_ns = float(published[-1])
         seconds = np.asarray(published * 1e-9, dtype=np.float64)
-        attitude, desired, rate, desired_rate, error, rate_error, voltages = (
-            _rows([tick[i] for tick in ticks])  # type: ignore[misc]  # from the third on they are rows
-            for i in range(3, 10)
-        )
-        attitude = _beside(attitude, desired)
+        k, desired, error = ticks.k.astype(np.float64), ticks.desired, ticks.attitude_error
         self._lines.add(
             np.column_stack(
                 [
                     k,
                     seconds,
-                    _alternating(attitude, desired),
-                    _alternating(rate, desired_rate),
+                    _alternating(_beside(ticks.attitude, desired), desired),
+                    _alternating(ticks.rate, ticks.desired_rate),
                     error,
-                    rate_error,
-                    voltages,
+                    ticks.rate_error,
+                    ticks.voltages,
                     _angle(error),
                     _angle(_error_vector(self._truth.on(seconds), desired)),
                     latency * 1e-3,
@@ -214,23 +212,6 @@ class Observer:
                 ]
             )
         )
-        ticks.clear()
-
-    def _reduce_gaps(self) -> None:
-        answers = np.concatenate([self._last_answer, np.array(self._answers, dtype=np.int64)])
-        self._answers.clear()
-        self._last_answer = answers[-1:]
-        missing = np.diff(answers) - 1
-        where = np.flatnonzero(missing)
-        self.gap_count += len(where)
-        found = [(int(missing[i]), int(answers[i]) + 1) for i in where]
-        self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
-
-
-def _rows(rows: Sequence[tuple[float, ...]]) -> Array:
-    """Rows of equal length as a matrix; three times as fast as `np.array`. Shape (n, columns)."""
-    columns = len(rows[0]) if rows else 0
-    return np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * columns).reshape(len(rows), columns)
 
 
 def _beside(attitude: Array, desired: Array) -> Array:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from service.config import Settings
 from service.log.files import ReviewError
 from service.log.panels import NUMBERS, case_of, title_of
-from service.log.review import Tick
+from service.log.ticks import Tick
 
 Array = npt.NDArray[np.float64]
 

@@ -9,17 +9,26 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import sqrt
+from math import nan, sqrt
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from protocol.frames import SignalSpec
 from protocol.messages import Telemetry
 from protocol.verbs import Change
 from service.config import Settings, load_over
-from service.controller import Controller
+from service.figures import added, squares
+from service.log.blocks import BlockController
+from service.log.codes import encoded, levels, table
 from service.log.files import LogFiles, Which
-from service.log.pairing import MAX_WAITING, Pairing, Read, Seen, Sessions
+from service.log.pairing import MAX_WAITING, Pairing, Read, Seen, Sessions, without_collections
+from service.log.report import Array
+from service.log.tallies import BLOCK
+
+Pair = tuple[int, Read, Read]
+"""A tick, its measurement and the command that answered it."""
 
 
 class Difference(BaseModel):
@@ -60,13 +69,13 @@ class Replayer(Pairing):
 
     def __init__(self, settings: Settings, changes: Sequence[Change]) -> None:
         super().__init__(settings.wire, settings.loop)
-        self._controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self._controller = BlockController(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._changes = deque(changes)
-        self._level = settings.wire.voltage.quantizer().level
         self._period = settings.loop.period
         self._begun = False
         self._unplaced: deque[Telemetry] = deque(maxlen=MAX_WAITING)
-        self._held: deque[tuple[int, Read, Read]] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
+        self._held: deque[Pair] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
+        self._waiting: list[Pair] = []  # to be computed as a block
         self.first_tick: int | None = None
         self.first_difference: Difference | None = None
         self.commands = self.differing = 0
@@ -79,10 +88,12 @@ class Replayer(Pairing):
 
     def answered(self, k: int, measurement: Read, command: Read) -> None:
         """Compute the command of tick k again."""
-        if self._begun:
-            self._compare(k, measurement, command)
-        else:
+        if not self._begun:
             self._held.append((k, measurement, command))
+            return
+        self._waiting.append((k, measurement, command))
+        if len(self._waiting) >= BLOCK:
+            self._compute()
 
     def passed_over(self, k: int, measurement: Read) -> None:
         """The controller never saw it."""
@@ -99,27 +110,25 @@ class Replayer(Pairing):
         super().finish()
         while not self._begun and self._unplaced:
             self._begin(self._unplaced.popleft())
+        self._compute()
 
     def _begin(self, telemetry: Telemetry) -> None:
         tick = telemetry.tick
         held = next((pair for pair in self._held if pair[0] == tick), None)
         if held is None:
             return
-        _, measurement, command = held
-        self._follow(tick)
-        computed = self._controller.tick(measurement.frame, tick)
-        controller = self._controller
+        measurement, controller = held[1], self._controller
+        controller.follow(tick, self._changes)
+        voltages = controller.compute(measurement.counter, measurement.codes, tick)
         told = telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error
         if held is self._held[0] and told == (controller.sign, controller.damping_estimate, controller.attitude_error):
             self.first_tick = tick  # the session's very first: nothing had been computed before it
-            self._count(tick, computed, command)
+            self._compare([held], np.array([voltages or [nan] * self._wire.actuators]))
         else:
             controller.resume(measurement.frame, tick, *told)
             self.first_tick = tick + 1
         self._begun = True
-        for k, measurement, command in self._held:
-            if k > tick:
-                self._compare(k, measurement, command)
+        self._waiting += [pair for pair in self._held if pair[0] > tick]
         self._held.clear()
 
     def result(self, vehicle: str, session: str) -> SessionReplay:
@@ -138,43 +147,43 @@ class Replayer(Pairing):
             u_total_computed=self._computed * self._period,
         )
 
-    def _follow(self, k: int) -> None:
-        while self._changes and self._changes[0].tick <= k:
-            self._controller.apply(self._changes.popleft())
+    def _compute(self) -> None:
+        """Compute the commands that wait again, and compare them."""
+        pairs, self._waiting = self._waiting, []
+        if pairs:
+            k, codes = np.array([k for k, _, _ in pairs]), table([measurement.codes for _, measurement, _ in pairs])
+            self._compare(pairs, self._controller.compute_all(k, codes, self._changes).voltages)
 
-    def _compare(self, k: int, measurement: Read, logged: Read) -> None:
-        if self._changes:
-            self._follow(k)
-        self._count(k, self._controller.answer(measurement.counter, measurement.codes, k), logged)
-
-    def _count(self, k: int, computed: bytes | None, logged: Read) -> None:
-        theirs = self._volts(logged.codes)
-        square = sum([u * u for u in theirs])
-        self.commands += 1
-        self._logged += square
-        if computed == logged.frame:
-            self._computed += square
-            return
-        self.differing += 1
-        if self.first_difference is None:
+    def _compare(self, pairs: Sequence[Pair], voltages: Array) -> None:
+        """Compare logged commands with what the law commands [V], NaN for no valid value. Shape (n, actuators)."""
+        signal = self._wire.voltage
+        ours, theirs = encoded(signal, voltages), table([command.codes for _, _, command in pairs])
+        differ = np.flatnonzero((ours.view(np.int64) != theirs.view(np.int64)).any(axis=1))  # an echo cannot differ
+        if len(differ) and self.first_difference is None:
+            k, measurement, command = pairs[differ[0]]
+            codes = [int(code) if signal.bits else code for code in ours[differ[0]].tolist()]
             self.first_difference = Difference(
                 tick=k,
                 time_s=round(k * self._period, 9),
-                logged=logged.frame.hex(),
-                computed=computed.hex() if computed is not None else "",
+                logged=command.frame.hex(),
+                computed=self._wire.command.pack(measurement.counter, codes).hex(),
             )
-        read = None if computed is None else self._read_command(computed)
-        ours = self._volts(read[1] if read else (0,) * len(theirs))
-        self._computed += sum(u * u for u in ours)
-        differences = [abs(a - b) for a, b in zip(ours, theirs, strict=True)]
-        self._square += sum(d * d for d in differences)
-        self._largest = max(self._largest, *differences)
-
-    def _volts(self, codes: Sequence[float]) -> list[float]:
-        """What a plant makes of a command; 0 V of a code without a valid value."""
-        return [volts if (volts := self._level(code)) == volts else 0.0 for code in codes]
+        self.commands += len(pairs)
+        self.differing += len(differ)
+        ours, theirs = _volts(signal, ours), _volts(signal, theirs)
+        self._logged = added(self._logged, squares(theirs))
+        self._computed = added(self._computed, squares(ours))
+        self._square = added(self._square, squares(ours - theirs))
+        self._largest = max(self._largest, float(np.abs(ours - theirs).max()))
 
 
+def _volts(signal: SignalSpec, codes: Array) -> Array:
+    """What a plant makes of commands; 0 V of a code without a valid value."""
+    volts = levels(signal, codes)
+    return np.where(np.isnan(volts), 0.0, volts)
+
+
+@without_collections()
 def replay(
     paths: Sequence[Path], overrides: Sequence[str] = (), progress: Callable[[float], None] | None = None
 ) -> list[SessionReplay]:

@@ -1,141 +1,70 @@
 """The review: every figure, from a log alone.
 
-The log holds the configuration (in the roles' contracts) and the frames, so the review decodes each measurement as the
-controller did, with the controller's own code, and asks it for the error. A measurement counts once a command has
-answered it or a later one: what the controller never used, it does not answer for.
+The log holds the configuration (in the roles' contracts) and the frames, so the review computes from each measurement
+what the controller did, to the last bit (blocks.py). A measurement counts once a command has answered it or a later
+one: what the controller never used, it does not answer for.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
+from math import nan
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from pydantic import ValidationError
 
-from protocol.attitude import Quaternion, Vector
 from protocol.messages import Event, Loss, Status, Telemetry, Truth
+from protocol.topics import Address
 from protocol.verbs import Change
 from service.config import ConfigError, Settings
-from service.controller import Controller
 from service.figures import Figures, Score
+from service.log.blocks import BlockController
+from service.log.codes import levels, table
 from service.log.files import LogFiles, ReviewError, Which
 from service.log.findings import facts_of, findings_of, name_of
 from service.log.limits import Limit
 from service.log.observe import Observer
-from service.log.pairing import Pairing, Read, Seen, without_collections
+from service.log.pairing import Pairing, Read, Seen, Sessions, without_collections
 from service.log.report import Findings, Report
 from service.log.story import Story
-
-TOPICS_READ: Final = frozenset({"measurement", "command", "telemetry", "truth", "event", "status", "loss"})
-
-
-class Tick(NamedTuple):
-    """One tick of a session as the controller saw it.
-
-    Attributes:
-        k: Tick of the law; its time is k·period.
-        published_ns: When its measurement was published, on the plant's wall clock [ns].
-        latency_ns: From then until the command that answered it was published [ns]; None if none did.
-        attitude: q as measured. The other quantities of the law likewise, in its units.
-        voltages: What was commanded, or, of a measurement that was passed over, what the next command said [V]; NaN
-            where a command had no valid value.
-    """
-
-    k: int
-    published_ns: int
-    latency_ns: int | None
-    attitude: Quaternion
-    desired: Quaternion
-    rate: Vector
-    desired_rate: Vector
-    attitude_error: Vector
-    rate_error: Vector
-    voltages: tuple[float, ...]
+from service.log.tallies import BLOCK
+from service.log.ticks import Tick, Ticks
 
 
 class Session(Pairing):
-    """One session's frames, scored as they are read.
+    """One session's frames: read one by one, computed and judged by the block.
 
     Args:
         settings: The configuration of its controller.
         changes: What its controller followed from which tick on, in order.
         watch: Called with every tick, in order.
+
+    Attributes:
+        score: Its figures of merit; complete after `finish`, as is what the observer has found.
+        observer: Is told every frame and every tick.
     """
 
     def __init__(
         self, settings: Settings, changes: Sequence[Change] = (), watch: Callable[[Tick], None] | None = None
     ) -> None:
-        self.settings = settings
-        self._changes = deque(changes)
         super().__init__(settings.wire, settings.loop)
-        self._controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
-        self._level = settings.wire.voltage.quantizer().level
-        self._passed_over: list[tuple[int, Read]] = []
+        self.settings = settings
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
-        self._watch = watch
-
-    def answered(self, k: int, measurement: Read, command: Read) -> None:
-        """Score the error at tick k, and the command."""
-        level = self._level
-        voltages = tuple([level(code) for code in command.codes])
-        if self._passed_over:
-            for tick, read in self._passed_over:
-                self._score(tick, read, None, voltages)
-            self._passed_over.clear()
-        self._score(k, measurement, command.published_ns - measurement.published_ns, voltages)
-        self.score.command(k, voltages)
-
-    def passed_over(self, k: int, measurement: Read) -> None:
-        """It was not answered, but its error counts."""
-        self._passed_over.append((k, measurement))
-
-    def _score(self, k: int, read: Read, latency_ns: int | None, voltages: tuple[float, ...]) -> None:
-        controller = self._controller
-        while self._changes and self._changes[0].tick <= k:
-            controller.apply(self._changes.popleft())
-        controller.compute(read.counter, read.codes, k)
-        if controller.tick_index != k:
-            return  # a measurement without a valid value
-        attitude_error = controller.attitude_error
-        self.score.error(k, attitude_error)
-        if self._watch is not None:
-            rate, rate_error = controller.rate, controller.rate_error
-            desired_rate = rate[0] - rate_error[0], rate[1] - rate_error[1], rate[2] - rate_error[2]
-            self._watch(
-                Tick(
-                    k,
-                    read.published_ns,
-                    latency_ns,
-                    controller.attitude,
-                    controller.desired,
-                    rate,
-                    desired_rate,
-                    attitude_error,
-                    rate_error,
-                    voltages,
-                )
-            )
-
-
-class Kept(dict[Which, list[Tick]]):
-    """Every tick of every session, for those who have the memory: its `watch` is what `read` takes as `watch`."""
-
-    def watch(self, which: Which, settings: Settings) -> Callable[[Tick], None]:
-        """Who keeps the ticks of a session."""
-        del settings
-        return self.setdefault(which, []).append
-
-
-class ObservedSession(Session):
-    """A session whose observer is told of every frame and every tick."""
-
-    def __init__(
-        self, settings: Settings, changes: Sequence[Change] = (), watch: Callable[[Tick], None] | None = None
-    ) -> None:
         self.observer = Observer(settings)
-        super().__init__(settings, changes, self.observer.tick if watch is None else self._both(watch))
+        self._controller = BlockController(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self._changes = deque(changes)
+        self._watch = watch
+        self._passed_over: list[tuple[int, Read]] = []
+        self._waiting: list[tuple[int, Read, Read, bool]] = []  # tick, measurement, command, whether it answers it
+
+    @property
+    def wants_telemetry(self) -> bool:
+        """All of it: it is drawn."""
+        return True
 
     def measured(self, measurement: Read) -> None:
         """See `Pairing.measured`."""
@@ -153,23 +82,102 @@ class ObservedSession(Session):
         super().telemetry(telemetry, published_ns)
 
     def answered(self, k: int, measurement: Read, command: Read) -> None:
-        """See `Pairing.answered`."""
-        self.observer.answered(k)
-        super().answered(k, measurement, command)
+        """The error at tick k counts, and the command."""
+        if self._passed_over:
+            self._waiting += [(tick, read, command, False) for tick, read in self._passed_over]
+            self._passed_over.clear()
+        self._waiting.append((k, measurement, command, True))
+        if len(self._waiting) >= BLOCK:
+            self._judge()
+
+    def passed_over(self, k: int, measurement: Read) -> None:
+        """It was not answered, but its error counts."""
+        self._passed_over.append((k, measurement))
 
     def finish(self) -> None:
         """See `Pairing.finish`."""
         super().finish()
+        self._judge()
         self.observer.finish()
 
-    def _both(self, watch: Callable[[Tick], None]) -> Callable[[Tick], None]:
-        observe = self.observer.tick
+    def _judge(self) -> None:
+        """Compute what waits as the controller did, and score it."""
+        if not self._waiting:
+            return
+        ticks, measurements, commands, answers = zip(*self._waiting, strict=True)
+        self._waiting.clear()
+        k, answered = np.array(ticks), np.array(answers)
+        computed = self._controller.compute_all(k, table([read.codes for read in measurements]), self._changes)
+        voltages = levels(self.settings.wire.voltage, table([read.codes for read in commands]))
+        published = np.array([read.published_ns for read in measurements])
+        latency = np.where(answered, np.array([read.published_ns for read in commands]) - published, nan)
+        seen = Ticks(
+            k,
+            published,
+            latency,
+            computed.attitude,
+            computed.desired,
+            computed.rate,
+            computed.rate - computed.rate_error,
+            computed.attitude_error,
+            computed.rate_error,
+            voltages,
+        )
+        judged = seen.where(~np.isnan(computed.attitude[:, 0]))  # of a measurement without a valid value there is none
+        self.score.errors(judged.k, judged.attitude_error)
+        self.score.commands(k[answered], voltages[answered])
+        self.observer.answered(k[answered])
+        self.observer.ticks(judged)
+        if self._watch is not None:
+            for tick in judged.each():
+                self._watch(tick)
 
-        def told(tick: Tick) -> None:
-            observe(tick)
-            watch(tick)
 
-        return told
+class Kept(dict[Which, list[Tick]]):
+    """Every tick of every session, for those who have the memory: its `watch` is what `read` takes as `watch`."""
+
+    def watch(self, which: Which, settings: Settings) -> Callable[[Tick], None]:
+        """Who keeps the ticks of a session."""
+        del settings
+        return self.setdefault(which, []).append
+
+
+class Run(Sessions[Session]):
+    """The sessions of a run, and what happened beside them.
+
+    Args:
+        make: Makes a session.
+
+    Attributes:
+        story: What roles told.
+    """
+
+    def __init__(self, make: Callable[[Which], Session]) -> None:
+        super().__init__(make)
+        self.story = Story()
+        self._running: dict[str, Session] = {}
+
+    def __missing__(self, which: Which) -> Session:
+        self._running[which[0]] = session = super().__missing__(which)
+        return session
+
+    def route(self, address: Address) -> Callable[[Seen], None] | None:
+        """Who takes the messages of a key; see `Sessions.route`."""
+        vehicle, role = address.vehicle, address.role
+        match address.topic.name:
+            case "truth":
+                return partial(self._truth, vehicle)
+            case "event":
+                return lambda seen: self.story.event(vehicle, Event.model_validate_json(seen.frame), seen.published_ns)
+            case "loss":
+                return lambda seen: self.story.loss(vehicle, Loss.model_validate_json(seen.frame))
+            case "status" if role is not None:
+                return lambda seen: self.story.status(vehicle, role, Status.model_validate_json(seen.frame))
+        return super().route(address)
+
+    def _truth(self, vehicle: str, seen: Seen) -> None:
+        if session := self._running.get(vehicle):
+            session.observer.truth(Truth.model_validate_json(seen.frame).attitude, seen.published_ns)
 
 
 class Review(NamedTuple):
@@ -186,7 +194,7 @@ class Review(NamedTuple):
 
     figures: Figures
     findings: Findings
-    session: ObservedSession
+    session: Session
     which: Which
     name: str
     facts: dict[str, dict[str, Any]]
@@ -240,53 +248,31 @@ def read(
     Raises:
         ReviewError: Not a log, or one without a session.
     """
-    sessions: dict[Which, ObservedSession] = {}
-    running: dict[str, ObservedSession] = {}
-    story = Story()
     try:
         files = LogFiles(paths)
         settings = files.settings
-        for address, payload, published_ns in files.messages(TOPICS_READ, progress):
-            vehicle, name = address.vehicle, address.topic.name
-            if address.session is not None:
-                which = vehicle, address.session
-                if which not in sessions:
-                    told = watch(which, settings) if watch else None
-                    sessions[which] = ObservedSession(settings, files.changes.get(which, ()), told)
-                    running[vehicle] = sessions[which]
-                seen = Seen(payload, published_ns)
-                if name == "measurement":
-                    sessions[which].measurement(seen)
-                else:
-                    sessions[which].command(seen)
-            elif name == "telemetry":
-                telemetry = Telemetry.model_validate_json(payload)
-                if session := sessions.get((vehicle, telemetry.session)):
-                    session.telemetry(telemetry, published_ns)
-            elif name == "truth":
-                if vehicle in running:
-                    running[vehicle].observer.truth(Truth.model_validate_json(payload).attitude, published_ns)
-            elif name == "event":
-                story.event(vehicle, Event.model_validate_json(payload), published_ns)
-            elif name == "loss":
-                story.loss(vehicle, Loss.model_validate_json(payload))
-            elif address.role is not None:
-                story.status(vehicle, address.role, Status.model_validate_json(payload))
+
+        def session(which: Which) -> Session:
+            return Session(settings, files.changes.get(which, ()), watch(which, settings) if watch else None)
+
+        run = Run(session)
+        for take, payload, published_ns in files.routed(run.route, progress):
+            take(Seen(payload, published_ns))
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    if not sessions:
+    if not run:
         raise ReviewError(f"{files.name} holds no session: no measurement or command frame was recorded")
-    for session in sessions.values():
-        session.finish()
-    longest = max(sessions, key=lambda which: sessions[which].score.ticks)
-    figures = _judge(sessions[longest], story.statuses.get((longest[0], "plant")), files, story.trips)
-    changes, observer = files.changes.get(longest, ()), sessions[longest].observer
-    findings = findings_of(figures, longest, settings, observer, story, changes, len(sessions))
+    for one in run.values():
+        one.finish()
+    longest, story = max(run, key=lambda which: run[which].score.ticks), run.story
+    figures = _figures(run[longest], story.statuses.get((longest[0], "plant")), files, story.trips)
+    changes, observer = files.changes.get(longest, ()), run[longest].observer
+    findings = findings_of(figures, longest, settings, observer, story, changes, len(run))
     facts = facts_of(files, story, longest[0])
-    return Review(figures, findings, sessions[longest], longest, name_of(paths), facts)
+    return Review(figures, findings, run[longest], longest, name_of(paths), facts)
 
 
-def _judge(session: Session, plant: Status | None, files: LogFiles, trips: list[str]) -> Figures:
+def _figures(session: Session, plant: Status | None, files: LogFiles, trips: list[str]) -> Figures:
     reasons: dict[str, str] = {}
     latency = plant.latency_us if plant else None
     if latency is None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -16,7 +17,7 @@ from protocol import topics
 from protocol.attitude import IDENTITY, Quaternion
 from protocol.verbs import Message as Model
 from service.log.observe import Observer
-from service.log.review import Tick
+from service.log.ticks import Ticks
 from tests.service.log.made_log import SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000
@@ -90,4 +91,5 @@ def feed(
     at = START_NS + k * PERIOD_NS
     zero = (0.0, 0.0, 0.0)
     observer.measurement((0, 0, 0, 0, 0, 0), at)
-    observer.tick(Tick(k, at, LATENCY_NS, attitude, desired, zero, zero, zero, zero, (0.0, 0.0)))
+    columns = (k, at, float(LATENCY_NS), attitude, desired, zero, zero, zero, zero, (0.0, 0.0))
+    observer.ticks(Ticks(*(np.array([column]) for column in columns)))

@@ -14,7 +14,7 @@ from service.config import load
 from service.log.observe import Observer
 from service.log.report import Findings
 from service.log.review import read
-from service.log.tallies import BLOCK, Told
+from service.log.tallies import Told
 from tests.service.log.made_log import START_NS, make_log
 from tests.service.log.retold import PERIOD_NS, Said, feed, retell, told
 
@@ -58,10 +58,10 @@ def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None
     observer = Observer(load())
     k, lengths = 0, [1 + i * 7919 % 1000 for i in range(3000)]
     for i, length in enumerate(lengths):
-        observer.answered(k)
+        observer.answered(np.array([k]))
         k += 1 + length
         feed(observer, i)
-    observer.answered(k)
+    observer.answered(np.array([k]))
     observer.finish()
     assert observer.gap_count == 3000
     assert sorted(gap.ticks for gap in observer.gaps) == sorted(lengths)[-100:]
@@ -71,10 +71,10 @@ def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None
 def test_gaps_are_seen_where_sensors_give_no_valid_value() -> None:
     """Such measurements are answered, but there is no tick to judge."""
     observer = Observer(load())
-    for k in (*range(7, 9), *range(12, BLOCK + 10), *range(BLOCK + 14, 6000)):  # with a gap where a block ends
-        observer.answered(k)
+    for block in ([*range(7, 9), *range(12, 4010)], [*range(4014, 6000)]):  # with a gap where a block ends
+        observer.answered(np.array(block))
     observer.finish()
-    assert [(gap.tick, gap.ticks) for gap in observer.gaps] == [(9, 3), (BLOCK + 10, 4)]
+    assert [(gap.tick, gap.ticks) for gap in observer.gaps] == [(9, 3), (4010, 4)]
 
 
 def test_what_is_told_while_there_are_no_ticks_is_forgotten_but_for_the_last() -> None:

@@ -13,7 +13,8 @@ from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Figures
 from service.log.pairing import Seen
-from service.log.review import Session, Tick
+from service.log.review import Session
+from service.log.ticks import Tick
 
 PERIOD_NS = 2_000_000
 START_NS = 1_800_000_000_000_000_000
