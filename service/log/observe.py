@@ -17,7 +17,7 @@ import numpy as np
 from protocol.attitude import Quaternion
 from protocol.messages import Telemetry
 from service.config import Settings
-from service.log.codes import table
+from service.log.codes import codes_in
 from service.log.panels import columns_of, panels_of
 from service.log.report import Array, Gap, Panel, Spread
 from service.log.tallies import BLOCK, Durations, Integers, Outermost, Told
@@ -40,8 +40,10 @@ class Observer:
         self._columns = columns_of(settings)
         self._lines = ThinnedLines(2 + len(self._columns))  # k and time of publication, then what is drawn
         self._ticks: list[Ticks] = []
-        self._codes: dict[str, list[tuple[float, ...]]] = {"measurement": [], "command": []}
+        self._wire = wire
+        self._measurements: list[bytes] = []
         self._measured: list[int] = []
+        self._commands: list[bytes] = []
         self._waiting = 0
         self._damping, self._truth = Told(3), Told(4)
         self._outermost = {name: Outermost(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
@@ -56,16 +58,20 @@ class Observer:
 
     # ── what it is told ──
 
-    def measurement(self, codes: tuple[float, ...], published_ns: int) -> None:
-        """A measurement, answered or not."""
+    def measurement(self, frame: bytes, published_ns: int) -> None:
+        """A measurement that can be read, answered or not."""
         if self._start_ns is None:
             self._start_ns = published_ns
         self._measured.append(published_ns)
-        self._frame("measurement", codes)
+        self._measurements.append(frame)
+        if len(self._measurements) >= BLOCK:
+            self._reduce_measurements()
 
-    def command(self, codes: tuple[float, ...]) -> None:
-        """A command."""
-        self._frame("command", codes)
+    def command(self, frame: bytes) -> None:
+        """A command that can be read."""
+        self._commands.append(frame)
+        if len(self._commands) >= BLOCK:
+            self._reduce_commands()
 
     def answered(self, k: Integers) -> None:
         """Ticks that were answered, be it by commands without a valid value. Shape (n,)."""
@@ -95,8 +101,8 @@ class Observer:
 
     def finish(self) -> None:
         """No more is to come."""
-        for name in self._codes:
-            self._reduce_frames(name)
+        self._reduce_measurements()
+        self._reduce_commands()
         self._reduce_ticks()
 
     # ── what it has found ──
@@ -159,27 +165,20 @@ class Observer:
 
     # ── a block at a time ──
 
-    def _frame(self, name: str, codes: tuple[float, ...]) -> None:
-        frames = self._codes[name]
-        frames.append(codes)
-        if len(frames) >= BLOCK:
-            self._reduce_frames(name)
+    def _reduce_measurements(self) -> None:
+        times = np.concatenate([self._last_measured, np.array(self._measured, dtype=np.int64)])
+        self._period_ns.add(np.diff(times))
+        self._last_measured = times[-1:]
+        codes = codes_in(self._wire.measurement, self._measurements)
+        wrong = self._outermost["attitude"].add(codes[:, :3]) | self._outermost["rate"].add(codes[:, 3:])
+        self.invalid["measurement"] += int(wrong.sum())
+        self._measured.clear()
+        self._measurements.clear()
 
-    def _reduce_frames(self, name: str) -> None:
-        if name == "measurement":
-            times = np.array(self._measured, dtype=np.int64)
-            times = np.concatenate([self._last_measured, times])
-            self._period_ns.add(np.diff(times))
-            self._last_measured = times[-1:]
-            self._measured.clear()
-        codes = table(self._codes[name])
-        self._codes[name].clear()
-        if len(codes):
-            if name == "measurement":
-                wrong = self._outermost["attitude"].add(codes[:, :3]) | self._outermost["rate"].add(codes[:, 3:])
-            else:
-                wrong = self._outermost["voltage"].add(codes)
-            self.invalid[name] += int(wrong.sum())
+    def _reduce_commands(self) -> None:
+        wrong = self._outermost["voltage"].add(codes_in(self._wire.command, self._commands))
+        self.invalid["command"] += int(wrong.sum())
+        self._commands.clear()
 
     def _reduce_ticks(self) -> None:
         if not self._waiting:

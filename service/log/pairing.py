@@ -28,18 +28,10 @@ _NEVER_NS: Final = 1 << 64
 """Later than any time of publication."""
 
 
-class Seen(NamedTuple):
-    """A frame, or another payload, out of the log."""
-
-    frame: bytes
-    published_ns: int
-
-
 class Read(NamedTuple):
-    """A frame out of the log, and what it says."""
+    """A frame out of the log that is not malformed."""
 
     counter: int
-    codes: tuple[float, ...]
     frame: bytes
     published_ns: int
 
@@ -65,7 +57,7 @@ class Pairing(ABC):
 
     def __init__(self, wire: WireSpec, loop: LoopSettings) -> None:
         self._wire = wire
-        self._read_measurement, self._read_command = wire.measurement.unpack, wire.command.unpack
+        self._measurement_counter, self._command_counter = wire.measurement.counter, wire.command.counter
         self._loop = loop
         self._measured: deque[Read] = deque(maxlen=MAX_WAITING)  # not answered yet
         self._commands: deque[Read] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
@@ -87,21 +79,21 @@ class Pairing(ABC):
     def passed_over(self, k: int, measurement: Read) -> None:
         """A measurement that no command answered, while one answered a later one."""
 
-    def measurement(self, seen: Seen) -> None:
+    def measurement(self, frame: bytes, published_ns: int) -> None:
         """A measurement frame; commands that were published before it can now be told which tick they answer."""
-        read = self._read_measurement(seen.frame)
-        if read is None:
+        counter = self._measurement_counter(frame)
+        if counter is None:
             self.malformed += 1
         else:
-            self.measured(Read(*read, *seen))
+            self.measured(Read(counter, frame, published_ns))
 
-    def command(self, seen: Seen) -> None:
+    def command(self, frame: bytes, published_ns: int) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
-        read = self._read_command(seen.frame)
-        if read is None:
+        counter = self._command_counter(frame)
+        if counter is None:
             self.malformed += 1
         else:
-            self.commanded(Read(*read, *seen))
+            self.commanded(Read(counter, frame, published_ns))
 
     def measured(self, measurement: Read) -> None:
         """A measurement that could be read."""
@@ -131,19 +123,19 @@ class Pairing(ABC):
         commands, measured = self._commands, self._measured
         while commands and commands[0].published_ns < until_ns:
             command = commands.popleft()
-            echo, published_ns = command.counter, command.published_ns
+            echo, _, published_ns = command
             found = len(measured) - 1
             while found >= 0 and (measured[found].counter != echo or measured[found].published_ns >= published_ns):
                 found -= 1
             if found < 0:
                 continue  # answers what the log does not have, or repeats an answer
             before = [measured.popleft() for _ in range(found)]
-            pair = Pair(measured.popleft(), command, before)
+            measurement = measured.popleft()
             if self._ticks is not None:
-                self._place(pair, self._ticks)
+                self._place(self._ticks, measurement, command, before)
             else:
-                self._pairs.append(pair)
-                self._anchor(pair.measurement.published_ns)
+                self._pairs.append(Pair(measurement, command, before))
+                self._anchor(measurement.published_ns)
 
     def _anchor(self, until_ns: int) -> None:
         """Match telemetry from before `until_ns` with the latest answered measurement before it with its counter."""
@@ -162,26 +154,26 @@ class Pairing(ABC):
                     self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep, tick=max(0, first) - 1)
                     self._pairs.clear()
                     for pair in pairs:
-                        self._place(pair, self._ticks)
+                        self._place(self._ticks, *pair)
                     break
             # else: the measurement that it speaks of came before the log began
 
-    def _place(self, pair: Pair, ticks: TickCounter) -> None:
+    def _place(self, ticks: TickCounter, measurement: Read, command: Read, before: list[Read]) -> None:
         """Find the tick as the controller did: it, too, saw the measurements that it answered, and no others."""
         last = ticks.tick
-        k = ticks.advance(pair.measurement.counter, pair.measurement.published_ns)
+        k = ticks.advance(measurement.counter, measurement.published_ns)
         if k is None:
             return
-        if pair.before:
+        if before:
             tick, over = k, []
-            for read in reversed(pair.before):
+            for read in reversed(before):
                 tick = _before(tick, read.counter)
                 if tick <= last:
                     break
                 over.append((tick, read))
             for missed, read in reversed(over):
                 self.passed_over(missed, read)
-        self.answered(k, pair.measurement, pair.command)
+        self.answered(k, measurement, command)
 
 
 def _before(tick: int, counter: int) -> int:
@@ -203,6 +195,9 @@ def without_collections() -> Iterator[None]:
 
 P = TypeVar("P", bound=Pairing)
 
+Taker = Callable[[bytes, int], None]
+"""Takes a message of the log: its content, and when it was published [ns]."""
+
 
 class Sessions(dict[Which, P]):
     """The sessions of a run, each made when its first frame comes.
@@ -218,7 +213,7 @@ class Sessions(dict[Which, P]):
         self[which] = self._make(which)
         return self[which]
 
-    def route(self, address: Address) -> Callable[[Seen], None] | None:
+    def route(self, address: Address) -> Taker | None:
         """Who takes the messages of a key; None if they are no business of a session."""
         name = address.topic.name
         if name == "telemetry":
@@ -228,8 +223,8 @@ class Sessions(dict[Which, P]):
         session = self[address.vehicle, address.session]
         return session.measurement if name == "measurement" else session.command
 
-    def _telemetry(self, vehicle: str, seen: Seen) -> None:
+    def _telemetry(self, vehicle: str, payload: bytes, published_ns: int) -> None:
         if any(whose == vehicle and session.wants_telemetry for (whose, _), session in self.items()):
-            telemetry = Telemetry.model_validate_json(seen.frame)
+            telemetry = Telemetry.model_validate_json(payload)
             if session := self.get((vehicle, telemetry.session)):
-                session.telemetry(telemetry, seen.published_ns)
+                session.telemetry(telemetry, published_ns)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import nan, sqrt
+from math import sqrt
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,9 @@ from protocol.verbs import Change
 from service.config import Settings, load_over
 from service.figures import added, squares
 from service.log.blocks import BlockController
-from service.log.codes import encoded, levels, table
+from service.log.codes import codes_in, encoded, levels
 from service.log.files import LogFiles, Which
-from service.log.pairing import MAX_WAITING, Pairing, Read, Seen, Sessions, without_collections
+from service.log.pairing import MAX_WAITING, Pairing, Read, Sessions, without_collections
 from service.log.report import Array
 from service.log.tallies import BLOCK
 
@@ -117,15 +117,13 @@ class Replayer(Pairing):
         held = next((pair for pair in self._held if pair[0] == tick), None)
         if held is None:
             return
-        measurement, controller = held[1], self._controller
-        controller.follow(tick, self._changes)
-        voltages = controller.compute(measurement.counter, measurement.codes, tick)
+        controller, voltages = self._controller, self._voltages([held])
         told = telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error
         if held is self._held[0] and told == (controller.sign, controller.damping_estimate, controller.attitude_error):
             self.first_tick = tick  # the session's very first: nothing had been computed before it
-            self._compare([held], np.array([voltages or [nan] * self._wire.actuators]))
+            self._compare([held], voltages)
         else:
-            controller.resume(measurement.frame, tick, *told)
+            controller.resume(held[1].frame, tick, *told)
             self.first_tick = tick + 1
         self._begun = True
         self._waiting += [pair for pair in self._held if pair[0] > tick]
@@ -151,13 +149,17 @@ class Replayer(Pairing):
         """Compute the commands that wait again, and compare them."""
         pairs, self._waiting = self._waiting, []
         if pairs:
-            k, codes = np.array([k for k, _, _ in pairs]), table([measurement.codes for _, measurement, _ in pairs])
-            self._compare(pairs, self._controller.compute_all(k, codes, self._changes).voltages)
+            self._compare(pairs, self._voltages(pairs))
+
+    def _voltages(self, pairs: Sequence[Pair]) -> Array:
+        """What the law commands at the next ticks [V]; NaN for no valid value. Shape (n, actuators)."""
+        codes = codes_in(self._wire.measurement, [measurement.frame for _, measurement, _ in pairs])
+        return self._controller.compute_all(np.array([k for k, _, _ in pairs]), codes, self._changes).voltages
 
     def _compare(self, pairs: Sequence[Pair], voltages: Array) -> None:
-        """Compare logged commands with what the law commands [V], NaN for no valid value. Shape (n, actuators)."""
-        signal = self._wire.voltage
-        ours, theirs = encoded(signal, voltages), table([command.codes for _, _, command in pairs])
+        """Compare logged commands with what the law commands."""
+        signal, ours = self._wire.voltage, encoded(self._wire.voltage, voltages)
+        theirs = codes_in(self._wire.command, [command.frame for _, _, command in pairs])
         differ = np.flatnonzero((ours.view(np.int64) != theirs.view(np.int64)).any(axis=1))  # an echo cannot differ
         if len(differ) and self.first_difference is None:
             k, measurement, command = pairs[differ[0]]
@@ -214,7 +216,7 @@ def replay(
 
     sessions = Sessions(replayer)
     for take, payload, published_ns in files.routed(sessions.route, progress):
-        take(Seen(payload, published_ns))
+        take(payload, published_ns)
     for session in sessions.values():
         session.finish()
     return [session.result(vehicle, name) for (vehicle, name), session in sessions.items()]

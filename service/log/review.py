@@ -23,12 +23,12 @@ from protocol.verbs import Change
 from service.config import ConfigError, Settings
 from service.figures import Figures, Score
 from service.log.blocks import BlockController
-from service.log.codes import levels, table
+from service.log.codes import codes_in, levels
 from service.log.files import LogFiles, ReviewError, Which
 from service.log.findings import facts_of, findings_of, name_of
 from service.log.limits import Limit
 from service.log.observe import Observer
-from service.log.pairing import Pairing, Read, Seen, Sessions, without_collections
+from service.log.pairing import Pairing, Read, Sessions, Taker, without_collections
 from service.log.report import Findings, Report
 from service.log.story import Story
 from service.log.tallies import BLOCK
@@ -68,12 +68,12 @@ class Session(Pairing):
 
     def measured(self, measurement: Read) -> None:
         """See `Pairing.measured`."""
-        self.observer.measurement(measurement.codes, measurement.published_ns)
+        self.observer.measurement(measurement.frame, measurement.published_ns)
         super().measured(measurement)
 
     def commanded(self, command: Read) -> None:
         """See `Pairing.commanded`."""
-        self.observer.command(command.codes)
+        self.observer.command(command.frame)
         super().commanded(command)
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
@@ -106,9 +106,11 @@ class Session(Pairing):
             return
         ticks, measurements, commands, answers = zip(*self._waiting, strict=True)
         self._waiting.clear()
+        wire = self._wire
         k, answered = np.array(ticks), np.array(answers)
-        computed = self._controller.compute_all(k, table([read.codes for read in measurements]), self._changes)
-        voltages = levels(self.settings.wire.voltage, table([read.codes for read in commands]))
+        measured = codes_in(wire.measurement, [read.frame for read in measurements])
+        computed = self._controller.compute_all(k, measured, self._changes)
+        voltages = levels(wire.voltage, codes_in(wire.command, [read.frame for read in commands]))
         published = np.array([read.published_ns for read in measurements])
         latency = np.where(answered, np.array([read.published_ns for read in commands]) - published, nan)
         seen = Ticks(
@@ -161,23 +163,23 @@ class Run(Sessions[Session]):
         self._running[which[0]] = session = super().__missing__(which)
         return session
 
-    def route(self, address: Address) -> Callable[[Seen], None] | None:
+    def route(self, address: Address) -> Taker | None:
         """Who takes the messages of a key; see `Sessions.route`."""
-        vehicle, role = address.vehicle, address.role
+        story, vehicle, role = self.story, address.vehicle, address.role
         match address.topic.name:
             case "truth":
                 return partial(self._truth, vehicle)
             case "event":
-                return lambda seen: self.story.event(vehicle, Event.model_validate_json(seen.frame), seen.published_ns)
+                return lambda payload, at_ns: story.event(vehicle, Event.model_validate_json(payload), at_ns)
             case "loss":
-                return lambda seen: self.story.loss(vehicle, Loss.model_validate_json(seen.frame))
+                return lambda payload, _: story.loss(vehicle, Loss.model_validate_json(payload))
             case "status" if role is not None:
-                return lambda seen: self.story.status(vehicle, role, Status.model_validate_json(seen.frame))
+                return lambda payload, _: story.status(vehicle, role, Status.model_validate_json(payload))
         return super().route(address)
 
-    def _truth(self, vehicle: str, seen: Seen) -> None:
+    def _truth(self, vehicle: str, payload: bytes, published_ns: int) -> None:
         if session := self._running.get(vehicle):
-            session.observer.truth(Truth.model_validate_json(seen.frame).attitude, seen.published_ns)
+            session.observer.truth(Truth.model_validate_json(payload).attitude, published_ns)
 
 
 class Review(NamedTuple):
@@ -257,7 +259,7 @@ def read(
 
         run = Run(session)
         for take, payload, published_ns in files.routed(run.route, progress):
-            take(Seen(payload, published_ns))
+            take(payload, published_ns)
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
     if not run:

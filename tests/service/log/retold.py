@@ -21,6 +21,7 @@ from service.log.ticks import Ticks
 from tests.service.log.made_log import SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000
+ZEROS = bytes(7)  # a measurement of 8 bits a signal
 LATENCY_NS = 300_000  # in the bin from 291.7 to 304.4 µs, whose middle is 297.9
 
 
@@ -90,6 +91,6 @@ def feed(
     """Let an observer see a tick, with its measurement."""
     at = START_NS + k * PERIOD_NS
     zero = (0.0, 0.0, 0.0)
-    observer.measurement((0, 0, 0, 0, 0, 0), at)
+    observer.measurement(ZEROS, at)
     columns = (k, at, float(LATENCY_NS), attitude, desired, zero, zero, zero, zero, (0.0, 0.0))
     observer.ticks(Ticks(*(np.array([column]) for column in columns)))

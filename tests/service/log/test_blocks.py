@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from protocol.attitude import IDENTITY, Quaternion, received_quaternion
-from protocol.frames import SignalSpec
+from protocol.frames import FrameFormat, SignalSpec
 from protocol.verbs import Change, Gains, Hold, Points, Reference, Sinusoid
 from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Score
 from service.log.blocks import BlockController, received_quaternions
-from service.log.codes import encoded, levels
+from service.log.codes import codes_in, encoded, levels
 
 TICKS = 700
 ROWS = 64
@@ -206,3 +206,23 @@ def test_a_score_of_many_is_the_score_of_each_to_the_last_bit(cut: int) -> None:
         many.commands(k[start : start + cut], volts[start : start + cut])
     assert many.figures() == one.figures()
     assert many._largest == one._largest
+
+
+@pytest.mark.parametrize("widths", [[8] * 6, [6, 6], [10] * 3 + [16] * 3, [2, 3, 5], [None, None], [None, 7, None, 16]])
+def test_frames_are_read_many_at_once_as_each(widths: list[int | None]) -> None:
+    kind, rng = FrameFormat(widths), np.random.default_rng(0)
+    rows = [
+        [
+            rng.normal() if width is None else int(rng.integers(-(2 ** (width - 1)), 2 ** (width - 1)))
+            for width in widths
+        ]
+        for _ in range(200)
+    ]
+    if widths[0] is None:
+        rows[7][0], rows[8][0], rows[9][0] = float("nan"), -0.0, 5e-324
+    frames = [kind.pack(i % 16, row) for i, row in enumerate(rows)]
+    assert bits(codes_in(kind, frames)) == bits(rows)
+    assert codes_in(kind, []).shape == (0, len(widths))
+    for frame in [*frames, b"", frames[0][:-1], frames[0] + b"\0", *(bytes([*frames[0][:-1], i]) for i in range(256))]:
+        read = kind.unpack(frame)
+        assert kind.counter(frame) == (None if read is None else read[0])

@@ -172,7 +172,7 @@ def test_without_quantization_a_value_at_the_limit_is_saturated() -> None:
     settings = load(overrides=["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"])
     observer = Observer(settings)
     for volts in (24.0, -24.0, 23.9, nan):
-        observer.command((volts, 1.0))
+        observer.command(settings.wire.command.pack(0, (volts, 1.0)))
     observer.finish()
     assert observer.saturated == {"voltage": 2 / 7}
     assert observer.invalid["command"] == 1

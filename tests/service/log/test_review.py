@@ -12,7 +12,6 @@ from protocol.messages import Claim, Telemetry
 from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Figures
-from service.log.pairing import Seen
 from service.log.review import Session
 from service.log.ticks import Tick
 
@@ -80,8 +79,8 @@ def arrivals(
         answered = published + answer_ns
         latest_measurement = max(latest_measurement, published + measurement_delay(k))
         latest_command = max(latest_command, answered + command_delay(k))
-        yield latest_measurement, lambda s, m=measurement, t=published: s.measurement(Seen(m, t))  # type: ignore[misc]
-        yield latest_command, lambda s, c=command, t=answered: s.command(Seen(c, t))  # type: ignore[misc]
+        yield latest_measurement, lambda s, m=measurement, t=published: s.measurement(m, t)  # type: ignore[misc]
+        yield latest_command, lambda s, c=command, t=answered: s.command(c, t)  # type: ignore[misc]
         if k % 10 == 0:
             yield latest_command + 1, lambda s, telemetry=telemetry, t=answered + 1: s.telemetry(telemetry, t)  # type: ignore[misc]
 
