@@ -44,6 +44,9 @@ _BACKLOG: Final = 16 * 1024
 _PAUSE_NS: Final = 300_000
 """A message this long after the last one may have found the sockets empty: what is buffered comes ten times as fast."""
 
+_LOOKS: Final = 8
+"""At a pause, look this often whether the sockets are empty: where messages come all the time, looking is in vain."""
+
 _BUSY_PER_S: Final = 200
 """Messages a second from which on it pays to let them gather."""
 
@@ -131,9 +134,10 @@ class Intake:
         self._own = threading.get_ident()  # what we publish ourselves is taken in by the thread that publishes
         self._last_ns = 0
         self._second_ns = 0  # when the running second began
-        self._second_count = 0
+        self._count = 0  # since then
         self._busy = False  # as the last second was
         self._sockets = _Sockets()
+        self._looks = 0  # how often to look still whether the sockets are empty, before a rest
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._take, indirect=False))
 
     def __len__(self) -> int:
@@ -159,7 +163,7 @@ class Intake:
             backlog = _Sockets().waiting()
             if backlog > _BACKLOG:
                 piled_up = now
-            silent = not backlog and time.monotonic_ns() - self._last_ns > _QUIET_NS
+            silent = not backlog and time.time_ns() - self._last_ns > _QUIET_NS
             if silent or now - piled_up > _GOES_ON_S:
                 return
             time.sleep(0.005)
@@ -170,18 +174,10 @@ class Intake:
         self._subscriber.undeclare()
 
     def _take(self, sample: zenoh.Sample) -> None:
-        thread = threading.get_ident()
-        if thread != self._own:
-            if thread not in self._receiving:
-                self._keep(thread)
-            if self._busy and time.monotonic_ns() - self._last_ns > _PAUSE_NS and not self._sockets.waiting():
-                time.sleep(self._batch_s)
         now = time.time_ns()
-        self._second_count += 1
-        if now - self._second_ns > 1_000_000_000:
-            self._busy = bool(self._batch_s) and self._second_count > _BUSY_PER_S
-            self._second_ns, self._second_count = now, 0
-            self._sockets = _Sockets()
+        if now - self._last_ns > _PAUSE_NS or self._looks:
+            self._pause(now)
+            now = time.time_ns()
         key, source = str(sample.key_expr), sample.source_info
         missing = 0 if source is None else self.numbers.missing(key, source)
         if len(self._queue) < self._most:
@@ -190,7 +186,26 @@ class Intake:
             with self._refusing:
                 self._refusals.messages[key] += 1
                 self._refusals.missing[key] += missing
-        self._last_ns = time.monotonic_ns()
+        self._count += 1
+        self._last_ns = now
+
+    def _pause(self, now: int) -> None:
+        """Nothing has come for a moment: let messages gather, unless some are waiting; then look again at the next."""
+        if now - self._second_ns > 1_000_000_000:
+            self._busy = bool(self._batch_s) and self._count > _BUSY_PER_S
+            self._second_ns, self._count = now, 0
+            self._sockets = _Sockets()
+        thread = threading.get_ident()
+        if thread == self._own:
+            return
+        if thread not in self._receiving:
+            self._keep(thread)
+        if not self._busy:
+            return
+        self._looks = (self._looks or _LOOKS) - 1
+        if not self._sockets.waiting():
+            self._looks = 0
+            time.sleep(self._batch_s)
 
     def _keep(self, thread: int) -> None:
         """Keep Python's state of a thread of Zenoh's. It would be made and freed for every message, for 25 µs."""

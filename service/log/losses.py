@@ -14,6 +14,8 @@ import zenoh
 _MASK: Final = 0xFFFF_FFFF
 """Numbers have 32 bits and begin again at 0."""
 
+_FRAMES: Final = ("/measurement", "/command")
+
 
 class Numbers:
     """Follows the numbers of every sender on every key. Threads may share it, as long as each has its own senders.
@@ -25,14 +27,20 @@ class Numbers:
     def __init__(self) -> None:
         self.settled = False
         self._before: set[zenoh.ZenohId] = set()  # who was
+        self._alone: dict[str, int] = {}  # what follows on a session's keys, which have one sender each
         self._following: dict[tuple[str, zenoh.ZenohId, int], int] = {}
 
     def missing(self, key: str, source: zenoh.SourceInfo) -> int:
         """How many messages of the same sender and key are missing before this one."""
-        sender, number = source.source_id, source.source_sn
+        number = source.source_sn
+        if self._alone.get(key) == number:  # the usual case, a thousand times a second
+            self._alone[key] = number + 1 & _MASK
+            return 0
+        sender = source.source_id
         member = sender.zid
         which = key, member, sender.eid
-        following = self._following.get(which)
+        frames = key.endswith(_FRAMES)
+        following = self._alone.get(key) if frames else self._following.get(which)
         if following is None:
             if not self.settled:
                 self._before.add(member)
@@ -40,5 +48,8 @@ class Numbers:
         ahead = number - following & _MASK
         if ahead > _MASK >> 1:
             return 0  # it is an older one
-        self._following[which] = number + 1 & _MASK
+        if frames:
+            self._alone[key] = number + 1 & _MASK
+        else:
+            self._following[which] = number + 1 & _MASK
         return ahead

@@ -29,7 +29,9 @@ from service.settings import RecorderSettings
 
 log: Final = logging.getLogger("aeroloop")
 
-DRAIN_WAIT_S: Final = 0.02
+WORK_EVERY_S: Final = 0.2
+"""Messages can wait: a chunk is closed only once a second."""
+
 STATUS_EVERY_S: Final = 1.0
 ASK_EVERY_S: Final = 1.0
 CHANGED: Final = "?"
@@ -75,7 +77,7 @@ class Recorder:
         self._role.event("started", f"recording to {self.log.path}")
         gc.freeze()  # a collection looks at the messages that wait, not at all that was ever imported
         try:
-            while not self._role.stop.wait(max(self._batch_s, DRAIN_WAIT_S)):
+            while not self._role.stop.wait(WORK_EVERY_S):
                 self._work()
         finally:
             self._intake.settle()

@@ -111,9 +111,10 @@ class RollingLog:
     def add(self, taken: Taken, decoded: list[Decoded]) -> None:
         """Add a message and what was made of it; only while `writable`."""
         sequence = self._sequences[taken.key] = self._sequences.get(taken.key, 0) + 1
-        self._unwritten.append(_Entry(taken, sequence, decoded))
+        entry = _Entry(taken, sequence, decoded)
+        self._unwritten.append(entry)
         self.written += 1
-        self._put(self._file, self._unwritten[-1])
+        self._put(self._file, entry)
         if self._file.full:
             self._commit()
 
