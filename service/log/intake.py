@@ -153,8 +153,12 @@ class Intake:
             refusals, self._refusals = self._refusals, Refusals(Counter(), Counter())
         return refusals
 
-    def settle(self) -> None:
-        """Wait until what is on its way has been taken in: for silence or, where others go on, for nothing piled up."""
+    def settle(self) -> bool:
+        """Wait until what is on its way has been taken in: for silence or, where others go on, for nothing piled up.
+
+        Returns:
+            Whether it came to that; False if more came all the time than could be taken in.
+        """
         batch_s, self._batch_s, self._busy = self._batch_s, 0.0, False
         time.sleep(batch_s)  # the receiving thread wakes from its last pause
         now = piled_up = time.monotonic()
@@ -165,9 +169,10 @@ class Intake:
                 piled_up = now
             silent = not backlog and time.time_ns() - self._last_ns > _QUIET_NS
             if silent or now - piled_up > _GOES_ON_S:
-                return
+                return True
             time.sleep(0.005)
             now = time.monotonic()
+        return False
 
     def close(self) -> None:
         """Take in no more. What is in the queue stays there."""

@@ -80,7 +80,8 @@ class Recorder:
             while not self._role.stop.wait(WORK_EVERY_S):
                 self._work()
         finally:
-            self._intake.settle()
+            if not self._intake.settle():
+                self._role.event("lost", "stopped while more came than could be taken in: the log lacks the last of it")
             self.log.try_again()
             self._status_due = 0.0
             self._work()
