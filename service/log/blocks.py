@@ -83,7 +83,7 @@ class BlockController(Controller):
         Args:
             k: Ticks, rising. Shape (n,).
             codes: Of each measurement. Shape (n, 6).
-            changes: What is followed from which tick on, in order; those up to the last tick are taken out.
+            changes: What is followed from which tick on, in order; those that it has come to follow are taken out.
         """
         with np.errstate(all="ignore"):  # a float64 wire may say 1e200
             vectors, rates = levels(self.wire.attitude, codes[:, :3]), levels(self.wire.rate, codes[:, 3:])
@@ -96,8 +96,6 @@ class BlockController(Controller):
                     computed, self._compute(k[some], vectors[some], rates[some], changes), strict=True
                 ):
                     column[some] = values
-        if len(k):
-            self.follow(int(k[-1]), changes)
         return computed
 
     def follow(self, k: int, changes: deque[Change]) -> None:

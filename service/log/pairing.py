@@ -79,31 +79,33 @@ class Pairing(ABC):
     def passed_over(self, k: int, measurement: Read) -> None:
         """A measurement that no command answered, while one answered a later one."""
 
+    @abstractmethod
+    def measured(self, frame: bytes, published_ns: int) -> None:
+        """A measurement that can be read, whatever becomes of it."""
+
+    @abstractmethod
+    def commanded(self, frame: bytes) -> None:
+        """A command that can be read, whatever it answers."""
+
     def measurement(self, frame: bytes, published_ns: int) -> None:
         """A measurement frame; commands that were published before it can now be told which tick they answer."""
         counter = self._measurement_counter(frame)
         if counter is None:
             self.malformed += 1
-        else:
-            self.measured(Read(counter, frame, published_ns))
+            return
+        self.measured(frame, published_ns)
+        if self._commands:
+            self._answer(published_ns)
+        self._measured.append(Read(counter, frame, published_ns))
 
     def command(self, frame: bytes, published_ns: int) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
         counter = self._command_counter(frame)
         if counter is None:
             self.malformed += 1
-        else:
-            self.commanded(Read(counter, frame, published_ns))
-
-    def measured(self, measurement: Read) -> None:
-        """A measurement that could be read."""
-        if self._commands:
-            self._answer(measurement.published_ns)
-        self._measured.append(measurement)
-
-    def commanded(self, command: Read) -> None:
-        """A command that could be read."""
-        self._commands.append(command)
+            return
+        self.commanded(frame)
+        self._commands.append(Read(counter, frame, published_ns))
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
         """Which tick a counter stood for; the first that can be matched tells it for the whole session."""
@@ -129,7 +131,7 @@ class Pairing(ABC):
                 found -= 1
             if found < 0:
                 continue  # answers what the log does not have, or repeats an answer
-            before = [measured.popleft() for _ in range(found)]
+            before = [measured.popleft() for _ in range(found)] if found else []
             measurement = measured.popleft()
             if self._ticks is not None:
                 self._place(self._ticks, measurement, command, before)

@@ -86,6 +86,12 @@ class Replayer(Pairing):
         """Until it is known where to begin."""
         return not self._begun
 
+    def measured(self, frame: bytes, published_ns: int) -> None:
+        """Only what was answered is computed again."""
+
+    def commanded(self, frame: bytes) -> None:
+        """Only what answers is compared."""
+
     def answered(self, k: int, measurement: Read, command: Read) -> None:
         """Compute the command of tick k again."""
         if not self._begun:

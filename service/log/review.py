@@ -66,15 +66,13 @@ class Session(Pairing):
         """All of it: it is drawn."""
         return True
 
-    def measured(self, measurement: Read) -> None:
+    def measured(self, frame: bytes, published_ns: int) -> None:
         """See `Pairing.measured`."""
-        self.observer.measurement(measurement.frame, measurement.published_ns)
-        super().measured(measurement)
+        self.observer.measurement(frame, published_ns)
 
-    def commanded(self, command: Read) -> None:
+    def commanded(self, frame: bytes) -> None:
         """See `Pairing.commanded`."""
-        self.observer.command(command.frame)
-        super().commanded(command)
+        self.observer.command(frame)
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
         """See `Pairing.telemetry`."""

@@ -29,6 +29,7 @@ WIRES = {
     "mixed": ["wire.attitude.bits=cont", "wire.rate.bits=16", "wire.rate.deadzone=0.01"],
     "rigid body": ["wire.actuators=3", "plant.kind=rigid_body", "plant.ideal=true"],
 }
+WIRES["continuous rigid body"] = WIRES["continuous"] + WIRES["rigid body"]
 REFERENCES: list[Reference | None] = [
     None,
     Hold(attitude=(0.0, 5.0, -10.0)),
@@ -154,6 +155,18 @@ def test_blocks_and_single_ticks_go_on_from_one_another() -> None:
         mixed.compute(k % 16, [int(code) for code in codes], k)
     assert bits(said) == bits(expected[:300])
     assert bits(np.hstack(mixed.compute_all(run.k[310:], run.codes[310:], deque()))) == bits(expected[310:])
+
+
+def test_where_the_law_gives_no_number_no_valid_value_is_commanded() -> None:
+    run = Run("continuous rigid body", 6)
+    run.codes[100, 3:] = 0.0, 1e200, 1e200  # the first element of ω × Jω is ∞ − ∞, the others are numbers
+    single, blocks = run.controller(Controller), run.controller(BlockController, rows=ROWS)
+    ticks = list(run.one_by_one(single))
+    said, commands = run.in_blocks(blocks, [])
+    assert single.failed
+    assert blocks.failed
+    assert commands == [command for _, command in ticks]
+    assert np.isnan([row[-1] for row in said]).tolist() == np.isnan([tick[-1] for tick, _ in ticks]).tolist()
 
 
 def test_received_quaternions_turn_as_one_received_after_another_does() -> None:

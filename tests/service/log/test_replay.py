@@ -7,15 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from protocol import topics
 from service.config import load
 from service.experiment import run_experiment
 from service.figures import Figures, Stream
 from service.log.files import LogFiles, ReviewError
 from service.log.limits import Limit, LimitError
-from service.log.mcap_records import CHUNK, Damage, records
+from service.log.mcap_records import CHANGE_METADATA, CHUNK, Damage, records
 from service.log.replay import SessionReplay, replay
 from service.log.review import review
 from tests.service.log.made_log import AN_OPERATORS_WORDS, make_log
+from tests.service.log.retold import retell
 
 TICKS = 600
 
@@ -42,6 +44,16 @@ def test_what_an_operator_changed_is_changed_in_the_replay_at_the_same_tick(tmp_
     make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
     session = replayed(tmp_path / "a.mcap")
     assert (session.commands, session.differing) == (TICKS, 0)
+
+
+def test_a_change_that_a_rotated_run_tells_again_is_known_once(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
+    changes = LogFiles([tmp_path / "a.mcap"]).changes["aero", "s1"]
+    again = [
+        (CHANGE_METADATA, {"key": topics.key("change", "aero"), "json": change.model_dump_json()}) for change in changes
+    ]
+    retold = retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=again)
+    assert [change.tick for change in LogFiles([retold]).changes["aero", "s1"]] == [0, 120, 250, 400]
 
 
 @pytest.mark.parametrize("begin", [1, 7, 123, 305])
