@@ -122,8 +122,8 @@ class Role:
 
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
 
-    def configured(self, config: dict[str, Any]) -> None:
-        """Answer questions for the contract with this configuration from now on."""
+    def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
+        """Answer questions for the contract with this configuration, and what is promised of it, from now on."""
         self._contract = Contract(
             role=self.role,
             vehicle=self.vehicle,
@@ -131,6 +131,7 @@ class Role:
             versions=versions(),
             facts=host_facts(),
             config=config,
+            certificate=certificate,
         ).encode()
 
     @property

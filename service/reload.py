@@ -37,7 +37,11 @@ _SECTIONS: Final = {
 
 
 def reload_on_hangup(
-    role: Role, settings: Settings, load: Callable[[], Settings], take_over: Callable[[Settings], None]
+    role: Role,
+    settings: Settings,
+    load: Callable[[], Settings],
+    take_over: Callable[[Settings], None],
+    promise: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda _: None,
 ) -> None:
     """Let SIGHUP read the configuration again.
 
@@ -46,30 +50,37 @@ def reload_on_hangup(
         settings: Its configuration so far.
         load: Reads it again; raises ConfigError.
         take_over: Given the new configuration between two ticks, takes what is in `LIVE`.
+        promise: What the theorem promises of an effective configuration, for the contract.
     """
     current = settings
     effective = settings.contract()
 
     def reload() -> Action:
-        nonlocal current
-        before, current = current, load()
-        lines = differences(before, current, role.role)
+        nonlocal current, effective
+        before, now = current, load()
+        current = now
+        lines = differences(before, now, role.role)
+        effective = _with_what_is_live(effective, now.contract(), role.role)
+        contract, promised = effective, promise(effective)
 
         def take() -> None:
-            take_over(current)
-            after = current.contract()
-            for name in LIVE[role.role]:
-                section, _, key = name.partition(".")
-                if key:
-                    effective[section][key] = after[section][key]
-                else:
-                    effective[section] = after[section]
-            role.configured(effective)  # what needs a restart is not in effect, and a log must not say so
+            take_over(now)
+            # What needs a restart is not in effect, and a log must not say so.
+            role.configured(contract, promised)
             role.event("changed", f"configuration read again: {'; '.join(lines) or 'nothing has changed'}")
 
         return take
 
     role.on_hangup(reload)
+
+
+def _with_what_is_live(effective: dict[str, Any], after: dict[str, Any], role: str) -> dict[str, Any]:
+    """A configuration with what takes effect at once of another one."""
+    merged = {**effective}
+    for name in LIVE[role]:
+        section, _, key = name.partition(".")
+        merged[section] = {**merged[section], key: after[section][key]} if key else after[section]
+    return merged
 
 
 def differences(before: Settings, after: Settings, role: str) -> list[str]:

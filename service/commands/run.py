@@ -109,11 +109,20 @@ def controller(
     settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
+        from service.config import from_contract
         from service.daemon import Daemon
+        from service.promise import promise_of
         from service.reload import reload_on_hangup
 
+        role.configured(settings.contract(), promise_of(settings))
         daemon = Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller)
-        reload_on_hangup(role, settings, load, lambda new: daemon.reconfigure(new.law, new.reference, new.controller))
+        reload_on_hangup(
+            role,
+            settings,
+            load,
+            lambda new: daemon.reconfigure(new.law, new.reference, new.controller),
+            lambda effective: promise_of(from_contract(effective)),
+        )
         daemon.run()
 
     run_role("controller", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
@@ -154,7 +163,7 @@ def bridge(
     log_format: LogFormat = "text",
     with_parent: WithParent = False,
 ) -> None:
-    """Run the bridge to a plant on the CAN bus of `[can]`, until SIGTERM."""
+    """Run the bridge to a plant on the configured CAN bus, until SIGTERM."""
     settings, load = reloadable(config, [*(overrides or []), "plant.via=can"])
     _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
 
@@ -168,7 +177,7 @@ def can_node(
     log_format: LogFormat = "text",
     with_parent: WithParent = False,
 ) -> None:
-    """Run the emulated plant as a node on the CAN bus of `[can]`, until SIGTERM."""
+    """Run the emulated plant as a node on the configured CAN bus, until SIGTERM."""
     settings = settings_of(config, [*(overrides or []), *_fault_options(faults)])
 
     def run(stop: Event) -> None:

@@ -133,15 +133,16 @@ class Hangup:
     def __init__(self) -> None:
         self.reload: Callable[[], Action] | None = None
         self.contract: dict[str, Any] = {}
+        self.certificate: dict[str, Any] | None = None
         self.told: list[tuple[str, str]] = []
 
     def on_hangup(self, reload: Callable[[], Action]) -> None:
         """Keep it."""
         self.reload = reload
 
-    def configured(self, config: dict[str, Any]) -> None:
+    def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None) -> None:
         """Keep it."""
-        self.contract = config
+        self.contract, self.certificate = config, certificate
 
     def event(self, kind: str, text: str) -> None:
         """Keep it."""
@@ -175,6 +176,24 @@ def test_what_needs_a_restart_is_not_in_the_contract_before_it() -> None:
     role.hang_up()
     assert role.told == [("changed", "configuration read again: law.mass: 1.075 → 2.0, after a restart")]
     assert role.contract["law"]["mass"] == 1.075
+
+
+def test_what_the_theorem_promises_is_told_of_the_new_gains_and_computed_before_the_tick() -> None:
+    role = Hangup()
+    promised: list[float] = []
+
+    def promise(config: dict[str, Any]) -> dict[str, Any]:
+        promised.append(config["law"]["C1"][0])
+        return {"holds": False}
+
+    reload_on_hangup(
+        cast(Role, role), load(), lambda: load(overrides=["law.C1=[1.0, 1.0, 1.0]"]), lambda _: None, promise
+    )
+    assert role.reload is not None
+    act = role.reload()
+    assert promised == [1.0]
+    act()
+    assert (promised, role.certificate) == ([1.0], {"holds": False})
 
 
 # Points out of a file
