@@ -47,9 +47,7 @@ class RecorderSettings(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     directory: Path = Field(default=Path("logs"), description="folder for logs that are not given a name")
-    path: Path | None = Field(
-        default=None, description="the log's first file; a new one named by the time if left out"
-    )
+    path: Path | None = Field(default=None, description="the log's first file; a new one named by the time if left out")
     chunk_s: float = Field(
         default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut costs [s]"
     )
