@@ -113,7 +113,7 @@ class BlockController(Controller):
         while since < n:  # until the next change, the same gains and the same plan
             self.follow(int(k[since]), changes)
             until = int(np.searchsorted(k, changes[0].tick)) if changes else n
-            self._lay_out(t[since:until], slice(since, min(until, n)))
+            self._lay_out(t[since:until], slice(since, until))
             since = until
         self._motions()
         if self.tick_index < 0:
