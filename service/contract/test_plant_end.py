@@ -33,7 +33,10 @@ def test_it_measures_at_its_rate_and_the_loop_tracks(hil: Hil) -> None:
     hil.run(3.0)
     figures = hil.log.figures
     rate = hil.settings.loop.rate_hz
-    assert figures.measurement.frames_per_s == pytest.approx(rate, rel=0.1)
+    # Ticks that a stall makes a plant end skip are never made up for. On a busy machine with five processes a sixth has
+    # been seen to go; a third less tells a plant that keeps another rate, and none may go faster.
+    assert figures.measurement.frames_per_s is not None
+    assert 0.67 * rate < figures.measurement.frames_per_s < 1.01 * rate
     assert figures.command.frames_per_s is not None
     assert figures.command.frames_per_s > rate / 2
     assert figures.max_error_deg is not None
