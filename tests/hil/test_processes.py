@@ -92,8 +92,8 @@ def test_a_demo_in_real_time_tracks_and_two_run_beside_each_other(tmp_path: Path
     for out, code in ended:
         assert code == 0
         figures = json.loads(out)
-        # 16 ticks short if the last frame was sent over 24 ms late: its four bits then stand for a later tick. Longer if
-        # the last tick was missed, for then the next one that comes ends the run: by at most the watchdog's 100 ms.
+        # 16 ticks short if the last frame was sent over 24 ms late: its four bits then stand for a later tick. Longer
+        # if the last tick was missed, for then the next one that comes ends the run: by at most the watchdog's 100 ms.
         assert 4.0 - 16 * 0.002 <= figures["duration_s"] <= 4.0 + 0.1
         # Two demos want six processes on two cores, so a share of the ticks may be late. The plant holds its last
         # command meanwhile; the error stays that of the reference's start plus quantization, some 2.5 degrees. Half
