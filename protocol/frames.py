@@ -21,6 +21,7 @@ from bitstruct.c import compile as compile_bits
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from protocol.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
+from protocol.transmit import Transmit
 
 COUNTER_BITS: Final = 4
 COUNTERS: Final = 1 << COUNTER_BITS
@@ -75,6 +76,7 @@ class WireSpec(BaseModel):
     )
     voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
     actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
+    transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
 
     @cached_property
     def measurement(self) -> FrameFormat:
@@ -93,6 +95,7 @@ class WireSpec(BaseModel):
             rate=self.rate.model_copy(update={"bits": out}),
             voltage=self.voltage.model_copy(update={"bits": inp}),
             actuators=self.actuators,
+            transmit=self.transmit,
         )
 
     def differences(self, other: WireSpec) -> list[str]:

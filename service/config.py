@@ -17,6 +17,7 @@ from pydantic_settings import (
     BaseSettings,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
+    SettingsError,
     TomlConfigSettingsSource,
 )
 
@@ -100,6 +101,8 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         return Configured(**_tree(overrides))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{file} is not TOML: {error}") from None
+    except SettingsError as error:  # a section in the environment is JSON
+        raise ConfigError(f"{error}: write its keys one by one, as {ENV_PREFIX}SECTION__KEY") from None
     except ValidationError as error:
         raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
 

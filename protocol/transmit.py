@@ -1,0 +1,84 @@
+"""When a frame is sent: every tick, or only when a level changes (Remark 3), with a heartbeat.
+
+What is quantized changes in steps, so a frame that says the same as the last one need not be sent: the other end holds
+the last levels, and nothing is lost. A heartbeat, at least every 15 ticks, tells that the sender still lives and keeps
+its 4-bit counter unmistakable. Where each frame is waited for, in lockstep, silence cannot be heard: there an empty
+frame stands for it, `SILENCE`, which says as much and is no frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+SILENCE: Final = b""
+"""Stands for a frame that is not sent because it would say what the last one said."""
+
+MOST_TICKS: Final = 15
+"""A counter of four bits tells ticks apart that are no further from each other."""
+
+Policy = Literal["periodic", "on_change"]
+
+
+class Transmit(BaseModel):
+    """What each end sends, and when. The word `on_change` alone stands for both directions."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    measurement: Policy = Field(default="periodic", description="measurement frames: every tick, or on a change")
+    command: Policy = Field(default="periodic", description="command frames: every tick, or on a change")
+    heartbeat_s: float = Field(
+        default=0.03,
+        gt=0,
+        le=1,
+        allow_inf_nan=False,
+        description="on_change: send at least this often, and at least every 15 ticks [s]",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_word(cls, value: Any) -> Any:
+        return {"measurement": value, "command": value} if isinstance(value, str) else value
+
+    def heartbeat_ticks(self, period_ns: int) -> int:
+        """The most ticks from one frame to the next, 1…15.
+
+        Args:
+            period_ns: Period of a tick [ns].
+        """
+        return max(1, min(MOST_TICKS, int(self.heartbeat_s * 1e9 / period_ns)))
+
+
+class Sender:
+    """Decides, tick by tick, whether a frame is to be sent.
+
+    Args:
+        policy: When frames are sent.
+        heartbeat: The most ticks from one frame to the next.
+    """
+
+    def __init__(self, policy: Policy, heartbeat: int) -> None:
+        self._always = policy == "periodic"
+        self._heartbeat = heartbeat
+        self._said: Sequence[float] | None = None
+        self._at = 0
+
+    def due(self, k: int, codes: Sequence[float]) -> bool:
+        """Whether a frame with these codes is to be sent at tick k; if so, it counts as sent.
+
+        Args:
+            k: Tick index, rising.
+            codes: What the frame would say; a sequence that nobody changes any more.
+        """
+        if self._always:
+            return True
+        if codes == self._said and k - self._at < self._heartbeat:
+            return False
+        self._said, self._at = codes, k
+        return True
+
+    def forget(self) -> None:
+        """A session begins: whatever comes is to be sent."""
+        self._said = None
