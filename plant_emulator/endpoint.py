@@ -1,8 +1,9 @@
 """The plant end of the loop, sans-I/O: measure → frame; frame → actuate; and the watchdog.
 
 It knows no socket and no clock: time is the tick index. Whoever owns it feeds it the newest command frame, once a tick,
-and sends what it returns. A command acts from the start of the period in which it arrived; when none has come in time
-the watchdog trips: the session ends, and the motors have 0 V until somebody arms the plant and a controller claims it.
+and sends what it returns. A command acts from the start of the period in which it arrived, and until another says
+something else; when none has come in time the watchdog trips: the session ends, and the motors have 0 V until somebody
+arms the plant and a controller claims it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from protocol.attitude import sent_vector
 from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
 from protocol.frames import COUNTERS, WireSpec
 from protocol.states import PlantState, PlantTrigger, TripCause
+from protocol.transmit import SILENCE, Sender
 
 
 class Endpoint(Tenancy):
@@ -57,6 +59,9 @@ class Endpoint(Tenancy):
         self._encode = [quantizer.encode for quantizer in self._quantizers]
         self._level = wire.voltage.quantizer().level
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
+        transmit = wire.transmit
+        self._sender = Sender(transmit.measurement, transmit.heartbeat_ticks(period_ns))
+        self._hears_silence = lockstep and transmit.command == "on_change"
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
         self.protect(watchdog_s, guard)
@@ -66,7 +71,8 @@ class Endpoint(Tenancy):
         self._unmeasured_yet = False
         self._fresh_tick = 0  # tick of the last fresh command, or of the grant
         self._unmeasured = [False] * COUNTERS  # whether the last measurement of each counter had no valid value
-        self._echo = -1  # the last fresh command's echo
+        self._said: tuple[float, ...] = ()  # codes of the last fresh command
+        self._echo = -1  # its echo
         self._answered = -1  # and the tick of the measurement that it answered
 
     def protect(self, watchdog_s: float, guard: Guard | None) -> None:
@@ -83,11 +89,13 @@ class Endpoint(Tenancy):
         """Let the time since the last tick pass under the newest command, and measure.
 
         Args:
-            frame: The newest command frame that came since the last tick, or None.
+            frame: The newest command frame that came since the last tick, or None; in lockstep SILENCE, if the
+                controller has nothing new to say.
             k: Tick index, rising; where it skips, the plant's time passes all the same. The very first only measures.
 
         Returns:
-            The measurement frame, or None while no session runs.
+            The measurement frame; SILENCE if there is none to send, because it would say what the last one said; None
+            while no session runs.
         """
         if self._tick >= 0:
             if frame is not None:
@@ -110,7 +118,7 @@ class Endpoint(Tenancy):
             return None
         codes = self._encoded(seen)
         self._unmeasured[self.counter] = codes is self._no_measurement
-        return self.wire.measurement.pack(self.counter, codes)
+        return self.wire.measurement.pack(self.counter, codes) if self._sender.due(k, codes) else SILENCE
 
     @property
     def ticked(self) -> int:
@@ -133,7 +141,10 @@ class Endpoint(Tenancy):
         """Act on a command frame if it is well-formed, newer than the last, and valid."""
         if self.session is None:
             return
-        read = self.wire.command.unpack(frame)
+        if frame == SILENCE and self._hears_silence and self._said:
+            read: tuple[int, tuple[float, ...]] | None = self.counter, self._said
+        else:
+            read = self.wire.command.unpack(frame)
         if read is None:
             self.refused += 1
             return
@@ -151,7 +162,7 @@ class Endpoint(Tenancy):
                 self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
                 return
         self._voltages = voltages
-        self._echo, self._answered = echo, answered
+        self._said, self._echo, self._answered = codes, echo, answered
         self._fresh_tick = self._tick
         self._machine.fire(PlantTrigger.COMMAND)
         self.accepted += 1
@@ -175,7 +186,8 @@ class Endpoint(Tenancy):
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
         self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
-        self._echo = self._answered = -1
+        self._said, self._echo, self._answered = (), -1, -1
+        self._sender.forget()
 
     def _rest(self) -> None:
         self._voltages = self._off

@@ -145,6 +145,8 @@ def _tree(overrides: Sequence[str]) -> dict[str, Any]:
         branch = tree
         for section in sections:
             branch = branch.setdefault(section, {})
+            if not isinstance(branch, dict):
+                raise ConfigError(f"--set gives {section} a value, and then {path.strip()}: set its keys one by one")
         branch[name] = _value(text.strip())
     return tree
 

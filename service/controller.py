@@ -1,7 +1,8 @@
 """The controller end of the loop, sans-I/O: measurement frame in, command frame out, at tick k.
 
 It knows no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
-run this one code path. The law's time is k times the period.
+run this one code path. The law's time is k times the period. Where a frame says nothing new and is not sent, silence
+stands for it: the law goes on with the levels it has.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from array import array
 from collections.abc import Callable, Sequence
 
 from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
-from protocol.frames import WireSpec
+from protocol.frames import COUNTERS, WireSpec
 from protocol.symbolic import Compiled
+from protocol.transmit import SILENCE, Sender
 from protocol.verbs import Change, Gains, Reference
 from service.law import LawSettings, law_function
 from service.reference import Motion, Plan
@@ -61,7 +63,9 @@ class Controller:
         self._first_motor = 3 - wire.actuators
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
         self._encode = [q.encode for q in self._voltage]
-        self._no_command = tuple(q.invalid for q in self._voltage)
+        self._no_command = [q.invalid for q in self._voltage]
+        self._sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(round(period * 1e9)))
+        self._held: Sequence[float] | None = None  # codes of the last measurement
         self._read, self._write = wire.measurement.unpack, wire.command.pack
         self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
         self._rate_level: Callable[[float], float] = wire.rate.quantizer().level
@@ -70,27 +74,42 @@ class Controller:
         """Answer a measurement.
 
         Args:
-            frame: The newest measurement frame, or None if none came since the last tick.
+            frame: The newest measurement frame; SILENCE if the plant sent none because its levels are what they were;
+                None if none came since the last tick.
             k: Tick index; the law's time is k·period.
 
         Returns:
-            The command frame that answers it; None if there is nothing to answer, which includes malformed bytes. A
-            measurement without a valid value is answered by a command without one: the plant then goes to 0 V.
+            The command frame that answers it; SILENCE if there is none to send, because it would say what the last one
+            said; None if there is nothing to answer, which includes malformed bytes. A measurement without a valid
+            value is answered by a command without one: the plant then goes to 0 V.
         """
         if frame is None:
             return None
+        if frame == SILENCE and self._held is not None:
+            return self.answer(k % COUNTERS, self._held, k)
         read = self._read(frame)
         if read is None:
             self.refused += 1
             return None
+        self._held = read[1]
         return self.answer(*read, k)
+
+    def hold(self, frame: bytes) -> None:
+        """Go on with the levels of a measurement that came after its tick was over; malformed bytes change nothing."""
+        read = self._read(frame)
+        if read is None:
+            self.refused += 1
+        else:
+            self._held = read[1]
 
     def answer(self, counter: int, codes: Sequence[float], k: int) -> bytes:
         """The command frame that answers a measurement with this counter and these codes; see `tick`."""
         voltages = self.compute(counter, codes, k)
         if voltages is None:
-            return self._write(counter, self._no_command)
-        return self._write(counter, [encode(u) for encode, u in zip(self._encode, voltages, strict=True)])
+            said: list[float] = self._no_command
+        else:
+            said = [encode(u) for encode, u in zip(self._encode, voltages, strict=True)]
+        return self._write(counter, said) if self._sender.due(k, said) else SILENCE
 
     def compute(self, counter: int, codes: Sequence[float], k: int) -> list[float] | None:
         """What `answer` sends, before quantization [V]; None if that has no valid value. Shape (actuators,)."""
@@ -117,11 +136,12 @@ class Controller:
         return voltages
 
     def attitude_of(self, frame: bytes) -> Quaternion | None:
-        """The attitude that a measurement frame says; None if it is malformed or says no valid value."""
+        """The attitude that a measurement says; None if it is malformed or says no valid value."""
         read = self._read(frame)
-        if read is None:
+        codes = self._held if frame == SILENCE else None if read is None else read[1]
+        if codes is None:
             return None
-        x, y, z = (self._attitude_level(code) for code in read[1][:3])
+        x, y, z = (self._attitude_level(code) for code in codes[:3])
         return received_quaternion(x, y, z, IDENTITY) if x + y + z == x + y + z else None
 
     def set_gains(self, gains: Gains) -> None:

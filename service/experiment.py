@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Plant
 from protocol.messages import Claim, Refusal
+from protocol.transmit import SILENCE
 from service.config import Settings
 from service.controller import Controller
 from service.figures import Figures, Score
@@ -43,16 +44,19 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
         raise ValueError(answer.reason)
 
     level = wire.voltage.quantizer().level
+    voltages: list[float] = []
     report_every = loop.ticks(1.0)
     measurement = endpoint.tick(None, 0)
     for k in _undisturbed(loop.ticks(duration_s)):
         command = controller.tick(measurement, k)
-        if command is None or (read := wire.command.unpack(command)) is None:
+        if command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
             raise ValueError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
-            score.error(k, controller.attitude_error)
-        score.command(k, [level(code) for code in read[1]])
+            score.error(k, controller.attitude_error, sent=measurement != SILENCE)
+        if read := wire.command.unpack(command):
+            voltages = [level(code) for code in read[1]]
+        score.command(k, voltages, sent=command != SILENCE)
         measurement = endpoint.tick(command, k + 1)
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)

@@ -68,13 +68,18 @@ class Score:
         self._error_tick = self._command_tick = 0
         self._error_square = self._command_square = 0.0
         self._errors = self._commands = 0
+        self._unsent_errors = self._unsent_commands = 0
         self._z_track = self._u_total = 0.0
         self._largest: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._largest_square = 0.0
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def error(self, k: int, error: Sequence[float]) -> None:
-        """The attitude error ε̃ at tick k; it stands until the next. Shape (3,)."""
+    def error(self, k: int, error: Sequence[float], *, sent: bool = True) -> None:
+        """The attitude error ε̃ at tick k; it stands until the next. Shape (3,).
+
+        It counts as a measurement frame if that was sent, and not if silence stood for it.
+        """
+        self._unsent_errors += not sent
         if self._first is None:
             self._first = k
         else:
@@ -87,11 +92,12 @@ class Score:
             self._largest, self._largest_square = self._last, self._error_square
         self._errors += 1
 
-    def command(self, k: int, voltages: Sequence[float]) -> None:
+    def command(self, k: int, voltages: Sequence[float], *, sent: bool = True) -> None:
         """The voltages [V] commanded at tick k; held until the next, or the watchdog. Shape (actuators,).
 
-        A command without a valid value puts the plant at 0 V.
+        A command without a valid value puts the plant at 0 V. It counts as a frame if that was sent.
         """
+        self._unsent_commands += not sent
         if self._commands:
             held = min(k - self._command_tick, self._longest_hold)
             self._u_total += self._command_square * (held * self._period)
@@ -99,6 +105,11 @@ class Score:
         square = sum(u * u for u in voltages)
         self._command_square = square if square == square else 0.0
         self._commands += 1
+
+    def unsent(self, measurements: int, commands: int) -> None:
+        """So many of the ticks that were told had no frame, because it would have said what the last one said."""
+        self._unsent_errors += measurements
+        self._unsent_commands += commands
 
     def errors(self, k: Integers, errors: Floats) -> None:
         """`error` of one tick after another: the same sums, in the same order. Shapes (n,) and (n, 3)."""
@@ -159,8 +170,8 @@ class Score:
             u_total=self._u_total + self._command_square * self._period if self._commands else None,
             max_error_deg=degrees(angle(*self._largest)) if self._errors else None,
             final_error_deg=degrees(angle(*self._last)) if self._errors else None,
-            measurement=_stream(self._errors, self._wire.measurement, duration),
-            command=_stream(self._commands, self._wire.command, duration),
+            measurement=_stream(self._errors - self._unsent_errors, self._wire.measurement, duration),
+            command=_stream(self._commands - self._unsent_commands, self._wire.command, duration),
             skipped_ticks=self.ticks - self._commands if self._errors else None,
             latency_us=latency,
             log=log,
