@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import time
 from threading import Condition
-from typing import Final
+from typing import Final, Literal
 
 from plant_emulator.presence import Presence
 from plant_emulator.settings import PlantSettings
 from plant_emulator.tenancy import Tenancy
 from protocol.can_link import HEARTBEAT_S, SILENT_S, CanLink, CanSettings, Heartbeat, fingerprint
 from protocol.clock import FIRST_COMMAND_S, LoopSettings, prepare_process
-from protocol.frames import WireSpec
+from protocol.frames import COUNTERS, WireSpec
 from protocol.role import Role
 from protocol.states import PlantState, PlantTrigger, TripCause
+from protocol.transmit import SILENCE
 
 WAIT_S: Final = 0.01
 REOPEN_S: Final = 0.5
@@ -58,6 +59,9 @@ class Relay(Tenancy):
         """A frame from the bus; returned if it may pass."""
         if self.session is None:
             return None
+        if self._is_silence(frame, "measurement"):
+            self.counter = (self.counter + 1) % COUNTERS
+            return frame if self._begun else None
         read = self.wire.measurement.unpack(frame)
         if read is None:
             self.refused += 1
@@ -73,6 +77,9 @@ class Relay(Tenancy):
         """
         if self.session is None:
             return None
+        if self._is_silence(frame, "command"):
+            self._fresh_ns = now_ns
+            return frame
         read = self.wire.command.unpack(frame)
         if read is None:
             self.refused += 1
@@ -93,6 +100,9 @@ class Relay(Tenancy):
             self._trip(TripCause.COMMAND_TIMEOUT, f"no first command within {FIRST_COMMAND_S:g} s")
         elif self.state is PlantState.DRIVEN and waited_ns > self._watchdog_ns and not self.lockstep:
             self._trip(TripCause.COMMAND_TIMEOUT, f"no fresh command for {waited_ns * 1e-6:.0f} ms")
+
+    def _is_silence(self, frame: bytes, direction: Literal["measurement", "command"]) -> bool:
+        return frame == SILENCE and self.lockstep and getattr(self.wire.transmit, direction) == "on_change"
 
     def _begin(self) -> None:
         self.number = (self.number + 1) % SESSIONS

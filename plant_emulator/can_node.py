@@ -82,9 +82,10 @@ class CanFront(Front):
             self.follow_session()
 
     def send(self, frame: bytes, counter: int) -> None:
-        """Send a measurement frame of the session."""
+        """Send a measurement frame of the session; SILENCE only where it could not be heard, in lockstep."""
         del counter
-        self._bus.send(frame)
+        if frame or self._loop.lockstep:
+            self._bus.send(frame)
 
     def arrived(self, arrival: Arrival) -> bool:
         """Every command that comes is in time: a bus keeps none back."""

@@ -19,6 +19,7 @@ from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
 from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.states import TripCause
+from protocol.transmit import SILENCE
 
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6
@@ -88,7 +89,11 @@ class Driver:
             skipped = grid.skipped if grid else 0
             k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
             timing.woke(grid.due_ns if grid else time.monotonic_ns())
+            before = self.endpoint.session
             front.take_inbox()
+            if grid and self.endpoint.session not in (None, before):
+                # To grant took its time, and a session's first measurement tells the controller where the grid is.
+                k, skipped = grid.wait(), grid.skipped
             self._tick(self._command(), k)
             if self.endpoint.session:
                 front.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
@@ -119,8 +124,7 @@ class Driver:
         frame = self.endpoint.tick(arrival.frame if arrival is not None and in_time else None, k)
         echo = None
         for sent in self._outgoing(frame):
-            read = self.endpoint.wire.measurement.unpack(sent)
-            echo = None if read is None else read[0]
+            echo = self.endpoint.counter if sent == SILENCE else self.endpoint.wire.measurement.counter(sent)
             self._front.send(sent, self.endpoint.counter if echo is None else echo)
         self._k = k
         self._front.after_tick(k)

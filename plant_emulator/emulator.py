@@ -22,6 +22,7 @@ from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.messages import Truth
 from protocol.role import Role
+from protocol.transmit import SILENCE
 from protocol.verbs import Advance, Answer, Inject
 
 
@@ -56,13 +57,16 @@ class Emulator(Driver):
         if self._commands.idle:
             return arrival
         frame, sent_ns = (arrival.frame, arrival.published_ns) if arrival else (None, 0)
-        passed = self._commands.passes(frame, self._faulty.time, sent_ns)
-        return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns) if passed else None
+        passed = self._commands.passes(frame or None, self._faulty.time, sent_ns)
+        if not passed:  # silence is no frame: nothing befalls it
+            return arrival if frame == SILENCE else None
+        return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns)
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
         if self._measurements.idle:
             return super()._outgoing(frame)
-        return self._measurements.passes(frame, self._faulty.time)
+        passed = self._measurements.passes(frame or None, self._faulty.time)
+        return [SILENCE] if frame == SILENCE and not passed else passed
 
 
 class EmulatorOnZenoh(Emulator):

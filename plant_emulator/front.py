@@ -41,7 +41,7 @@ class Front(ABC):
 
     @abstractmethod
     def send(self, frame: bytes, counter: int) -> None:
-        """Send a measurement frame of the session."""
+        """Send a measurement frame of the session; SILENCE only where it could not be heard, in lockstep."""
 
     @abstractmethod
     def arrived(self, arrival: Arrival) -> bool:

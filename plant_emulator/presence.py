@@ -20,6 +20,7 @@ from protocol.frames import COUNTERS
 from protocol.links import Arrival, Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
 from protocol.role import Role
+from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
@@ -52,6 +53,7 @@ class Presence(Front):
         self.late = 0
         self._latency = RollingHistogram()
         self._sent_at = [0] * COUNTERS
+        self._sparse = endpoint.wire.transmit.measurement == "on_change"
         self._sent = self._received = 0
         self._told_state = endpoint.state
         self._since = _now() if endpoint.cause else None
@@ -81,11 +83,16 @@ class Presence(Front):
             self.follow_session()
 
     def send(self, frame: bytes, counter: int) -> None:
-        """Send a measurement frame of the session."""
-        if self._link is not None:
-            self._sent_at[counter] = time.monotonic_ns()
+        """Send a measurement frame of the session; silence is sent only where it could not be heard, in lockstep."""
+        if self._link is None:
+            return
+        if self._sparse:
+            for ahead in range(1, COUNTERS // 2):
+                self._sent_at[(counter + ahead) % COUNTERS] = 0  # of these nothing was sent yet
+        self._sent_at[counter] = time.monotonic_ns() if frame else 0
+        if frame or self._loop.lockstep:
             self._link.send(frame)
-            self._sent += 1
+        self._sent += frame != SILENCE
 
     def arrived(self, arrival: Arrival) -> bool:
         """Keep count of a command frame, and of how long it took. Whether it came in time to be acted upon.
@@ -94,7 +101,7 @@ class Presence(Front):
         publication can. That is never before the publication of the measurement it answers, on the plant's own clock,
         whatever the controller's clock says (hybrid logical clocks), so nothing that is in time is taken for late.
         """
-        self._received += 1
+        self._received += arrival.frame != SILENCE
         late_ns = time.time_ns() - arrival.published_ns
         if late_ns > self._latest_ns and not self._loop.lockstep:
             text = f"commands come {late_ns * 1e-6:.0f} ms after they were sent: refused"
@@ -102,8 +109,8 @@ class Presence(Front):
             self.late += 1
             return False
         read = self._endpoint.wire.command.unpack(arrival.frame)
-        if read is not None and (elapsed := arrival.at_ns - self._sent_at[read[0]]) > 0:
-            self._latency.add(elapsed)
+        if read is not None and (sent_at := self._sent_at[read[0]]) and arrival.at_ns > sent_at:
+            self._latency.add(arrival.at_ns - sent_at)
         return True
 
     def after_tick(self, k: int) -> None:

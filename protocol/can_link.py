@@ -27,6 +27,7 @@ from protocol.frames import FrameFormat, WireSpec
 from protocol.links import Arrival, Link, Mailbox
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.states import PlantState, TripCause
+from protocol.transmit import SILENCE
 
 MEASUREMENT_ID: Final = 0x100
 COMMAND_ID: Final = 0x200
@@ -160,6 +161,8 @@ class CanLink(Link):
         self._beat_id = (PLANT_HEARTBEAT_ID if plant else CONTROLLER_HEARTBEAT_ID) + settings.node
         self._heard_id = (CONTROLLER_HEARTBEAT_ID if plant else PLANT_HEARTBEAT_ID) + settings.node
         self._receives = wire.command if plant else wire.measurement
+        transmit = wire.transmit
+        self._may_be_silent = (transmit.command if plant else transmit.measurement) == "on_change"
         self._mailbox = Mailbox(changed)
         self._unsent = 0
         self._open = False
@@ -278,6 +281,10 @@ class CanLink(Link):
         now = time.monotonic_ns()
         if identifier == self._receive_id:
             size = self._receives.size
+            if data == SILENCE and self._may_be_silent:
+                self.heard_ns = now
+                self._mailbox.put(data, time.time_ns())
+                return
             if len(data) < size or any(data[size:]) or (len(data) != size and size <= CLASSIC_BYTES):
                 self.refused += 1
                 return

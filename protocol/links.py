@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from threading import Condition
 from typing import NamedTuple
 
@@ -81,38 +82,38 @@ class Link(ABC):
 
 
 class Mailbox:
-    """A slot for one frame, written by a receiving thread and read by the loop. The newest wins.
+    """A slot for a frame, written by a receiving thread and read by the loop. The newest wins.
 
     Args:
         changed: Notified when a frame comes; one of its own if None. Several slots may share one.
+        depth: How many frames it holds, for who must know of each that came; the oldest is taken first.
     """
 
-    def __init__(self, changed: Condition | None = None) -> None:
+    def __init__(self, changed: Condition | None = None, depth: int = 1) -> None:
         self._changed = changed or Condition()
-        self._arrival: Arrival | None = None
+        self._arrivals: deque[Arrival] = deque(maxlen=depth)
 
     def put(self, frame: bytes, published_ns: int = 0) -> None:
-        """Put a frame in the slot, in place of one that may be there."""
+        """Put a frame in the slot, in place of the oldest if it is full."""
         arrival = Arrival(frame, time.monotonic_ns(), published_ns)
         with self._changed:
-            self._arrival = arrival
+            self._arrivals.append(arrival)
             self._changed.notify()
 
     @property
     def pending(self) -> bool:
         """Whether there is something in the slot."""
-        return self._arrival is not None
+        return bool(self._arrivals)
 
     def take(self) -> Arrival | None:
-        """Empty the slot."""
+        """Take a frame out of the slot."""
         with self._changed:
-            arrival, self._arrival = self._arrival, None
-        return arrival
+            return self._arrivals.popleft() if self._arrivals else None
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """Empty the slot once something is in it, or return None after `timeout_s`."""
+        """Take a frame out of the slot once something is in it, or return None after `timeout_s`."""
         with self._changed:
-            if self._arrival is None:
+            if not self._arrivals:
                 self._changed.wait(timeout_s)
             return self.take()
 

@@ -188,6 +188,21 @@ class Event(Message):
     session: str | None = None
 
 
+class Lapse(Message):
+    """Where a controller that hears silence on a clock did not compute a tick with the levels that were the plant's.
+
+    With these, the frames and the changes, a log of such a session can be computed again.
+    """
+
+    session: str
+    kind: Literal["late", "missed"] = Field(
+        description="late: the measurement of this tick was first used some ticks later; missed: so many ticks from "
+        "this one on were not computed"
+    )
+    tick: int
+    ticks: int = Field(ge=1, description="how many ticks")
+
+
 class Loss(Message):
     """Messages of one key that the recorder knows are not in the log."""
 

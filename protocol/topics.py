@@ -57,6 +57,7 @@ TOPICS: Final = {
         Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),
         Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", "Telemetry"),
         Topic("change", "change", "json", "controller", "when something changes", "Change"),
+        Topic("lapse", "lapse", "json", "controller", "when a measurement comes late", "Lapse"),
         Topic("reference", "reference", "json", "operator", "as it streams", "Setpoint"),
         Topic("truth", "truth", "json", "plant", "truth_rate", "Truth"),
         Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", "Status"),

@@ -12,10 +12,11 @@ from pydantic import ValidationError
 from protocol import topics
 from protocol.clock import LoopSettings
 from protocol.frames import WireSpec
-from protocol.links import ZenohLink
+from protocol.links import Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release
 from protocol.role import Role
 from protocol.verbs import Answer
+from service.hearing import MAILBOX
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -60,6 +61,7 @@ class Claimant:
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lossless=self._loop.lockstep,
+            mailbox=Mailbox(depth=MAILBOX if self._wire.transmit.measurement == "on_change" else 1),
             numbers=role.numbers,
         )
         answer = self._ask(claim)

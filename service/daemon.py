@@ -1,10 +1,9 @@
 """The controller process: claim a vehicle, then wait → tick → send → account, until told to stop.
 
-A tick is due when its measurement arrives, so that the plant's clock leads; or, with `pace = "clock"`, on a grid of its
-own, which takes the newest measurement. In lockstep the very same loop runs as fast as the plant asks. Whenever the
-daemon has no session it claims again, four times a second, so either end may start first and either may be restarted.
-When measurements stop coming for longer than `stale_s` it gives the session up and says nothing more; the plant's
-watchdog does the rest.
+What a tick is, hearing.py says; in lockstep the very same loop runs as fast as the plant asks. Whenever the daemon has
+no session it claims again, four times a second, so either end may start first and either may be restarted. When
+measurements stop coming for longer than `stale_s` it gives the session up and says nothing more; the plant's watchdog
+does the rest.
 """
 
 from __future__ import annotations
@@ -13,22 +12,24 @@ import os
 import time
 import uuid
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Literal
 
 import zenoh
 from pydantic import ValidationError
 
 from protocol import topics
-from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, TickGrid, prepare_process
+from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, prepare_process
 from protocol.errors import AeroloopError
-from protocol.frames import TickCounter, WireSpec
-from protocol.links import Arrival, ZenohLink
-from protocol.messages import Status, Telemetry, report, summary
+from protocol.frames import WireSpec
+from protocol.links import ZenohLink
+from protocol.messages import Lapse, Status, Telemetry, report, summary
 from protocol.role import Role
 from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
+from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask, Reference
 from service.claimant import Claimant
 from service.controller import Controller
+from service.hearing import Heard, Hearing
 from service.law import LawSettings
 from service.live import Live
 from service.settings import ControllerSettings
@@ -82,13 +83,12 @@ class Daemon:
         self._claimant = Claimant(role, loop, wire, auto_arm=settings.auto_arm)
         self._live = Live(role, law, reference, settings, rolls=wire.actuators == 3)
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
-        self._grid: TickGrid | None = None
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
         self._recorders = 0
         self._plant: Status | None = None
         self._granted = False  # whether the plant's status has ever named this session
         self._lost = ""
-        self._sent = self._received = self._skipped = self._refused = self._saturated = 0
+        self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = 0
         self._notes: list[str] = []
         self._timing: LoopTiming | None = None
         self._age = RollingHistogram()
@@ -102,8 +102,6 @@ class Daemon:
         if not self._loop.lockstep:
             self._notes = prepare_process(self._loop)
             self._timing = LoopTiming()
-            if self._settings.pace == "clock":
-                self._grid = TickGrid(self._loop.period_ns)
         role = self._role
         self._live.serve()
         role.serve("stand_down", Ask, lambda _: self._stand_down)
@@ -137,36 +135,36 @@ class Daemon:
             self._publish_status()
 
     def _run(self, link: ZenohLink) -> bool:
-        """One session: a tick for every measurement. True once the duration is over, False if the session was lost.
-
-        The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
-        """
+        """One session: a tick for every one of the plant's. True once the duration is over, False if it was lost."""
         controller, live, timing = self._controller, self._live, self._timing
-        ticks = TickCounter(self._loop.period_ns, lockstep=self._loop.lockstep)
-        k, heard = -1, time.monotonic()
+        own_grid = self._settings.pace == "clock" and not self._loop.lockstep
+        hearing = Hearing(link, self._loop, self._wire, own_grid=own_grid)
+        k, last = -1, time.monotonic()
         while self._may_go_on() and (self._last_tick is None or k < self._last_tick):
-            arrival = self._next(link)
-            if arrival is None:
-                if (reason := self._is_lost(time.monotonic() - heard)) is not None:
+            heard = hearing.next(min(WAIT_S, self._stale_s))
+            if heard is None or heard.published_ns is None:
+                if (reason := self._is_lost(time.monotonic() - last)) is not None:
                     return self._lose(reason)
+            else:
+                last = time.monotonic()
+                self._age.add(max(0, time.time_ns() - heard.published_ns))
+            if heard is None:
+                continue
+            if heard.late:
+                self._hold(heard, k)
                 continue
             if timing:
-                timing.woke(self._grid.due_ns if self._grid else arrival.at_ns)
-            heard = time.monotonic()
-            self._age.add(max(0, time.time_ns() - arrival.published_ns))
-            read = self._wire.measurement.unpack(arrival.frame)
-            # What is malformed counts as the measurement that was due, and is refused by the controller.
-            measured = k + 1 if read is None else ticks.advance(read[0], arrival.published_ns)
-            if measured is None:
-                continue
-            live.before_tick(measured, arrival.frame)
+                timing.woke(heard.due_ns)
+            live.before_tick(heard.tick, heard.frame)
             if not self._may_go_on():
                 break
-            command = controller.tick(arrival.frame, measured)
-            if command is not None:
+            command = controller.tick(heard.frame, heard.tick)
+            if command or (command is not None and self._loop.lockstep):
                 link.send(command)
-            self._account(command, measured, max(0, measured - k - 1))
-            k = measured
+            if heard.missed and hearing.must_tell:
+                self._lapse("missed", k + 1, heard.missed)
+            k = heard.tick
+            self._account(command, heard)
             if timing:
                 timing.done()
         return self._may_go_on()
@@ -174,20 +172,25 @@ class Daemon:
     def _may_go_on(self) -> bool:
         return not self._role.stop.is_set() and self._machine.state not in (State.HOLDING, State.FAULTED)
 
-    def _next(self, link: ZenohLink) -> Arrival | None:
-        """The measurement of the next tick, or None if none has come by then."""
-        if self._grid is None:
-            return link.wait(min(WAIT_S, self._stale_s))
-        self._grid.wait()
-        return link.take()
-
-    def _account(self, command: bytes | None, measured: int, missed: int) -> None:
+    def _hold(self, heard: Heard, k: int) -> None:
+        """A measurement came when tick k, its own or a later one, was over: the next tick has its levels."""
         self._received += 1
-        self._skipped += missed
-        if missed >= STALL_TICKS:
-            self._role.warn("stall", "fault", f"{missed} ticks missed at once", self._claimant.session)
+        self._controller.hold(heard.frame)
+        self._lapse("late", heard.tick, k + 1 - heard.tick)
+
+    def _lapse(self, kind: Literal["late", "missed"], tick: int, ticks: int) -> None:
+        assert self._claimant.session is not None
+        self._role.publish("lapse", Lapse(session=self._claimant.session, kind=kind, tick=tick, ticks=ticks))
+
+    def _account(self, command: bytes | None, heard: Heard) -> None:
+        measured = heard.tick
+        self._ticks += 1
+        self._received += heard.frame != SILENCE
+        self._skipped += heard.missed
+        if heard.missed >= STALL_TICKS:
+            self._role.warn("stall", "fault", f"{heard.missed} ticks missed at once", self._claimant.session)
         if command is not None:
-            self._sent += 1
+            self._sent += command != SILENCE
             self._follow(measured)
         if self._controller.tick_index == measured and measured % self._telemetry_every == 0:
             self._publish_telemetry()
@@ -329,8 +332,8 @@ class Daemon:
                 state=self._machine.state,
                 session=self._claimant.session,
                 uptime_s=self._role.uptime_s,
-                ticks=self._received,
-                rate_hz=(self._received - self._status_ticks) / (now - self._status_time),
+                ticks=self._ticks,
+                rate_hz=(self._ticks - self._status_ticks) / (now - self._status_time),
                 skipped=self._skipped,
                 received=self._received,
                 sent=self._sent,
@@ -341,7 +344,7 @@ class Daemon:
                 notes=self._notes,
             )
         )
-        self._status_ticks, self._status_time = self._received, now
+        self._status_ticks, self._status_time = self._ticks, now
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
 

@@ -12,7 +12,8 @@ from pydantic import ValidationError
 
 from protocol import topics
 from protocol.errors import AeroloopError
-from protocol.messages import Contract
+from protocol.messages import Contract, Lapse
+from protocol.topics import Address
 from protocol.verbs import Change
 from service.config import Settings, from_contract
 from service.log.mcap_index import skim
@@ -34,6 +35,8 @@ from service.log.mcap_records import (
 
 METADATA_PREFIX: Final = "aeroloop."
 
+_TOLD: Final = ("change", "lapse")
+
 T = TypeVar("T")
 
 Which = tuple[str, str]
@@ -54,6 +57,7 @@ class LogFiles:
         paths: The files, in the order of their first messages.
         contracts: Who took part, by role; the last of each.
         changes: What controllers followed from which tick on, by vehicle and session.
+        lapses: Where controllers that hear silence did not compute with the plant's levels, likewise.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
 
@@ -64,9 +68,10 @@ class LogFiles:
     def __init__(self, paths: Sequence[Path]) -> None:
         self.contracts: dict[str, Contract] = {}
         self.changes: dict[Which, list[Change]] = {}
+        self.lapses: dict[Which, list[Lapse]] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
-        self._told: set[tuple[str, bytes]] = set()  # changes, as vehicle and JSON
+        self._told: set[tuple[str, bytes]] = set()  # changes and lapses, as vehicle and JSON
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
         for changes in self.changes.values():
@@ -121,23 +126,27 @@ class LogFiles:
                 self.damages[path] = damages
 
     def _prelude(self, path: Path) -> int:
-        """Gather contracts and changes, which may stand anywhere in a file. Returns the time of its first message."""
+        """Gather contracts, changes and lapses, which may stand anywhere in a file.
+
+        Returns:
+            The time of its first message.
+        """
         first = 0
-        changes: dict[int, str] = {}
+        told: dict[int, Address] = {}
         damages: list[Damage] = []
         try:
-            for record in skim(path, _is_change) or chain(summary(path), records(path, damages)):
+            for record in skim(path, _is_told) or chain(summary(path), records(path, damages)):
                 if record.opcode == MESSAGE:
-                    if changes or not first:
+                    if told or not first:
                         message = Message.read(record.content)
                         first = first or message.publish_time
-                        if message.channel in changes:
-                            self._follows(changes[message.channel], message.data)
+                        if message.channel in told:
+                            self._tells(told[message.channel], message.data)
                 elif record.opcode == CHANNEL:
                     channel = Channel.read(record.content)
                     key = topics.read_key(channel.topic)
-                    if key is not None and key.topic.name == "change":
-                        changes[channel.id] = key.vehicle
+                    if key is not None and key.topic.name in _TOLD:
+                        told[channel.id] = key
                 elif record.opcode == METADATA:
                     name, entries = metadata(record.content)
                     if name == CONTRACT_METADATA:
@@ -145,7 +154,7 @@ class LogFiles:
                         self.contracts[contract.role] = contract
                     elif name == CHANGE_METADATA:
                         if key := topics.read_key(entries["key"]):
-                            self._follows(key.vehicle, entries["json"])
+                            self._tells(key, entries["json"].encode())
                     elif name.startswith(METADATA_PREFIX) and "json" in entries:
                         said = json.loads(entries["json"])
                         self.metadata[name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
@@ -159,18 +168,22 @@ class LogFiles:
             self.damages[path] = damages
         return first
 
-    def _follows(self, vehicle: str, text: str | bytes) -> None:
-        """Add a change; the files of a rotated run tell the same one again."""
-        told = vehicle, text if isinstance(text, bytes) else text.encode()
-        if told not in self._told:
-            self._told.add(told)
+    def _tells(self, key: Address, text: bytes) -> None:
+        """Add a change or a lapse; the files of a rotated run tell the same change again."""
+        if (key.vehicle, text) in self._told:
+            return
+        self._told.add((key.vehicle, text))
+        if key.topic.name == "lapse":
+            lapse = Lapse.model_validate_json(text)
+            self.lapses.setdefault((key.vehicle, lapse.session), []).append(lapse)
+        else:
             change = Change.model_validate_json(text)
-            self.changes.setdefault((vehicle, change.session), []).append(change)
+            self.changes.setdefault((key.vehicle, change.session), []).append(change)
 
 
-def _is_change(key: str) -> bool:
+def _is_told(key: str) -> bool:
     address = topics.read_key(key)
-    return address is not None and address.topic.name == "change"
+    return address is not None and address.topic.name in _TOLD
 
 
 def _share_of(progress: Callable[[float], None] | None, before: int, size: int) -> Callable[[int], None] | None:

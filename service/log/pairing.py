@@ -2,7 +2,8 @@
 
 The law's tick is not in a frame, only its counter modulo 16. Telemetry says both now and then, and the session's first
 tick always; from there the counter is unwrapped, over gaps with the help of the times of publication. Those times also
-say which measurement a command answers: the latest before it that had its echo for a counter, as for the plant.
+say which measurement a command answers: the latest before it that had its echo for a counter, as for the plant. Where
+an end sends only what is new, filling.py gives a frame for every tick first.
 """
 
 from __future__ import annotations
@@ -10,30 +11,23 @@ from __future__ import annotations
 import gc
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
 from protocol.clock import LoopSettings
 from protocol.frames import COUNTERS, TickCounter, WireSpec
-from protocol.messages import Telemetry
+from protocol.messages import Lapse, Telemetry
 from protocol.topics import Address
 from service.log.files import Which
+from service.log.filling import Filler, Lapses, Read
 
 MAX_WAITING: Final = 4096
 """Measurements kept while no telemetry has yet said which tick they are."""
 
 _NEVER_NS: Final = 1 << 64
 """Later than any time of publication."""
-
-
-class Read(NamedTuple):
-    """A frame out of the log that is not malformed."""
-
-    counter: int
-    frame: bytes
-    published_ns: int
 
 
 class Pair(NamedTuple):
@@ -50,20 +44,28 @@ class Pairing(ABC):
     Args:
         wire: How its frames are read.
         loop: Its grid.
+        lapses: Where its controller did not compute with the plant's levels.
 
     Attributes:
         malformed: Frames so far that could not be read.
     """
 
-    def __init__(self, wire: WireSpec, loop: LoopSettings) -> None:
+    def __init__(self, wire: WireSpec, loop: LoopSettings, lapses: Sequence[Lapse] = ()) -> None:
         self._wire = wire
         self._measurement_counter, self._command_counter = wire.measurement.counter, wire.command.counter
+        transmit = wire.transmit
+        self._fill_measurements = (
+            Filler(wire.measurement, loop, on_grid=True) if transmit.measurement == "on_change" else None
+        )
+        self._fill_commands = Filler(wire.command, loop, on_grid=False) if transmit.command == "on_change" else None
+        self._lapses = Lapses(lapses) if lapses else None
         self._loop = loop
         self._measured: deque[Read] = deque(maxlen=MAX_WAITING)  # not answered yet
         self._commands: deque[Read] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
         self._pairs: deque[Pair] = deque(maxlen=MAX_WAITING)  # whose tick is not known yet
         self._anchors: deque[tuple[Telemetry, int]] = deque(maxlen=MAX_WAITING)  # and what could tell it
         self._ticks: TickCounter | None = None  # once it is known where it starts
+        self._last_counter = -1  # of the measurement that was answered last
         self.malformed = 0
 
     @property
@@ -89,28 +91,49 @@ class Pairing(ABC):
 
     def measurement(self, frame: bytes, published_ns: int) -> None:
         """A measurement frame; commands that were published before it can now be told which tick they answer."""
+        if self._fill_measurements is not None:
+            self._filled(self._fill_measurements.reads(frame, published_ns), self._take_measurement)
+            return
         counter = self._measurement_counter(frame)
         if counter is None:
             self.malformed += 1
             return
-        self.measured(frame, published_ns)
-        if self._commands:
-            self._answer(published_ns)
-        self._measured.append(Read(counter, frame, published_ns))
+        self._take_measurement(Read(counter, frame, published_ns, published_ns))
 
     def command(self, frame: bytes, published_ns: int) -> None:
         """A command frame. The recorder has it from another link than the measurements, so it may come before them."""
+        if self._fill_commands is not None:
+            self._filled(self._fill_commands.reads(frame, published_ns), self._take_command)
+            return
         counter = self._command_counter(frame)
         if counter is None:
             self.malformed += 1
             return
-        self.commanded(frame)
-        self._commands.append(Read(counter, frame, published_ns))
+        self._take_command(Read(counter, frame, published_ns, published_ns))
 
     def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
         """Which tick a counter stood for; the first that can be matched tells it for the whole session."""
         if self._ticks is None:
             self._anchors.append((telemetry, published_ns))
+
+    def _filled(self, reads: list[Read] | None, take: Callable[[Read], None]) -> None:
+        if reads is None:
+            self.malformed += 1
+            return
+        for read in reads:
+            take(read)
+
+    def _take_measurement(self, read: Read) -> None:
+        if read.sent:
+            self.measured(read.frame, read.published_ns)
+        if self._commands:
+            self._answer(read.since_ns)
+        self._measured.append(read)
+
+    def _take_command(self, read: Read) -> None:
+        if read.sent:
+            self.commanded(read.frame)
+        self._commands.append(read)
 
     def finish(self) -> None:
         """No more is to come: what still waits is judged by what there is."""
@@ -125,19 +148,36 @@ class Pairing(ABC):
         commands, measured = self._commands, self._measured
         while commands and commands[0].published_ns < until_ns:
             command = commands.popleft()
-            echo, _, published_ns = command
-            found = len(measured) - 1
-            while found >= 0 and (measured[found].counter != echo or measured[found].published_ns >= published_ns):
-                found -= 1
+            echo, published_ns = command.counter, command.published_ns
+            if command.sent:
+                found = len(measured) - 1
+                while found >= 0 and (measured[found].counter != echo or measured[found].since_ns >= published_ns):
+                    found -= 1
+            else:
+                found = self._next_with(echo)
             if found < 0:
                 continue  # answers what the log does not have, or repeats an answer
             before = [measured.popleft() for _ in range(found)] if found else []
             measurement = measured.popleft()
+            self._last_counter = measurement.counter
             if self._ticks is not None:
                 self._place(self._ticks, measurement, command, before)
             else:
                 self._pairs.append(Pair(measurement, command, before))
-                self._anchor(measurement.published_ns)
+                self._anchor(measurement.since_ns)
+
+    def _next_with(self, echo: int) -> int:
+        """Where the measurement is that a command would answer that was not sent; −1 if the plant skipped its tick.
+
+        Such a command has no time of its own, but it is of the first tick with its echo after the one answered last.
+        """
+        wanted, passed, before = (echo - self._last_counter - 1) % COUNTERS + 1, 0, self._last_counter
+        for found, read in enumerate(self._measured):
+            passed += (read.counter - before - 1) % COUNTERS + 1
+            if passed >= wanted:
+                return found if passed == wanted else -1
+            before = read.counter
+        return -1
 
     def _anchor(self, until_ns: int) -> None:
         """Match telemetry from before `until_ns` with the latest answered measurement before it with its counter."""
@@ -145,10 +185,7 @@ class Pairing(ABC):
             telemetry, published_ns = self._anchors.popleft()
             pairs = list(self._pairs)
             for i in reversed(range(len(pairs))):
-                if (
-                    pairs[i].measurement.published_ns < published_ns
-                    and pairs[i].measurement.counter == telemetry.counter
-                ):
+                if pairs[i].measurement.since_ns < published_ns and pairs[i].measurement.counter == telemetry.counter:
                     first = telemetry.tick
                     for pair in reversed(pairs[:i]):
                         first = _before(first, pair.measurement.counter)
@@ -174,8 +211,14 @@ class Pairing(ABC):
                     break
                 over.append((tick, read))
             for missed, read in reversed(over):
+                if self._lapses is not None:
+                    self._lapses.at(missed, read)
                 self.passed_over(missed, read)
-        self.answered(k, measurement, command)
+        used = measurement if self._lapses is None else self._lapses.at(k, measurement)
+        if used is None:
+            self.passed_over(k, measurement)
+        else:
+            self.answered(k, used, command)
 
 
 def _before(tick: int, counter: int) -> int:

@@ -16,14 +16,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.frames import SignalSpec
-from protocol.messages import Telemetry
+from protocol.messages import Lapse, Telemetry
 from protocol.verbs import Change
 from service.config import Settings, load_over
 from service.figures import added, squares
 from service.log.blocks import BlockController
 from service.log.codes import codes_in, encoded, levels
 from service.log.files import LogFiles, Which
-from service.log.pairing import MAX_WAITING, Pairing, Read, Sessions, without_collections
+from service.log.filling import Read
+from service.log.pairing import MAX_WAITING, Pairing, Sessions, without_collections
 from service.log.report import Array
 from service.log.tallies import BLOCK
 
@@ -65,10 +66,11 @@ class Replayer(Pairing):
     Args:
         settings: The controller's configuration.
         changes: What it followed from which tick on, in order.
+        lapses: Where it did not compute with the plant's levels.
     """
 
-    def __init__(self, settings: Settings, changes: Sequence[Change]) -> None:
-        super().__init__(settings.wire, settings.loop)
+    def __init__(self, settings: Settings, changes: Sequence[Change], lapses: Sequence[Lapse] = ()) -> None:
+        super().__init__(settings.wire, settings.loop, lapses)
         self._controller = BlockController(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._changes = deque(changes)
         self._period = settings.loop.period
@@ -218,7 +220,7 @@ def replay(
             changes = [change.model_copy(update={"gains": None}) for change in changes]
         if own_reference:
             changes = [change.model_copy(update={"reference": None}) for change in changes]
-        return Replayer(settings, changes)
+        return Replayer(settings, changes, files.lapses.get(which, ()))
 
     sessions = Sessions(replayer)
     for take, payload, published_ns in files.routed(sessions.route, progress):

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from protocol.messages import Event, Loss, Status, Telemetry, Truth
+from protocol.messages import Event, Lapse, Loss, Status, Telemetry, Truth
 from protocol.topics import Address
 from protocol.verbs import Change
 from service.config import ConfigError, Settings
@@ -25,10 +25,11 @@ from service.figures import Figures, Score
 from service.log.blocks import BlockController
 from service.log.codes import codes_in, levels
 from service.log.files import LogFiles, ReviewError, Which
+from service.log.filling import Read
 from service.log.findings import facts_of, findings_of, name_of
 from service.log.limits import Limit
 from service.log.observe import Observer
-from service.log.pairing import Pairing, Read, Sessions, Taker, without_collections
+from service.log.pairing import Pairing, Sessions, Taker, without_collections
 from service.log.report import Findings, Report
 from service.log.story import Story
 from service.log.tallies import BLOCK
@@ -41,6 +42,7 @@ class Session(Pairing):
     Args:
         settings: The configuration of its controller.
         changes: What its controller followed from which tick on, in order.
+        lapses: Where it did not compute with the plant's levels.
         watch: Called with every tick, in order.
 
     Attributes:
@@ -49,9 +51,13 @@ class Session(Pairing):
     """
 
     def __init__(
-        self, settings: Settings, changes: Sequence[Change] = (), watch: Callable[[Tick], None] | None = None
+        self,
+        settings: Settings,
+        changes: Sequence[Change] = (),
+        lapses: Sequence[Lapse] = (),
+        watch: Callable[[Tick], None] | None = None,
     ) -> None:
-        super().__init__(settings.wire, settings.loop)
+        super().__init__(settings.wire, settings.loop, lapses)
         self.settings = settings
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
         self.observer = Observer(settings)
@@ -110,7 +116,10 @@ class Session(Pairing):
         computed = self._controller.compute_all(k, measured, self._changes)
         voltages = levels(wire.voltage, codes_in(wire.command, [read.frame for read in commands]))
         published = np.array([read.published_ns for read in measurements])
-        latency = np.where(answered, np.array([read.published_ns for read in commands]) - published, nan)
+        measured_now = np.array([read.sent for read in measurements])
+        commanded_now = np.array([read.sent for read in commands])
+        timed = answered & measured_now & commanded_now
+        latency = np.where(timed, np.array([read.published_ns for read in commands]) - published, nan)
         seen = Ticks(
             k,
             published,
@@ -123,9 +132,11 @@ class Session(Pairing):
             computed.rate_error,
             voltages,
         )
-        judged = seen.where(~np.isnan(computed.attitude[:, 0]))  # of a measurement without a valid value there is none
+        valid = ~np.isnan(computed.attitude[:, 0])  # of a measurement without a valid value there is none
+        judged = seen.where(valid)
         self.score.errors(judged.k, judged.attitude_error)
         self.score.commands(k[answered], voltages[answered])
+        self.score.unsent(int((valid & ~measured_now).sum()), int((answered & ~commanded_now).sum()))
         self.observer.answered(k[answered])
         self.observer.ticks(judged)
         if self._watch is not None:
@@ -253,7 +264,8 @@ def read(
         settings = files.settings
 
         def session(which: Which) -> Session:
-            return Session(settings, files.changes.get(which, ()), watch(which, settings) if watch else None)
+            told = files.changes.get(which, ()), files.lapses.get(which, ())
+            return Session(settings, *told, watch(which, settings) if watch else None)
 
         run = Run(session)
         for take, payload, published_ns in files.routed(run.route, progress):
