@@ -183,6 +183,8 @@ class Endpoint(Tenancy):
     def _begin(self) -> None:
         if self._guard is not None:
             self._guard.reset()
+        for quantizer in self._quantizers:
+            quantizer.reset()
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
         self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is

@@ -1,9 +1,9 @@
 """The DBC of one node: what every bit on the CAN bus means, for tools that know nothing of this project.
 
 A CAN payload is the wire frame byte for byte, so the whole file follows from the `WireSpec`: widths place the signals,
-and the quantizer gives factor, bounds and the code that says "no valid value". With half-step dead zone the level of
-code i is i·l, which is what a DBC can say. With any other it is not; the signal is then the bare code, and its comment
-has the formula. Many tools read DBC files as cp1252, so the text keeps to ASCII.
+and the quantizer gives factor, bounds and the code that says "no valid value". Uniform with half-step dead zone, with
+or without hysteresis, the level of code i is i·l, which is what a DBC can say. Otherwise it is not; the signal is then
+the bare code, and its comment has the formula. Many tools read DBC files as cp1252, so the text keeps to ASCII.
 
 Identifiers and lengths are those of `can_link`. cantools takes about half a second to import: import this module where
 it is used, not at a program's head.
@@ -33,6 +33,7 @@ from protocol.can_link import (
     number_of,
 )
 from protocol.frames import COUNTER_BITS, FrameFormat, SignalSpec, WireSpec
+from protocol.logarithmic import LogarithmicQuantizer
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
 from protocol.states import PlantState, TripCause
@@ -186,20 +187,20 @@ def _signal(quantity: _Quantity, at: int) -> Signal:
     comment, unit = quantity.comment, quantity.unit
     scale: float = 1
     choices: Choices | None = None
-    if not isinstance(quantizer, UniformQuantizer):
+    if not isinstance(quantizer, UniformQuantizer | LogarithmicQuantizer):
         width, top = 64, quantizer.limit
         comment += " IEEE 754 double; NaN says: no valid value."
     else:
         width, top = quantizer.bits, quantizer.top
         choices = OrderedDict([(quantizer.invalid, NO_VALID_VALUE)])
         comment += f" Quantized; code {quantizer.invalid} says: no valid value."
-        if isclose(quantizer.deadzone, quantizer.step / 2, rel_tol=_SAME_STEP):
+        formula = _formula(quantizer)
+        if formula is None:
             scale = quantizer.step
         else:
+            level, constants = formula
             comment += (
-                " This is the bare code i; the level is 0 for i = 0, else"
-                f" sgn(i) * (y0 + l/2 + (|i| - 1) * l) [{unit or 1}]"
-                f" with y0 = {quantizer.deadzone!r} and l = {quantizer.step!r}."
+                f" This is the bare code i; the level is 0 for i = 0, else {level} [{unit or 1}] with {constants}."
             )
             unit = ""
     return Signal(
@@ -214,6 +215,19 @@ def _signal(quantity: _Quantity, at: int) -> Signal:
         unit=unit,
         comment=comment,
     )
+
+
+def _formula(quantizer: UniformQuantizer | LogarithmicQuantizer) -> tuple[str, str] | None:
+    """The level of code i, and the constants in it; None if that is i times the step."""
+    if isinstance(quantizer, LogarithmicQuantizer):
+        return "sgn(i) * (e(|i| - 1) + e(|i|)) / 2", (
+            "e(k) = y0 * (yt / y0) ** (k / m) for k < m, else yt + (k - m) * l;"
+            f" y0 = {quantizer.deadzone!r}, yt = {quantizer.threshold!r},"
+            f" m = {quantizer.growing} and l = {quantizer.step!r}"
+        )
+    if isclose(quantizer.deadzone, quantizer.step / 2, rel_tol=_SAME_STEP):
+        return None
+    return "sgn(i) * (y0 + l/2 + (|i| - 1) * l)", f"y0 = {quantizer.deadzone!r} and l = {quantizer.step!r}"
 
 
 def _start(at: int) -> int:

@@ -20,6 +20,8 @@ from typing import Annotated, Final, Literal, TypeAlias
 from bitstruct.c import compile as compile_bits
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from protocol.hysteresis import HysteresisQuantizer
+from protocol.logarithmic import LogarithmicQuantizer
 from protocol.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
 from protocol.transmit import Transmit
 
@@ -39,28 +41,66 @@ Bits: TypeAlias = Annotated[
 ]
 
 
+Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
+
+_OWNER: Final[dict[str, Kind]] = {"hysteresis": "hysteresis-uniform", "threshold": "logarithmic-uniform"}
+"""Parameters that only one kind of quantizer has."""
+
+
 class SignalSpec(BaseModel):
-    """How one signal is quantized. `range` runs from −limit to +limit, in the signal's unit."""
+    """How one signal is quantized. The range runs from −limit to +limit, in the signal's unit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
     limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
     deadzone: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False, description="y0 of (C.14) [signal's unit]; half a step if left out"
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="y0 of (C.14) [signal's unit]; half a step if left out, a quarter of that if logarithmic-uniform",
+    )
+    kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
+    hysteresis: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="h: how much farther a level is held [signal's unit]; half a step if left out; hysteresis-uniform",
+    )
+    threshold: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="where steps stop growing [signal's unit]; limit/4 if left out; logarithmic-uniform",
     )
 
     @model_validator(mode="after")
-    def _deadzone_within_limit(self) -> SignalSpec:
+    def _makes_a_quantizer(self) -> SignalSpec:
         if self.deadzone is not None and self.deadzone >= self.limit:
             raise ValueError(f"the dead zone {self.deadzone} must be smaller than the limit {self.limit}")
+        for name, owner in _OWNER.items():
+            if getattr(self, name) is not None and self.kind != owner:
+                raise ValueError(f'{name} belongs to kind = "{owner}", and kind is "{self.kind}"')
+        if self.kind != "uniform":
+            self.quantizer()  # has bounds of its own, which depend on the bits
         return self
 
     def quantizer(self) -> Quantizer:
-        """A quantizer of this signal, with its own count of saturations."""
+        """A quantizer of one element of this signal, with its own count of saturations and its own memory."""
         if self.bits is None:
             return Continuous(self.limit)
+        if self.kind == "hysteresis-uniform":
+            return HysteresisQuantizer(self.bits, self.limit, self.deadzone, self.hysteresis)
+        if self.kind == "logarithmic-uniform":
+            return LogarithmicQuantizer(self.bits, self.limit, self.deadzone, self.threshold)
         return UniformQuantizer(self.bits, self.limit, self.deadzone)
+
+    def with_bits(self, bits: int | None) -> SignalSpec:
+        """The same with other bits. Raises ValueError where the kind takes no such number, or not with the rest."""
+        changed = self.model_copy(update={"bits": bits})
+        if self.kind != "uniform":
+            changed.quantizer()
+        return changed
 
 
 class WireSpec(BaseModel):
@@ -89,11 +129,15 @@ class WireSpec(BaseModel):
         return FrameFormat([self.voltage.bits] * self.actuators)
 
     def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
-        """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont."."""
+        """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont.".
+
+        Raises:
+            ValueError: A signal's kind takes no such number of bits.
+        """
         return WireSpec(
-            attitude=self.attitude.model_copy(update={"bits": out}),
-            rate=self.rate.model_copy(update={"bits": out}),
-            voltage=self.voltage.model_copy(update={"bits": inp}),
+            attitude=self.attitude.with_bits(out),
+            rate=self.rate.with_bits(out),
+            voltage=self.voltage.with_bits(inp),
             actuators=self.actuators,
             transmit=self.transmit,
         )

@@ -9,12 +9,14 @@ value" and decodes to NaN.
 
 With the paper's dead zone y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). For any other y₀ the step is chosen
 so that, there too, the outermost interval ends exactly at the limit: l = (limit − y₀) / (2^(R−1) − 1).
+
+The uniform quantizer is the paper's; `hysteresis` and `logarithmic` have two more kinds (Remark 8).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import ceil, copysign, nan
 from typing import Final
 
@@ -27,6 +29,8 @@ TIE: Final[float] = 1 - 2.0**-50
 
 class Quantizer(ABC):
     """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) asks.
+
+    Decoding needs no memory; encoding may have one, which is the last code. So each scalar has a quantizer of its own.
 
     Attributes:
         limit: Edge of the range, in the signal's unit.
@@ -54,10 +58,16 @@ class Quantizer(ABC):
             ValueError: Not a code of this quantizer.
         """
 
+    def reset(self) -> None:  # noqa: B027  # most kinds remember nothing
+        """Forget what was encoded: a session begins. The count of saturations goes on."""
+
+    def resume(self, code: float) -> None:  # noqa: B027  # the same
+        """Go on as if this code had been the last; `invalid` is none, and changes nothing."""
+
     @property
+    @abstractmethod
     def outermost(self) -> float:
         """The largest level, where saturation begins [signal's unit]."""
-        return self.quantize(self.limit)
 
     @property
     @abstractmethod
@@ -74,24 +84,26 @@ class Quantizer(ABC):
         return self.decode(self.encode(y))
 
 
-class UniformQuantizer(Quantizer):
-    """The uniform quantizer of (C.14). A tie goes towards zero: intervals are (y_i − l/2, y_i + l/2].
+class CodedQuantizer(Quantizer):
+    """A quantizer with R-bit codes and a table of levels, symmetric about 0; kinds differ in levels and in `encode`.
 
     Args:
         bits: R, 2…16.
         limit: Edge of the range [signal's unit], > 0.
-        deadzone: y₀, the largest magnitude that is quantized to 0 [signal's unit]; l/2 if None, as in the paper.
 
     Attributes:
-        step: l, the length of an interval [signal's unit].
-        deadzone: y₀ as used.
+        top: N = 2^(R−1) − 1, the code of the outermost level.
+        deadzone: y₀, the largest magnitude that is quantized to 0 by its value alone [signal's unit].
         levels: Level by code. Python's negative index is two's complement, so `levels[code]` is the whole decoder.
 
     Raises:
         ValueError: A value out of bounds.
     """
 
-    def __init__(self, bits: int, limit: float, deadzone: float | None = None) -> None:
+    deadzone: float
+    levels: list[float]
+
+    def __init__(self, bits: int, limit: float) -> None:
         if not MIN_BITS <= bits <= MAX_BITS:
             raise ValueError(f"a quantizer has {MIN_BITS} to {MAX_BITS} bits, not {bits}")
         if not 0 < limit < float("inf"):
@@ -99,6 +111,51 @@ class UniformQuantizer(Quantizer):
         self.bits = bits
         self.limit = limit
         self.top: int = 2 ** (bits - 1) - 1
+        self.saturated = 0
+
+    def _tabulate(self, positive: Sequence[float]) -> None:
+        """Take these for the levels 1…N."""
+        self.levels = [0.0, *positive, nan, *(-y for y in reversed(positive))]
+
+    @property
+    def outermost(self) -> float:
+        """See `Quantizer.outermost`."""
+        return self.levels[self.top]
+
+    @property
+    def invalid(self) -> int:
+        """−2^(R−1)."""
+        return -self.top - 1
+
+    @property
+    def level(self) -> Callable[[float], float]:
+        """See `Quantizer.level`."""
+        return self.levels.__getitem__  # type: ignore[return-value]  # a code out of a frame is an int
+
+    def decode(self, code: float) -> float:
+        """The level of a code; NaN for `invalid`."""
+        if not (isinstance(code, int) and -self.top - 1 <= code <= self.top):
+            raise ValueError(f"{code!r} is not a code of {self.bits} bits")
+        return self.levels[code]
+
+
+class UniformQuantizer(CodedQuantizer):
+    """The uniform quantizer of (C.14). A tie goes towards zero: intervals are (y_i − l/2, y_i + l/2].
+
+    Args:
+        bits: R, 2…16.
+        limit: Edge of the range [signal's unit], > 0.
+        deadzone: y₀ [signal's unit]; l/2 if None, as in the paper.
+
+    Attributes:
+        step: l, the length of an interval [signal's unit].
+
+    Raises:
+        ValueError: A value out of bounds.
+    """
+
+    def __init__(self, bits: int, limit: float, deadzone: float | None = None) -> None:
+        super().__init__(bits, limit)
         if deadzone is None:
             self.step: float = 2 * limit / (2**bits - 1)
             self.deadzone = self.step / 2
@@ -110,19 +167,7 @@ class UniformQuantizer(Quantizer):
         if not 0 < self.step < float("inf"):
             raise ValueError(f"a limit of {limit} leaves no step that a float can hold")
         self.bound = max(self.deadzone, self.step / 2)
-        self.saturated = 0
-        positive = [self.deadzone + self.step / 2 + i * self.step for i in range(self.top)]
-        self.levels: list[float] = [0.0, *positive, nan, *(-y for y in reversed(positive))]
-
-    @property
-    def invalid(self) -> int:
-        """−2^(R−1)."""
-        return -self.top - 1
-
-    @property
-    def level(self) -> Callable[[float], float]:
-        """See `Quantizer.level`."""
-        return self.levels.__getitem__  # type: ignore[return-value]  # a code out of a frame is an int
+        self._tabulate([self.deadzone + self.step / 2 + i * self.step for i in range(self.top)])
 
     def encode(self, y: float) -> int:
         """The code of a value; see `Quantizer.encode`."""
@@ -135,12 +180,6 @@ class UniformQuantizer(Quantizer):
         if y != y:
             raise ValueError("NaN has no code; send the code for 'no valid value'")
         return ceil(x) if y > 0 else -ceil(x)
-
-    def decode(self, code: float) -> float:
-        """The level of a code; NaN for `invalid`."""
-        if not (isinstance(code, int) and -self.top - 1 <= code <= self.top):
-            raise ValueError(f"{code!r} is not a code of {self.bits} bits")
-        return self.levels[code]
 
 
 class Continuous(Quantizer):
@@ -159,6 +198,11 @@ class Continuous(Quantizer):
         self.limit = limit
         self.bound = 0.0
         self.saturated = 0
+
+    @property
+    def outermost(self) -> float:
+        """The limit."""
+        return self.limit
 
     @property
     def invalid(self) -> float:

@@ -163,7 +163,10 @@ def _explain(error: dict[str, Any]) -> str:
     if error["type"] == "extra_forbidden":
         return f"unknown configuration key {where}; `aeroloop show config` lists the known ones"
     message = str(error["msg"]).removeprefix("Value error, ")
-    return f"{where}: {message[0].lower()}{message[1:]}, not {error['input']!r}"
+    told = f"{where}: {message[0].lower()}{message[1:]}"
+    if error["type"] == "value_error" and isinstance(error["input"], dict):  # of a whole section, and names its values
+        return told
+    return f"{told}, not {error['input']!r}"
 
 
 def _for_toml(tree: dict[str, Any]) -> dict[str, Any]:
@@ -192,4 +195,7 @@ def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> 
                 raise ConfigError(f"{option} takes {MIN_BITS} to {MAX_BITS} bits or cont, not {bits!r}")
             for signal in signals:
                 wire[signal]["bits"] = bits if bits == "cont" else int(bits)
-    return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
+    try:
+        return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
+    except ValidationError as error:  # a kind of quantizer may take other numbers of bits
+        raise ConfigError("; ".join(f"wire.{_explain(dict(e))}" for e in error.errors(include_url=False))) from None

@@ -19,8 +19,6 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from protocol.frames import FrameFormat, SignalSpec, WireSpec
-from protocol.quantizer import UniformQuantizer
 from service import paper
 from service.figures import Figures
 
@@ -232,25 +230,6 @@ def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
             live.update(Group(bar, line if now.statuses.get("controller") else "starting three processes …"))
 
         yield update
-
-
-def wire_table(wire: WireSpec) -> None:
-    """Print a wire spec: each signal's quantizer, each frame's size."""
-    table = Table("signal", "bits", "limit", "step", "largest error", box=None)
-    signals: dict[str, tuple[SignalSpec, str]] = {
-        "ε attitude": (wire.attitude, ""),
-        "ω rate": (wire.rate, "rad/s"),
-        "u voltage": (wire.voltage, "V"),
-    }
-    for name, (signal, unit) in signals.items():
-        quantizer = signal.quantizer()
-        step = f"{quantizer.step:.6g} {unit}" if isinstance(quantizer, UniformQuantizer) else "–"
-        bits = "cont" if signal.bits is None else str(signal.bits)
-        table.add_row(name, bits, f"±{signal.limit:g} {unit}", step, f"{quantizer.bound:.6g} {unit}")
-    Console().print(table)
-    frames: tuple[tuple[str, FrameFormat], ...] = (("measurement", wire.measurement), ("command", wire.command))
-    for label, kind in frames:
-        Console().print(f"{label}: {kind.bits} bits in {kind.size} bytes")
 
 
 def soak_table(soak: Soak) -> None:

@@ -56,7 +56,7 @@ def _by_bits(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]
     choices = [[name] for name in quantized] + ([quantized] if len(quantized) > 1 else [])
     found = False
     for names in choices:
-        fewest = next((bits for bits in _all_bits() if holds(with_bits(wire, names, bits), law)), None)
+        fewest = next((bits for bits, tried in _candidates(wire, names) if holds(tried, law)), None)
         if fewest is not None:
             found = True
             which = f"wire.{names[0]}" if len(names) == 1 else "all of them"
@@ -65,8 +65,14 @@ def _by_bits(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]
         yield Remedy(text=f"no number of bits up to {MAX_BITS} would do", overrides=[])
 
 
-def _all_bits() -> range:
-    return range(MIN_BITS, MAX_BITS + 1)
+def _candidates(wire: WireSpec, names: list[str]) -> Iterator[tuple[int, WireSpec]]:
+    """The wire with every number of bits that the signals named can have."""
+    for bits in range(MIN_BITS, MAX_BITS + 1):
+        try:
+            tried = with_bits(wire, names, bits)
+        except ValueError:
+            continue  # some kinds of quantizer need more
+        yield bits, tried
 
 
 def with_bits(wire: WireSpec, names: list[str], bits: int) -> WireSpec:

@@ -28,7 +28,7 @@ def show_config(config: Config = None, overrides: Overrides = None) -> None:
 @group.command()
 def spec(config: Config = None, overrides: Overrides = None) -> None:
     """Print the wire as configured: frames, widths, steps."""
-    from service.display import wire_table
+    from service.wire_table import wire_table
 
     wire_table(settings_of(config, overrides).wire)
 

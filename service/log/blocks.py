@@ -20,7 +20,7 @@ from protocol.symbolic import Buffer, Compiled
 from protocol.verbs import Change, Reference
 from service.controller import Controller
 from service.law import LawSettings
-from service.log.codes import levels
+from service.log.codes import encoded_by, levels
 from service.log.report import Array
 from service.log.tallies import Integers
 from service.reference import reference_function
@@ -97,6 +97,22 @@ class BlockController(Controller):
                 ):
                     column[some] = values
         return computed
+
+    def commands(self, voltages: Array) -> Array:
+        """The codes of the commands that `answer` sends, one after another. Shape (n, actuators).
+
+        Args:
+            voltages: What the law commands [V]; rows of NaN for no valid value. Shape (n, actuators).
+        """
+        pairs = zip(self._voltage, voltages.T, strict=True)
+        return np.stack([encoded_by(quantizer, column) for quantizer, column in pairs], axis=1)
+
+    def sent(self, codes: Array) -> None:
+        """Go on as after commands with these codes, whatever was computed. Shape (n, actuators)."""
+        for quantizer, column in zip(self._voltage, codes.T, strict=True):
+            quantizer.reset()
+            for code in column[~np.isnan(column) & (column != quantizer.invalid)][-1:].tolist():
+                quantizer.resume(code)
 
     def follow(self, k: int, changes: deque[Change]) -> None:
         """Follow, and take out, the changes up to tick k."""

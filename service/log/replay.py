@@ -21,7 +21,7 @@ from protocol.verbs import Change
 from service.config import Settings, load_over
 from service.figures import added, squares
 from service.log.blocks import BlockController
-from service.log.codes import codes_in, encoded, levels
+from service.log.codes import codes_in, levels
 from service.log.files import LogFiles, Which
 from service.log.filling import Read
 from service.log.pairing import MAX_WAITING, Pairing, Sessions, without_collections
@@ -132,6 +132,7 @@ class Replayer(Pairing):
             self._compare([held], voltages)
         else:
             controller.resume(held[1].frame, tick, *told)
+            controller.sent(self._logged_codes([pair for pair in self._held if pair[0] <= tick]))
             self.first_tick = tick + 1
         self._begun = True
         self._waiting += [pair for pair in self._held if pair[0] > tick]
@@ -166,8 +167,8 @@ class Replayer(Pairing):
 
     def _compare(self, pairs: Sequence[Pair], voltages: Array) -> None:
         """Compare logged commands with what the law commands."""
-        signal, ours = self._wire.voltage, encoded(self._wire.voltage, voltages)
-        theirs = codes_in(self._wire.command, [command.frame for _, _, command in pairs])
+        signal, ours = self._wire.voltage, self._controller.commands(voltages)
+        theirs = self._logged_codes(pairs)
         differ = np.flatnonzero((ours.view(np.int64) != theirs.view(np.int64)).any(axis=1))  # an echo cannot differ
         if len(differ) and self.first_difference is None:
             k, measurement, command = pairs[differ[0]]
@@ -185,6 +186,9 @@ class Replayer(Pairing):
         self._computed = added(self._computed, squares(ours))
         self._square = added(self._square, squares(ours - theirs))
         self._largest = max(self._largest, float(np.abs(ours - theirs).max()))
+
+    def _logged_codes(self, pairs: Sequence[Pair]) -> Array:
+        return codes_in(self._wire.command, [command.frame for _, _, command in pairs])
 
 
 def _volts(signal: SignalSpec, codes: Array) -> Array:
