@@ -90,7 +90,7 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
 
 def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:
     """Seven bytes that differ where two ends would not understand each other: SHA-256 of what they must agree on."""
-    agreed = {"wire": wire.model_dump(mode="json"), "period_ns": period_ns, "lockstep": lockstep}
+    agreed = {"wire": wire.agreed(), "period_ns": period_ns, "lockstep": lockstep}
     return hashlib.sha256(json.dumps(agreed, sort_keys=True).encode()).digest()[:_FINGERPRINT_BYTES]
 
 

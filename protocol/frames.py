@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from math import isinf
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from bitstruct.c import compile as compile_bits
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -141,6 +141,18 @@ class WireSpec(BaseModel):
             actuators=self.actuators,
             transmit=self.transmit,
         )
+
+    def agreed(self) -> dict[str, Any]:
+        """What two ends tell each other of it, as JSON: of a uniform signal only what a signal of that kind has.
+
+        So an end that knows no other kinds understands the others as long as they use none.
+        """
+        told = self.model_dump(mode="json")
+        for signal in told.values():
+            if isinstance(signal, dict) and signal["kind"] == "uniform":
+                for name in ("kind", *_OWNER):
+                    del signal[name]
+        return told
 
     def differences(self, other: WireSpec) -> list[str]:
         """Where two specs differ, one line a field: `rate.bits: 8, not 10`. Empty if they are the same wire."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints
+from pydantic import AfterValidator, Field, PlainSerializer, StringConstraints
 
 from protocol import verbs
 from protocol.clock import Histogram, LoopTiming
@@ -41,7 +41,7 @@ class Claim(Message):
     period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
     lockstep: bool = Field(description="the plant waits for each answer before it steps")
     auto_arm: bool = Field(default=False, description="arm the plant by this claim, unless an operator stopped it")
-    wire: WireSpec
+    wire: Annotated[WireSpec, PlainSerializer(WireSpec.agreed)]
 
 
 class Grant(Message):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from protocol.frames import FrameFormat, SignalSpec, WireSpec
 from protocol.hysteresis import HysteresisQuantizer
@@ -14,7 +14,7 @@ from protocol.quantizer import Quantizer, UniformQuantizer
 def wire_table(wire: WireSpec) -> None:
     """Print a wire spec: each signal's quantizer, each frame's size."""
     console = Console()
-    table = Table("signal", "kind", "bits", "limit", "step", "largest error", box=None)
+    table = Table("signal", Column("kind", no_wrap=True), "bits", "limit", "step", "largest error", box=None)
     signals: dict[str, tuple[SignalSpec, str]] = {
         "ε attitude": (wire.attitude, ""),
         "ω rate": (wire.rate, " rad/s"),

@@ -44,8 +44,9 @@ def levels(signal: SignalSpec, codes: Array) -> Array:
 
 
 def encoded(signal: SignalSpec, values: Array) -> Array:
-    """The code of each value, by a quantizer a column that has encoded nothing yet; see `encoded_by`. Shape (n, m)."""
-    return np.stack([encoded_by(signal.quantizer(), column) for column in values.T], axis=1)
+    """The code of each value, by a quantizer a column that has encoded nothing yet; see `encoded_by`. Any shape."""
+    columns = values.reshape(len(values), -1).T
+    return np.stack([encoded_by(signal.quantizer(), column) for column in columns], axis=1).reshape(values.shape)
 
 
 def encoded_by(quantizer: Quantizer, values: Array) -> Array:

@@ -397,8 +397,15 @@ def test_the_fingerprint_is_the_one_of_the_specification() -> None:
 
 def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on() -> None:
     others = {"bits": 9, "limit": 2.5, "deadzone": 0.125}
-    changes: dict[str, float] = {
-        f"{signal}.{field}": other for signal in ("attitude", "rate", "voltage") for field, other in others.items()
+    kinds: dict[str, object] = {
+        "kind": "logarithmic-uniform",
+        "hysteresis": {"kind": "hysteresis-uniform", "hysteresis": 0.125},
+        "threshold": {"kind": "logarithmic-uniform", "threshold": 0.125},
+    }
+    changes: dict[str, object] = {
+        f"{signal}.{field}": other
+        for signal in ("attitude", "rate", "voltage")
+        for field, other in (others | kinds).items()
     }
     changes["actuators"] = 3
     plain = PAPER.model_dump()
@@ -413,7 +420,7 @@ def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on()
     for path, value in changes.items():
         other = json.loads(json.dumps(plain))
         *sections, field = path.split(".")
-        (other[sections[0]] if sections else other)[field] = value
+        (other[sections[0]] if sections else other).update(value if isinstance(value, dict) else {field: value})
         seen.add(fingerprint(WireSpec.model_validate(other), PERIOD_NS, lockstep=False))
     seen.add(fingerprint(PAPER.with_bits(None, 6), PERIOD_NS, lockstep=False))
     assert len(seen) == 3 + len(changes) + 1
