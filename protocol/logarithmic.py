@@ -25,6 +25,9 @@ MIN_LOGARITHMIC_BITS: Final = 3
 _ALIKE: Final = 1 - 2.0**-30
 """The last geometric interval may be longer than l by this: where the two are equal, rounding must not choose m."""
 
+_APART: Final = 2.0**-46
+"""Edges are farther from each other than what counts as a tie, relatively."""
+
 
 class LogarithmicQuantizer(CodedQuantizer):
     """The logarithmic-uniform quantizer. A tie goes towards zero.
@@ -59,7 +62,7 @@ class LogarithmicQuantizer(CodedQuantizer):
         self.step = self._step(self.growing)
         self.edges = self._edges()
         lengths = [b - a for a, b in pairwise(self.edges)]
-        if not all(length > 0 for length in lengths):
+        if not all(b - a > _APART * b for a, b in pairwise(self.edges)):
             raise ValueError(f"a limit of {limit} leaves no intervals that a float can tell apart")
         self.bound = max(self.deadzone, max(lengths) / 2)
         self._tabulate([(a + b) / 2 for a, b in pairwise(self.edges)])

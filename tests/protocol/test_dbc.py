@@ -57,6 +57,14 @@ WIRES: Final = {
         voltage=SignalSpec(bits=7, limit=24.0, deadzone=2.5),
     ),
     "a dead zone on one": WireSpec(rate=SignalSpec(bits=4, limit=2.0, deadzone=0.25)),
+    "other kinds": WireSpec(
+        attitude=SignalSpec(bits=8, limit=1.0, kind="hysteresis-uniform"),
+        rate=SignalSpec(bits=10, limit=7.3, kind="logarithmic-uniform"),
+        voltage=SignalSpec(bits=7, limit=24.0, kind="logarithmic-uniform", deadzone=0.01, threshold=2.0),
+    ),
+    "hysteresis about a dead zone": WireSpec(
+        rate=SignalSpec(bits=9, limit=2.0, kind="hysteresis-uniform", deadzone=0.25, hysteresis=0.1)
+    ),
     "steps of one": WireSpec(rate=SignalSpec(bits=4, limit=7.5), voltage=SignalSpec(bits=5, limit=15.5)),
     "tiny and huge": WireSpec(rate=SignalSpec(bits=12, limit=1e-9), voltage=SignalSpec(bits=12, limit=3e20)),
 }
@@ -110,6 +118,32 @@ def by_formula(comment: str, code: int) -> float:
     return -magnitude if code < 0 else magnitude
 
 
+def by_logarithmic_formula(comment: str, code: int) -> float:
+    """The same of the logarithmic-uniform kind."""
+    found = re.search(
+        r"else sgn\(i\) \* \(e\(\|i\| - 1\) \+ e\(\|i\|\)\) / 2 .*"
+        r" with e\(k\) = y0 \* \(yt / y0\) \*\* \(k / m\) for k < m, else yt \+ \(k - m\) \* l;"
+        r" y0 = (\S+), yt = (\S+), m = (\d+) and l = (\S+)\.$",
+        comment,
+    )
+    assert found, comment
+    y0, yt, m, step = float(found[1]), float(found[2]), int(found[3]), float(found[4])
+
+    def edge(k: int) -> float:
+        return y0 * (yt / y0) ** (k / m) if k < m else yt + (k - m) * step
+
+    magnitude = (edge(abs(code) - 1) + edge(abs(code))) / 2 if code else 0.0
+    return -magnitude if code < 0 else magnitude
+
+
+def bare(spec: SignalSpec) -> bool:
+    """Whether the level of code i is not i times a step, so that the DBC has the bare code."""
+    return spec.bits is not None and (
+        spec.kind == "logarithmic-uniform"
+        or not (spec.deadzone is None or isclose(spec.deadzone, spec.limit / (2**spec.bits - 1), rel_tol=1e-12))
+    )
+
+
 def assert_tells(signal: Signal, spec: SignalSpec, code: float, told: Any) -> None:
     """What cantools decoded is what this code is to the quantizer."""
     value = quantizer_of(spec).decode(code)
@@ -119,12 +153,15 @@ def assert_tells(signal: Signal, spec: SignalSpec, code: float, told: Any) -> No
     elif code == -(2 ** (spec.bits - 1)):
         assert isnan(value)
         assert told == "no_valid_value"
-    elif spec.deadzone is None or isclose(spec.deadzone, spec.limit / (2**spec.bits - 1), rel_tol=1e-12):
+    elif not bare(spec):
         assert abs(told - value) <= ROUNDING * abs(value)
     else:
         assert told == code
         assert signal.comment is not None
-        assert by_formula(signal.comment, int(code)) == value
+        if spec.kind == "logarithmic-uniform":
+            assert by_logarithmic_formula(signal.comment, int(code)) == pytest.approx(value, rel=ROUNDING, abs=0)
+        else:
+            assert by_formula(signal.comment, int(code)) == value
 
 
 def assert_decodes(message: Message, layout: FrameFormat, of: Sequence[SignalSpec], counter: int, codes: Any) -> None:
@@ -235,10 +272,9 @@ def test_signals_have_names_units_bounds_and_comments(spec: WireSpec) -> None:
         assert all(signal.comment and signal.byte_order == "big_endian" for signal in message.signals)
         for signal, one in zip(others, of, strict=True):
             quantizer = quantizer_of(one)
-            bare = one.deadzone is not None and one.bits is not None
             assert (signal.is_signed, signal.offset) == (True, 0)
-            assert signal.unit == (None if bare else UNITS[signal.name.rstrip("123")])
-            highest = top(one) if bare else quantizer.outermost
+            assert signal.unit == (None if bare(one) else UNITS[signal.name.rstrip("123")])
+            highest = top(one) if bare(one) else quantizer.outermost
             assert signal.maximum == pytest.approx(highest, rel=ROUNDING, abs=0)
             assert signal.minimum == pytest.approx(-highest, rel=ROUNDING, abs=0)
             if one.bits is None:
@@ -246,8 +282,11 @@ def test_signals_have_names_units_bounds_and_comments(spec: WireSpec) -> None:
                 assert signal.scale == 1
             else:
                 assert signal.choices == {-(2 ** (one.bits - 1)): "no_valid_value"}
-                assert isinstance(quantizer, UniformQuantizer)
-                assert signal.scale == (1 if bare else quantizer.step)
+                if bare(one):
+                    assert signal.scale == 1
+                else:
+                    assert isinstance(quantizer, UniformQuantizer)
+                    assert signal.scale == quantizer.step
 
 
 @pytest.mark.parametrize("off", [1.0, 1 + 2.0**-50, 1 - 1e-14])

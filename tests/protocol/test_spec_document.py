@@ -13,7 +13,7 @@ from typing import Final
 import pytest
 
 import protocol
-from protocol.frames import FrameFormat, WireSpec
+from protocol.frames import FrameFormat, SignalSpec, WireSpec
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
 from protocol.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
@@ -22,6 +22,7 @@ from protocol.topics import TOPICS
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
 
 QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
+KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes | levels |"
 FRAMES: Final = "| frame | bits of ε, ω / u | actuators | counter | codes | hex |"
 REFUSED: Final = "| frame | bits of ε, ω / u | actuators | hex | why |"
 
@@ -52,6 +53,7 @@ def rows(header: str, under: str) -> list[Row]:
 
 
 QUANTIZER_ROWS: Final = rows(QUANTIZER, "Golden vectors")
+KIND_ROWS: Final = rows(KINDS, "Golden vectors")
 FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
 REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
 
@@ -86,6 +88,7 @@ def as_bits(text: str) -> int | str:
     ("found", "least"),
     [
         pytest.param(QUANTIZER_ROWS, 6, id="quantizer"),
+        pytest.param(KIND_ROWS, 14, id="kinds"),
         pytest.param(FRAME_ROWS, 8, id="frames"),
         pytest.param(REFUSED_ROWS, 4, id="refused"),
     ],
@@ -107,6 +110,22 @@ def test_the_quantizer_gives_its_golden_vectors(row: Row) -> None:
     assert quantizer.encode(float(value)) == number(code)
     # The text gives at least twelve significant digits; zero is exact.
     assert quantizer.decode(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
+
+
+@pytest.mark.parametrize("row", KIND_ROWS, ids=" ".join)
+def test_the_other_kinds_give_their_golden_vectors(row: Row) -> None:
+    kind, bits, limit, deadzone, parameter, values, codes, levels = row
+    name = {"hysteresis-uniform": "hysteresis", "logarithmic-uniform": "threshold"}[kind]
+    given = {key: float(text) for key, text in (("deadzone", deadzone), (name, parameter)) if text != "–"}
+    quantizer = SignalSpec.model_validate({"kind": kind, "bits": int(bits), "limit": float(limit), **given}).quantizer()
+    for value, code, level in zip(values.split(), codes.split(), levels.split(), strict=True):
+        if isnan(float(value)):
+            assert number(code) == quantizer.invalid
+            quantizer.resume(quantizer.invalid)
+            assert isnan(quantizer.decode(number(code)))
+            continue
+        assert quantizer.encode(float(value)) == number(code)
+        assert quantizer.decode(number(code)) == pytest.approx(float(level), rel=1e-12, abs=0)
 
 
 @pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)

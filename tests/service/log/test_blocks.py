@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from protocol.attitude import IDENTITY, Quaternion, received_quaternion
-from protocol.frames import FrameFormat, SignalSpec
+from protocol.frames import FrameFormat, Kind, SignalSpec
+from protocol.logarithmic import LogarithmicQuantizer
+from protocol.quantizer import CodedQuantizer
 from protocol.verbs import Change, Gains, Hold, Points, Reference, Sinusoid
 from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Score
 from service.log.blocks import BlockController, received_quaternions
-from service.log.codes import codes_in, encoded, levels
+from service.log.codes import codes_in, encoded, encoded_by, levels
 
 TICKS = 700
 ROWS = 64
@@ -29,6 +31,8 @@ WIRES = {
     "mixed": ["wire.attitude.bits=cont", "wire.rate.bits=16", "wire.rate.deadzone=0.01"],
     "rigid body": ["wire.actuators=3", "plant.kind=rigid_body", "plant.ideal=true"],
 }
+WIRES["hysteresis"] = [f"wire.{signal}.kind=hysteresis-uniform" for signal in ("attitude", "rate", "voltage")]
+WIRES["logarithmic"] = [f"wire.{signal}.kind=logarithmic-uniform" for signal in ("attitude", "rate", "voltage")]
 WIRES["continuous rigid body"] = WIRES["continuous"] + WIRES["rigid body"]
 REFERENCES: list[Reference | None] = [
     None,
@@ -108,7 +112,7 @@ class Run:
         for start, end in pairwise(edges):
             block = controller.compute_all(self.k[start:end], self.codes[start:end], changes)
             said += np.hstack(block).tolist()
-            for k, row in zip(self.k[start:end], encoded(self.wire.voltage, block.voltages).tolist(), strict=True):
+            for k, row in zip(self.k[start:end], controller.commands(block.voltages).tolist(), strict=True):
                 codes = row if self.wire.voltage.bits is None else [int(code) for code in row]
                 commands.append(self.wire.command.pack(int(k) % 16, codes))
         return said, commands
@@ -143,6 +147,19 @@ def test_a_session_taken_up_in_its_middle_goes_on_as_the_loop_would(begin: int) 
     assert blocks.sign == -1
     assert bits(said) == bits([tick for tick, _ in ticks])
     assert commands == [command for _, command in ticks]
+
+
+def test_what_a_hysteresis_holds_is_taken_up_with_the_session() -> None:
+    """Whatever was computed meanwhile: what holds is the last valid code that was sent, of each motor."""
+    run = Run("hysteresis", 4)
+    one, cut = (run.controller(BlockController, rows=ROWS) for _ in range(2))
+    volts = np.cumsum(np.random.default_rng(4).normal(scale=0.2, size=(300, 2)), axis=0)
+    volts[149] = float("nan")
+    whole = one.commands(volts)
+    cut.commands(-volts[:40])
+    cut.sent(whole[:150])
+    assert bits(cut.commands(volts[150:])) == bits(whole[150:])
+    assert bits(whole[150:]) != bits(run.controller(BlockController, rows=ROWS).commands(volts[150:]))
 
 
 def test_blocks_and_single_ticks_go_on_from_one_another() -> None:
@@ -197,6 +214,26 @@ def test_codes_and_levels_of_many_are_those_of_each(bits_and_dead_zone: tuple[in
     assert bits(encoded(signal, np.array([float("nan")]))) == bits([quantizer.invalid])
     every = [*codes, quantizer.invalid]
     assert bits(levels(signal, np.array(every, dtype=np.float64))) == bits([quantizer.level(code) for code in every])
+
+
+@pytest.mark.parametrize("kind", ["hysteresis-uniform", "logarithmic-uniform"])
+@pytest.mark.parametrize("width", [3, 8, 16])
+def test_codes_and_levels_of_many_are_those_of_each_of_any_kind(kind: Kind, width: int) -> None:
+    signal = SignalSpec(bits=width, limit=24.0, kind=kind)
+    quantizer, twin = signal.quantizer(), signal.quantizer()
+    assert isinstance(quantizer, CodedQuantizer)
+    values = np.cumsum(np.random.default_rng(width).normal(scale=0.05 * 24, size=2000)) % 60 - 30
+    if isinstance(quantizer, LogarithmicQuantizer):
+        edges = np.array(quantizer.edges)
+        values = np.concatenate([values, edges, -edges, np.nextafter(edges, 0), np.nextafter(edges, 99), [0.0, -0.0]])
+    values = np.concatenate([values, [float("inf"), -1e300]])
+    codes = [quantizer.encode(value) for value in values.tolist()]
+    silent = np.insert(values, 777, float("nan"))  # no valid value leaves what is remembered alone
+    expected = [*codes[:777], quantizer.invalid, *codes[777:]]
+    assert bits(encoded(signal, silent)) == bits(expected)
+    assert bits([*encoded_by(twin, silent[:900]), *encoded_by(twin, silent[900:])]) == bits(expected)
+    assert twin.saturated == 0
+    assert bits(levels(signal, np.array(expected))) == bits([quantizer.level(code) for code in expected])
 
 
 @pytest.mark.parametrize("cut", [1, 7, 1000])
