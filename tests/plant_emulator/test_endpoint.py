@@ -341,6 +341,34 @@ def test_a_trip_is_latched_and_only_a_new_claim_ends_it() -> None:
     assert _state(endpoint) is PlantState.DRIVEN
 
 
+def _seen_codes(endpoint: Endpoint, plant: Notebook, rates: Sequence[float], k: int, wire: WireSpec) -> list[float]:
+    """The codes of ω_x at ticks from k on, of a body that turns about x at these rates [rad/s]."""
+    codes = []
+    for i, rate in enumerate(rates):
+        plant.now = Measurement(IDENTITY, (rate, 0.0, 0.0))
+        codes.append(_read(endpoint.tick(None, k + i), wire)[1][3])
+    return codes
+
+
+def test_what_a_quantizer_holds_outlasts_a_failed_sensor_but_no_session() -> None:
+    wire = WireSpec(rate=SignalSpec(bits=4, limit=7.5, kind="hysteresis-uniform"))  # l = 1
+    endpoint, plant = _claimed(wire)
+    assert _seen_codes(endpoint, plant, [3.0, 2.2, nan, 2.2], 1, wire) == [3, 3, -8, 3]
+    assert endpoint.release("of-a")
+    assert isinstance(endpoint.claim(_claim("b", wire)), Grant)
+    assert _seen_codes(endpoint, plant, [2.2, 3.0, 3.1], 5, wire) == [2, 2, 3]
+
+
+def test_each_axis_holds_its_own_level() -> None:
+    wire = WireSpec(rate=SignalSpec(bits=4, limit=7.5, kind="hysteresis-uniform"))
+    endpoint, plant = _claimed(wire)
+    codes = []
+    for k, rate in enumerate(((3.0, 2.0, 0.0), (2.2, 2.8, 0.9)), start=1):
+        plant.now = Measurement(IDENTITY, rate)
+        codes.append(_read(endpoint.tick(None, k), wire)[1][3:])
+    assert codes == [(3, 2, 0), (3, 2, 0)]
+
+
 def test_the_holder_of_a_tripped_session_can_claim_again() -> None:
     endpoint, _ = _claimed()
     endpoint.expire(TripCause.NO_ANSWER, "nobody answers")

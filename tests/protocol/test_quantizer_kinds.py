@@ -54,7 +54,7 @@ def edges_by_decimals(quantizer: LogarithmicQuantizer) -> list[Decimal]:
 
         def serves(m: int) -> bool:
             longest = yt - yt * (-logarithm / m).exp()
-            return longest * (1 - Decimal(2) ** -30) <= (limit - yt) / (top - m)
+            return bool(longest * (1 - Decimal(2) ** -30) <= (limit - yt) / (top - m))
 
         m = next(m for m in range(1, top) if serves(m))
         step = (limit - yt) / (top - m)

@@ -1,0 +1,228 @@
+"""Whatever quantizer a signal names, the whole loop has it: experiment, log, replay, certificate and command line."""
+
+from __future__ import annotations
+
+from math import sqrt
+from pathlib import Path
+from typing import get_args
+
+import pyarrow.parquet
+import pytest
+
+from protocol.frames import Kind
+from service.cells import Cell, run_cell
+from service.certificate import Certificate, certify
+from service.cli import execute as run
+from service.config import ConfigError, Settings, load, load_over, with_bits
+from service.experiment import run_experiment
+from service.log.export import export
+from service.log.files import LogFiles
+from service.log.replay import SessionReplay, replay
+from service.log.review import read, review
+from tests.service.log.made_log import AN_OPERATORS_WORDS, lockstep, make_log
+
+SIGNALS = ("attitude", "rate", "voltage")
+OTHERS = [kind for kind in get_args(Kind) if kind != "uniform"]
+TICKS = 600
+
+every_kind = pytest.mark.parametrize("kind", get_args(Kind))
+other_kinds = pytest.mark.parametrize("kind", OTHERS)
+
+
+def throughout(kind: str, *more: str) -> Settings:
+    """The paper's experiment in lockstep with this kind for all signals."""
+    return load_over(lockstep(), [*(f"wire.{signal}.kind={kind}" for signal in SIGNALS), *more])
+
+
+def certificate(settings: Settings) -> Certificate:
+    return certify(settings.wire, settings.law, settings.reference, settings.controller)
+
+
+def replayed(path: Path) -> SessionReplay:
+    (session,) = replay([path])
+    return session
+
+
+# ── the loop ──
+
+
+@other_kinds
+def test_the_experiment_runs_repeats_and_is_not_that_of_the_uniform_kind(kind: str) -> None:
+    settings = throughout(kind)
+    figures = run_experiment(settings, 5.0)
+    assert figures == run_experiment(settings, 5.0)
+    assert figures.skipped_ticks == 0
+    assert figures.z_track is not None
+    uniform = run_experiment(throughout("uniform"), 5.0).z_track
+    assert uniform is not None
+    assert figures.z_track != uniform
+    # Errors of up to twice the uniform ones, whose squares are most of z_track; not a loop that has come apart.
+    assert figures.z_track < 5 * uniform
+
+
+@other_kinds
+def test_more_bits_bring_every_kind_to_the_loop_without_quantization(kind: str) -> None:
+    fine = run_experiment(with_bits(throughout(kind), "16", "16"), 5.0)
+    continuous = run_experiment(with_bits(throughout(kind), "cont", "cont"), 5.0)
+    # 16 bits err by 3e-5 at the most, against an ε̃ of 1e-2: a few parts in a thousand.
+    assert fine.z_track == pytest.approx(continuous.z_track, rel=5e-3)
+    assert fine.u_total == pytest.approx(continuous.u_total, rel=5e-3)
+
+
+@other_kinds
+def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[Settings]()
+
+    def instead(settings: Settings, duration_s: float) -> object:
+        seen.append(settings)
+        return run_experiment(settings, duration_s / 500)
+
+    monkeypatch.setattr("service.cells.run_experiment", instead)
+    run_cell(throughout(kind).contract(), Cell(bits_out=9, bits_in=7))
+    wire = seen[0].wire
+    assert [(signal.kind, signal.bits) for signal in (wire.attitude, wire.rate, wire.voltage)] == [
+        (kind, 9), (kind, 9), (kind, 7)
+    ]  # fmt: skip
+
+
+# ── the log ──
+
+
+@every_kind
+def test_every_command_of_a_log_is_computed_again_byte_for_byte(kind: str, tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", TICKS, settings=throughout(kind), changes=AN_OPERATORS_WORDS)
+    session = replayed(tmp_path / "a.mcap")
+    assert (session.first_tick, session.commands, session.differing) == (0, TICKS, 0)
+
+
+@other_kinds
+@pytest.mark.parametrize("begin", [7, 123, 305])
+def test_a_log_that_begins_in_the_middle_is_replayed_with_what_was_held_then(
+    kind: str, begin: int, tmp_path: Path
+) -> None:
+    # A motor that is held ten steps farther stays at one level for long: what is held at the start decides much.
+    more = ["wire.voltage.hysteresis=8"] if kind == "hysteresis-uniform" else []
+    make_log(tmp_path / "a.mcap", TICKS, settings=throughout(kind, *more), begin=begin)
+    session = replayed(tmp_path / "a.mcap")
+    told = -(-begin // 10) * 10
+    assert (session.first_tick, session.commands, session.differing) == (told + 1, TICKS - told - 1, 0)
+
+
+@every_kind
+def test_the_figures_of_a_log_are_those_of_the_experiment(kind: str, tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", TICKS, settings=throughout(kind))
+    figures, expected = review(tmp_path / "a.mcap"), run_experiment(throughout(kind), TICKS * 0.002)
+    assert (figures.z_track, figures.u_total) == (expected.z_track, expected.u_total)
+    assert figures.damages == []
+
+
+@other_kinds
+def test_a_level_that_saturates_is_counted_in_the_log(kind: str, tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 200, settings=throughout(kind, "wire.voltage.limit=2"))
+    shares = read(tmp_path / "a.mcap").findings.saturated
+    assert 0 < shares["voltage"] < 1
+    assert shares["attitude"] == 0
+
+
+@other_kinds
+def test_an_export_has_the_levels_that_were_sent_and_which_saturated(kind: str, tmp_path: Path) -> None:
+    log, out = tmp_path / "a.mcap", tmp_path / "a.parquet"
+    settings = throughout(kind, "wire.voltage.limit=2")
+    make_log(log, 200, settings=settings)
+    export([log], "parquet", out)
+    table, wire, quantizer = (
+        pyarrow.parquet.read_table(out).to_pydict(),
+        settings.wire,
+        settings.wire.voltage.quantizer(),
+    )
+    sent = [wire.command.unpack(payload) for _, payload, _ in LogFiles([log]).messages(("command",))]
+    codes = [frame[1] for frame in sent if frame is not None]
+    assert len(codes) == 200
+    for i, name in enumerate(("voltage_2", "voltage_3")):
+        assert table[f"{name}_V"] == [quantizer.decode(both[i]) for both in codes]
+        assert table[f"saturated_{name}"] == [abs(both[i]) == 31 for both in codes]
+    seen = [wire.measurement.unpack(payload) for _, payload, _ in LogFiles([log]).messages(("measurement",))]
+    level = wire.rate.quantizer().level
+    assert table["rate_z_rad_s"] == [level(frame[1][5]) for frame in seen if frame is not None]
+
+
+# ── the certificate ──
+
+
+@every_kind
+def test_the_certificate_takes_the_bound_of_each_kind(kind: str) -> None:
+    settings = throughout(kind, *(f"wire.{signal}.bits=12" for signal in SIGNALS))
+    found, wire = certificate(settings), settings.wire
+    assert found.holds
+    for symbol, signal, elements in (("‖δ_ε‖", wire.attitude, 3), ("‖δ_ω‖", wire.rate, 3), ("‖δ_u‖", wire.voltage, 2)):
+        assert found.value(symbol) == sqrt(elements) * signal.quantizer().bound
+
+
+def test_what_errs_by_more_promises_less() -> None:
+    radii = [certificate(throughout(kind, *(f"wire.{s}.bits=12" for s in SIGNALS))).radius for kind in get_args(Kind)]
+    assert all(radius is not None for radius in radii)
+    assert radii[0] < min(radii[1:])  # type: ignore[type-var,operator]  # none is None
+
+
+@other_kinds
+def test_where_it_fails_the_remedies_are_bits_that_the_kind_can_have_and_cure_it(kind: str) -> None:
+    settings = throughout(kind, "wire.rate.limit=20", "wire.rate.bits=4")
+    found = certificate(settings)
+    assert not found.holds
+    bits = [remedy for remedy in found.remedies if any(".bits=" in change for change in remedy.overrides)]
+    assert bits
+    for remedy in bits:
+        assert certificate(load_over(settings, remedy.overrides)).holds, remedy
+        fewer = [f"{key}={int(n) - 1}" for key, _, n in (change.partition("=") for change in remedy.overrides)]
+        assert not certificate(load_over(settings, fewer)).holds, remedy
+
+
+# ── the command line ──
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["wire.rate.kind=loud"], "wire.rate.kind: input should be 'uniform', 'hysteresis-uniform' or"),
+        (["wire.rate.hysteresis=0.1"], "wire.rate: hysteresis belongs to kind"),
+        (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.bits=2"], "wire.voltage: a logarithmic-uniform"),
+        (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.threshold=13"], "wire.voltage: a threshold is"),
+    ],
+)
+def test_what_a_kind_does_not_take_is_told_in_one_line_that_names_the_signal(
+    overrides: list[str], told: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(overrides=overrides)
+    assert str(caught.value).startswith(told)
+    assert run(["show", "spec", *(word for change in overrides for word in ("--set", change))]) == 2
+    captured = capfd.readouterr()
+    assert captured.err == f"aeroloop: {caught.value}\n"
+    assert captured.out == ""
+
+
+def test_bits_on_the_command_line_are_refused_as_those_in_the_configuration(capfd: pytest.CaptureFixture[str]) -> None:
+    command = ["lab", "experiment", "--set", "wire.rate.kind=logarithmic-uniform", "--bits-out", "2"]
+    assert run(command) == 2
+    assert capfd.readouterr().err == (
+        "aeroloop: wire.rate: a logarithmic-uniform quantizer has at least 3 bits, not 2\n"
+    )
+
+
+def test_show_spec_tells_the_kind_and_what_it_does(capfd: pytest.CaptureFixture[str]) -> None:
+    kinds = ["wire.attitude.kind=hysteresis-uniform", "wire.voltage.kind=logarithmic-uniform"]
+    assert run(["show", "spec", *(word for change in kinds for word in ("--set", change))]) == 0
+    shown = " ".join(capfd.readouterr().out.split())
+    assert "ε attitude hysteresis-uniform 8 ±1 0.00784314 0.00784314" in shown
+    assert "ω rate uniform 8" in shown
+    assert "ε attitude: a level is held for 0.00392157 beyond its interval" in shown
+    assert "u voltage: 0 within ±0.0952381 V, then 18 steps that grow from 0.0246 V up to ±6 V, and 13 alike" in shown
+
+
+def test_the_shown_configuration_read_back_has_the_same_kinds(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    changes = ["wire.rate.kind=hysteresis-uniform", "wire.rate.hysteresis=0.01"]
+    assert run(["show", "config", *(word for change in changes for word in ("--set", change))]) == 0
+    (tmp_path / "a.toml").write_text(capfd.readouterr().out)
+    assert load(tmp_path / "a.toml").wire == load(overrides=changes).wire
