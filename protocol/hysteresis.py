@@ -69,7 +69,7 @@ class HysteresisQuantizer(UniformQuantizer):
         high = min(self.limit, outer + h + _SLACK * (outer + h))
         if code:
             inner = outer - self.step
-            low = max(-self.limit, inner - h - _SLACK * (inner + h))
+            low = inner - h - _SLACK * (inner + h)
         else:
             low = -high
         self._held = code

@@ -60,8 +60,8 @@ def encoded_by(quantizer: Quantizer, values: Array) -> Array:
         codes = np.array([encode(y) if y == y else nan for y in values.tolist()], dtype=np.float64)
         quantizer.saturated = saturated
     elif isinstance(quantizer, LogarithmicQuantizer):
-        codes = np.minimum(np.searchsorted(quantizer.edges, np.abs(values) * TIE), quantizer.top)
-        codes = np.where(values > 0, codes, 0.0 - codes)  # 0.0 − 0 is +0
+        codes = np.minimum(np.searchsorted(quantizer.edges, np.abs(values) * TIE), quantizer.top).astype(np.float64)
+        codes = np.where(values > 0, codes, 0.0 - codes)  # 0.0 − 0.0 is +0
     elif isinstance(quantizer, UniformQuantizer):
         x = (np.abs(values) - quantizer.deadzone) / quantizer.step * TIE
         codes = np.minimum(np.ceil(x), quantizer.top)

@@ -127,6 +127,23 @@ def test_beyond_the_limit_the_outermost_level_is_held_and_counted(quantizer: Hys
     assert quantizer.saturated == 5
 
 
+def test_what_is_held_may_reach_beyond_the_limit_but_no_value_there_escapes_the_outermost_level() -> None:
+    quantizer = HysteresisQuantizer(4, 7.5, hysteresis=7.4)  # l = 1: 3 is held from −4.9 to 10.9, 0 from −7.9 on
+    for n, (held, y, code) in enumerate(
+        [(7, 7.6, 7), (3, 7.6, 7), (0, -7.6, -7), (-1, 7.6, 7), (1, -7.6, -7)], start=1
+    ):
+        quantizer.resume(held)
+        assert quantizer.encode(y) == code
+        assert quantizer.saturated == n
+    quantizer.resume(1)
+    assert quantizer.encode(-6.9) == 1
+    quantizer = HysteresisQuantizer(2, 1.0, deadzone=0.05, hysteresis=0.99)  # ±1 is held down to ∓0.94, and 0 to ±1.04
+    for n, (held, y) in enumerate([(0, 1.03), (0, -1.03), (1, 1.03)], start=1):
+        quantizer.resume(held)
+        assert quantizer.encode(y) == (1 if y > 0 else -1)
+        assert quantizer.saturated == n
+
+
 def test_a_session_starts_without_a_memory_and_no_valid_value_leaves_it_alone() -> None:
     quantizer = HysteresisQuantizer(4, 7.5)
     quantizer.encode(3.0)

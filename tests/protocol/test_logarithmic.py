@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from decimal import Decimal, localcontext
+from fractions import Fraction
 from itertools import pairwise
 from math import inf, isnan, nan
 
@@ -75,6 +76,21 @@ def test_a_value_gets_the_level_whose_interval_holds_it_and_a_tie_goes_towards_z
     codes = {bisect_left(quantizer.edges, abs(y) * (1 + side * 16 * EPS)) for side in (-1, 1)}
     assert abs(quantizer.encode(y)) in codes
     assert quantizer.encode(y) * y >= 0
+
+
+@pytest.mark.parametrize("bits", range(MIN_LOGARITHMIC_BITS, MAX_BITS + 1))
+def test_an_edge_rounded_once_is_a_tie_whatever_the_quantizer_rounds(bits: int) -> None:
+    quantizer = LogarithmicQuantizer(bits, 24.0)
+    m, alike = quantizer.growing, quantizer.top - quantizer.growing
+    for i in range(alike + 1):
+        edge = float(6 + Fraction(18 * i, alike))
+        assert quantizer.encode(edge) == m + i
+        assert quantizer.encode(-edge) == -m - i
+
+
+def test_where_the_longest_interval_is_l_by_design_rounding_does_not_choose_m() -> None:
+    # 0.1 … 0.4 … 0.7 … 1.0; in binary64 the first is longer than the others by a unit in the last place.
+    assert LogarithmicQuantizer(3, 1.0, 0.1, 0.4).growing == 1
 
 
 @settings(max_examples=200, deadline=None)

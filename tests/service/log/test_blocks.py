@@ -159,7 +159,13 @@ def test_what_a_hysteresis_holds_is_taken_up_with_the_session() -> None:
     cut.commands(-volts[:40])
     cut.sent(whole[:150])
     assert bits(cut.commands(volts[150:])) == bits(whole[150:])
-    assert bits(whole[150:]) != bits(run.controller(BlockController, rows=ROWS).commands(volts[150:]))
+    fresh = run.controller(BlockController, rows=ROWS).commands(volts[150:])
+    assert bits(whole[150:]) != bits(fresh)
+    step = 48 / 63
+    rise = np.array([[step, -step], [0.3 * step, -0.3 * step]])
+    assert cut.commands(rise).tolist() == [[1, -1], [1, -1]]
+    cut.sent(whole[149:150])  # nothing valid: nothing is held
+    assert cut.commands(rise[1:]).tolist() == [[0, 0]]
 
 
 def test_blocks_and_single_ticks_go_on_from_one_another() -> None:
@@ -231,6 +237,7 @@ def test_codes_and_levels_of_many_are_those_of_each_of_any_kind(kind: Kind, widt
     silent = np.insert(values, 777, float("nan"))  # no valid value leaves what is remembered alone
     expected = [*codes[:777], quantizer.invalid, *codes[777:]]
     assert bits(encoded(signal, silent)) == bits(expected)
+    assert encoded(signal, silent).dtype == np.float64
     assert bits([*encoded_by(twin, silent[:900]), *encoded_by(twin, silent[900:])]) == bits(expected)
     assert twin.saturated == 0
     assert bits(levels(signal, np.array(expected))) == bits([quantizer.level(code) for code in expected])
