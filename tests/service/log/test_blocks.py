@@ -163,9 +163,10 @@ def test_what_a_hysteresis_holds_is_taken_up_with_the_session() -> None:
     assert bits(whole[150:]) != bits(fresh)
     step = 48 / 63
     rise = np.array([[step, -step], [0.3 * step, -0.3 * step]])
-    assert cut.commands(rise).tolist() == [[1, -1], [1, -1]]
-    cut.sent(whole[149:150])  # nothing valid: nothing is held
-    assert cut.commands(rise[1:]).tolist() == [[0, 0]]
+    one = run.controller(BlockController, rows=ROWS)
+    assert one.commands(rise).tolist() == [[1, -1], [1, -1]]
+    one.sent(whole[149:150])  # nothing valid: nothing is held
+    assert one.commands(rise[1:]).tolist() == [[0, 0]]
 
 
 def test_blocks_and_single_ticks_go_on_from_one_another() -> None:
