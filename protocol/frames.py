@@ -143,15 +143,17 @@ class WireSpec(BaseModel):
         )
 
     def agreed(self) -> dict[str, Any]:
-        """What two ends tell each other of it, as JSON: of a uniform signal only what a signal of that kind has.
+        """What two ends tell each other of it, as JSON: what they use, so that one that knows no more understands it.
 
-        So an end that knows no other kinds understands the others as long as they use none.
+        A uniform signal tells nothing of other kinds, and frames that are sent as ever nothing of when.
         """
         told = self.model_dump(mode="json")
-        for signal in told.values():
-            if isinstance(signal, dict) and signal["kind"] == "uniform":
-                for name in ("kind", *_OWNER):
-                    del signal[name]
+        for name in ("attitude", "rate", "voltage"):
+            if told[name]["kind"] == "uniform":
+                for unused in ("kind", *_OWNER):
+                    del told[name][unused]
+        if self.transmit == Transmit():
+            del told["transmit"]
         return told
 
     def differences(self, other: WireSpec) -> list[str]:

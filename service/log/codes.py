@@ -55,7 +55,7 @@ def encoded_by(quantizer: Quantizer, values: Array) -> Array:
     What a quantizer remembers goes on from block to block. It counts no saturations.
     """
     if isinstance(quantizer, HysteresisQuantizer):
-        # Each code depends on the one before, so this one is no twin but the quantizer itself, 0.2 µs a value.
+        # Each code depends on the one before, so this is no twin but the quantizer itself; a value that holds is cheap.
         saturated, encode = quantizer.saturated, quantizer.encode
         codes = np.array([encode(y) if y == y else nan for y in values.tolist()], dtype=np.float64)
         quantizer.saturated = saturated

@@ -408,6 +408,7 @@ def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on()
         for field, other in (others | kinds).items()
     }
     changes["actuators"] = 3
+    changes |= {"transmit.measurement": "on_change", "transmit.command": "on_change", "transmit.heartbeat_s": 0.02}
     plain = PAPER.model_dump()
     leaves = {
         f"{name}.{field}" if isinstance(value, dict) else name
