@@ -134,7 +134,9 @@ class Status(Message):
     role: str
     state: str
     session: str | None = None
-    cause: str | None = Field(default=None, description="plant: why it may not be driven, where that is so")
+    cause: str | None = Field(
+        default=None, description="plant: why it may not be driven; controller: why it claims none; where that is so"
+    )
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
     uptime_s: float
     ticks: int = Field(description="ticks since start")

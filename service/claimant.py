@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import uuid
 from typing import Final
 
@@ -104,3 +105,8 @@ class Claimant:
             except ValidationError:
                 continue
         return None
+
+
+def controller_name() -> str:
+    """A name for this controller that no other has: host names repeat, so a few random digits follow the process id."""
+    return f"controller-{os.getpid()}-{uuid.uuid4().hex[:4]}"

@@ -8,11 +8,9 @@ does the rest.
 
 from __future__ import annotations
 
-import os
 import time
-import uuid
 from collections.abc import Callable
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import zenoh
 from pydantic import ValidationError
@@ -22,17 +20,19 @@ from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, prepare_p
 from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
 from protocol.links import ZenohLink
-from protocol.messages import Lapse, Status, Telemetry, report, summary
+from protocol.messages import Lapse, Status, report, summary
 from protocol.role import Role
 from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask, Reference
+from service.assurance import Assurance, gains_of
 from service.claimant import Claimant
 from service.controller import Controller
 from service.hearing import Heard, Hearing
 from service.law import LawSettings
 from service.live import Live
 from service.settings import ControllerSettings
+from service.telling import telemetry_of
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 CLAIM_PERIOD_S: Final = 0.25
@@ -81,7 +81,8 @@ class Daemon:
         self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
         self._claimant = Claimant(role, loop, wire, auto_arm=settings.auto_arm)
-        self._live = Live(role, law, reference, settings, rolls=wire.actuators == 3)
+        self._assurance = Assurance(role, wire, law, reference, settings)
+        self._live = Live(role, law, reference, settings, self._assurance, rolls=wire.actuators == 3)
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
         self._recorders = 0
@@ -113,8 +114,7 @@ class Daemon:
         try:
             finished = False
             while not finished and not role.stop.is_set():
-                ready = self._recorders or not self._settings.require_recorder
-                link = self._claim() if ready and self._machine.state is State.SEARCHING else None
+                link = self._claim() if self._may_claim() and self._machine.state is State.SEARCHING else None
                 if link is None:
                     self._publish_when_due()
                     role.stop.wait(CLAIM_PERIOD_S)
@@ -217,6 +217,13 @@ class Daemon:
 
     # ── the session ──
 
+    def _may_claim(self) -> bool:
+        recorded = self._recorders > 0 or not self._settings.require_recorder
+        blocks = self._assurance.blocks
+        if recorded or blocks:
+            self._assurance.tell()
+        return recorded and not blocks
+
     def _claim(self) -> ZenohLink | None:
         if self._controller.tick_index >= 0:  # made before the claim: once granted, every tick counts
             self._refused += self._controller.refused
@@ -288,8 +295,19 @@ class Daemon:
         self._machine.fire(Trigger.RECALL)
         return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
 
+    def promise(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> dict[str, Any] | None:
+        """What the theorem promises of a configuration, for the contract; in any thread, before `reconfigure`.
+
+        Raises:
+            UncertifiedError: It must hold, would not, and a session runs: no vehicle is dropped for a configuration.
+        """
+        required = settings.require_certificate and self._claimant.session is not None
+        self._assurance.admit(*self._live.prospect(law, reference), required=required)
+        return self._assurance.promise(gains_of(law), reference)
+
     def reconfigure(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> None:
         """Take over gains, reference and settings between two ticks."""
+        self._assurance.require(settings.require_certificate)
         self._live.configure(settings)
         self._live.adopt(law, reference)
         self._take(settings)
@@ -302,22 +320,8 @@ class Daemon:
     # ── what it tells ──
 
     def _publish_telemetry(self) -> None:
-        controller = self._controller
         assert self._claimant.session is not None
-        self._role.publish(
-            "telemetry",
-            Telemetry(
-                session=self._claimant.session,
-                tick=controller.tick_index,
-                counter=controller.counter,
-                attitude_error=controller.attitude_error,
-                rate_error=controller.rate_error,
-                desired=controller.desired,
-                damping_estimate=controller.damping_estimate,
-                voltages=tuple(controller.voltages),
-                sign=controller.sign,
-            ),
-        )
+        self._role.publish("telemetry", telemetry_of(self._controller, self._claimant.session))
 
     def _publish_when_due(self) -> None:
         if time.monotonic_ns() >= self._status_due:
@@ -331,6 +335,7 @@ class Daemon:
                 role=self._role.role,
                 state=self._machine.state,
                 session=self._claimant.session,
+                cause=self._assurance.blocks,
                 uptime_s=self._role.uptime_s,
                 ticks=self._ticks,
                 rate_hz=(self._ticks - self._status_ticks) / (now - self._status_time),
@@ -346,8 +351,3 @@ class Daemon:
         )
         self._status_ticks, self._status_time = self._ticks, now
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
-
-
-def controller_name() -> str:
-    """A name for this controller that no other has: host names repeat, so a few random digits follow the process id."""
-    return f"controller-{os.getpid()}-{uuid.uuid4().hex[:4]}"

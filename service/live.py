@@ -19,6 +19,7 @@ from protocol import topics
 from protocol.attitude import Vector, distance, to_euler
 from protocol.role import Role
 from protocol.verbs import Answer, Change, Gains, Hold, Points, Reference, Setpoint, Stream, Track
+from service.assurance import Assurance, gains_of
 from service.controller import Controller
 from service.law import LawSettings
 from service.reference import FollowError, Limits, Plan
@@ -26,11 +27,6 @@ from service.settings import ControllerSettings
 
 START_S: Final = 1.0
 """The least time for the way to a reference that is far when a session begins [s]."""
-
-
-def gains_of(law: LawSettings) -> Gains:
-    """The gains of a configured law."""
-    return Gains(C1=law.C1, C2=law.C2, Gamma=law.Gamma)
 
 
 def _described(reference: Reference) -> str:
@@ -55,6 +51,7 @@ class Live:
         law: The gains to begin with.
         reference: The reference to begin with.
         settings: How far a reference may go.
+        assurance: What the theorem promises of it; nobody asks if None.
         rolls: Whether the vehicle can roll.
 
     Attributes:
@@ -62,9 +59,17 @@ class Live:
     """
 
     def __init__(
-        self, role: Role, law: LawSettings, reference: Reference, settings: ControllerSettings, *, rolls: bool
+        self,
+        role: Role,
+        law: LawSettings,
+        reference: Reference,
+        settings: ControllerSettings,
+        assurance: Assurance | None = None,
+        *,
+        rolls: bool,
     ) -> None:
         self._role = role
+        self._assurance = assurance
         self._rolls = rolls
         self._gains = gains_of(law)
         self._reference: Reference = reference
@@ -87,9 +92,14 @@ class Live:
     def serve(self) -> None:
         """Listen to operators."""
         role = self._role
-        role.serve("set_gains", Gains, lambda gains: lambda: self.set_gains(gains))
-        role.serve("track", Track, lambda track: self.track(track.reference, track.within_s))
+        role.serve("set_gains", Gains, self._asked_gains)
+        role.serve("track", Track, self._asked_reference)
         role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), self._streamed)
+
+    def prospect(self, law: LawSettings, reference: Reference) -> tuple[Gains, Reference]:
+        """The gains and the reference there would be after `adopt`."""
+        (gains, configured), new = self._adopted, gains_of(law)
+        return new if new != gains else self._gains, reference if reference != configured else self._followed
 
     def adopt(self, law: LawSettings, reference: Reference) -> None:
         """Take over what differs in a configuration that was read again; what it leaves alone stays as it is."""
@@ -107,6 +117,7 @@ class Live:
                     self.track(reference, Track(reference=reference).within_s)()
                 except FollowError as error:
                     self._role.event("fault", f"the configured reference is not followed: {error}", self._session)
+        self._assure()
 
     # ── the loop's side ──
 
@@ -155,6 +166,43 @@ class Live:
         self._role.event("changed", text, self._session)
 
     # ── what can be asked ──
+
+    def _asked_gains(self, gains: Gains) -> Callable[[], Answer]:
+        def act() -> Answer:
+            self._admit(self._gains.model_copy(update=changed), self._followed)  # looked up, unless more has changed
+            answer = self.set_gains(gains)
+            self._assure()
+            return answer
+
+        self._running()
+        changed = {name: value for name, value in gains if value is not None}
+        self._admit(self._gains.model_copy(update=changed), self._followed)
+        return act
+
+    def _asked_reference(self, track: Track) -> Callable[[], Answer]:
+        def act() -> Answer:
+            self._admit(self._gains, track.reference)
+            answer = follow()
+            self._assure()
+            return answer
+
+        follow = self.track(track.reference, track.within_s)
+        self._running()
+        self._admit(self._gains, track.reference)
+        return act
+
+    def _admit(self, gains: Gains, reference: Reference) -> None:
+        if self._assurance is not None:
+            self._assurance.admit(gains, reference)
+
+    def _assure(self) -> None:
+        if self._assurance is not None:
+            self._assurance.take(self._gains, self._followed)
+
+    @property
+    def _followed(self) -> Reference:
+        """The reference of which the theorem is asked: a stream's set-points are not known beforehand."""
+        return self._stream or self._reference
 
     def set_gains(self, gains: Gains) -> Answer:
         """Use other gains from this tick on."""

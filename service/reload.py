@@ -22,6 +22,7 @@ LIVE: Final = {
         "controller.max_reference_rate",
         "controller.max_reference_tilt_deg",
         "controller.auto_arm",
+        "controller.require_certificate",
     ),
     "plant": ("plant.limits", "plant.watchdog_s", "plant.truth_rate_hz"),
     "recorder": ("recorder.chunk_s", "recorder.max_file_mb", "recorder.max_file_s", "recorder.keep_gb"),
@@ -50,7 +51,8 @@ def reload_on_hangup(
         settings: Its configuration so far.
         load: Reads it again; raises ConfigError.
         take_over: Given the new configuration between two ticks, takes what is in `LIVE`.
-        promise: What the theorem promises of an effective configuration, for the contract.
+        promise: What the theorem promises of an effective configuration, for the contract; raises an AeroloopError
+            where it must hold and does not, and nothing changes.
     """
     current = settings
     effective = settings.contract()
@@ -58,10 +60,10 @@ def reload_on_hangup(
     def reload() -> Action:
         nonlocal current, effective
         before, now = current, load()
-        current = now
         lines = differences(before, now, role.role)
-        effective = _with_what_is_live(effective, now.contract(), role.role)
-        contract, promised = effective, promise(effective)
+        contract = _with_what_is_live(effective, now.contract(), role.role)
+        promised = promise(contract)
+        current, effective = now, contract
 
         def take() -> None:
             take_over(now)

@@ -39,6 +39,11 @@ class ControllerSettings(BaseModel):
         description="a session that begins further than this from its reference first goes there smoothly [deg]",
     )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
+    require_certificate: bool = Field(
+        default=False,
+        description="do not claim unless the theorem holds of this configuration (`aeroloop lab certify`), and refuse "
+        "an operator's change after which it would not",
+    )
 
 
 class RecorderSettings(BaseModel):

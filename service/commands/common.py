@@ -123,7 +123,7 @@ def run_role(
 
     def live() -> None:
         from protocol.role import Role
-        from service.daemon import controller_name
+        from service.claimant import controller_name
 
         name = controller_name() if kind == "controller" else None
         with Role(kind, settings.vehicle, settings.network, settings.contract(), name) as role:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -111,17 +111,20 @@ def controller(
     def run(role: Role) -> None:
         from service.config import from_contract
         from service.daemon import Daemon
-        from service.promise import promise_of
         from service.reload import reload_on_hangup
 
-        role.configured(settings.contract(), promise_of(settings))
         daemon = Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller)
+
+        def promise(now: Settings) -> dict[str, Any] | None:
+            return daemon.promise(now.law, now.reference, now.controller)
+
+        role.configured(settings.contract(), promise(settings))
         reload_on_hangup(
             role,
             settings,
             load,
             lambda new: daemon.reconfigure(new.law, new.reference, new.controller),
-            lambda effective: promise_of(from_contract(effective)),
+            lambda effective: promise(from_contract(effective)),
         )
         daemon.run()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from plant_emulator.endpoint import Endpoint
 from protocol import topics
-from protocol.messages import Claim, Contract, Telemetry
+from protocol.messages import Claim, Contract
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
@@ -15,6 +15,7 @@ from service.log.intake import Taken
 from service.log.mcap_records import CHANGE_METADATA, CONTRACT_METADATA
 from service.log.writer import LogFile
 from service.reference import Plan
+from service.telling import telemetry_of
 
 START_NS = 1_800_000_000_000_000_000
 VEHICLE, SESSION = "aero", "s1"
@@ -89,25 +90,11 @@ def make_log(
             logged = bytes([command[0], command[1] ^ 0x01]) if k == spoil else command
             write("command", logged, at + 300_000)
             if k % 10 == 0:
-                write("telemetry", _telemetry(controller).encode(), at + 300_001)
+                write("telemetry", telemetry_of(controller, SESSION).encode(), at + 300_001)
         measurement = endpoint.tick(command, k + 1)
         if k % chunk_every == chunk_every - 1:
             log.commit()
     log.end()
-
-
-def _telemetry(controller: Controller) -> Telemetry:
-    return Telemetry(
-        session=SESSION,
-        tick=controller.tick_index,
-        counter=controller.counter,
-        attitude_error=controller.attitude_error,
-        rate_error=controller.rate_error,
-        desired=controller.desired,
-        damping_estimate=controller.damping_estimate,
-        voltages=tuple(controller.voltages),
-        sign=controller.sign,
-    )
 
 
 AN_OPERATORS_WORDS: dict[int, tuple[Gains | None, Reference | None]] = {
