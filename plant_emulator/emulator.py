@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 
 from plant_emulator.driver import Driver
+from plant_emulator.emulated import EmulatedPlant
+from plant_emulator.endpoint import Endpoint
 from plant_emulator.faults import Fault
 from plant_emulator.faulty_stream import FaultyStream
 from plant_emulator.front import Front
@@ -24,6 +26,19 @@ from protocol.messages import Truth
 from protocol.role import Role
 from protocol.transmit import SILENCE
 from protocol.verbs import Advance, Answer, Inject
+
+
+def truth_of(plant: EmulatedPlant, endpoint: Endpoint) -> Truth:
+    """The state now, and which measurement was taken of it."""
+    state, session = plant.truth(), endpoint.session
+    return Truth(
+        tick=endpoint.ticked,
+        attitude=state.attitude,
+        rate=state.rate,
+        voltages=state.voltages,
+        session=session,
+        session_tick=None if session is None else endpoint.session_tick,
+    )
 
 
 class FaultError(AeroloopError):
@@ -105,10 +120,7 @@ class EmulatorOnZenoh(Emulator):
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         echo = super()._tick(arrival, k)
         if self._truth_every and k % self._truth_every == 0:
-            state = self._emulated.truth()
-            self._role.publish(
-                "truth", Truth(tick=k, attitude=state.attitude, rate=state.rate, voltages=state.voltages)
-            )
+            self._role.publish("truth", truth_of(self._emulated, self.endpoint))
         if self._steps is not None:
             self._steps -= 1
         return echo

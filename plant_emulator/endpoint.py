@@ -126,9 +126,14 @@ class Endpoint(Tenancy):
         return self._tick
 
     @property
+    def session_tick(self) -> int:
+        """Tick of the last measurement since the session's first, which has 0."""
+        return self._tick - self._session_tick
+
+    @property
     def counter(self) -> int:
         """Counter of the last measurement."""
-        return (self._tick - self._session_tick) % COUNTERS
+        return self.session_tick % COUNTERS
 
     def _encoded(self, seen: Measurement) -> list[float]:
         attitude, rate = seen

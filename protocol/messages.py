@@ -179,6 +179,8 @@ class Truth(Message):
     attitude: tuple[float, float, float, float] = Field(description="q, body relative to inertial [1]")
     rate: tuple[float, float, float] = Field(description="ω, body frame [rad/s]")
     voltages: tuple[float, ...] = Field(description="voltages at the motors [V]")
+    session: str | None = Field(default=None, description="whose measurement was taken of this very state, if one was")
+    session_tick: int | None = Field(default=None, description="that measurement's tick since the session's first")
 
 
 class Event(Message):

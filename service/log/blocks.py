@@ -41,6 +41,9 @@ class Computed(NamedTuple):
         attitude_error: ε̃ [1]. Shape (n, 3).
         rate_error: ω_e [rad/s]. Shape (n, 3).
         voltages: u before quantization [V]; NaN where the law gave no number. Shape (n, actuators).
+        sign: ±1, the equilibrium approached. Shape (n, 1).
+        gain: C₁'s diagonal [1/s]. Shape (n, 3).
+        damping_estimate: θ̂ that the law went by [N·m·s/rad]. Shape (n, 3).
     """
 
     attitude: Array
@@ -49,6 +52,9 @@ class Computed(NamedTuple):
     attitude_error: Array
     rate_error: Array
     voltages: Array
+    sign: Array
+    gain: Array
+    damping_estimate: Array
 
 
 class BlockController(Controller):
@@ -89,7 +95,8 @@ class BlockController(Controller):
             vectors, rates = levels(self.wire.attitude, codes[:, :3]), levels(self.wire.rate, codes[:, 3:])
             valid = np.flatnonzero(~np.isnan(np.hstack([vectors, rates])).any(axis=1))
             self.invalid += len(k) - len(valid)
-            computed = Computed(*(np.full((len(k), columns), nan) for columns in (4, 4, 3, 3, 3, self.wire.actuators)))
+            shape = (4, 4, 3, 3, 3, self.wire.actuators, 1, 3, 3)
+            computed = Computed(*(np.full((len(k), columns), nan) for columns in shape))
             for start in range(0, len(valid), self._rows):
                 some = valid[start : start + self._rows]
                 for column, values in zip(
@@ -137,6 +144,7 @@ class BlockController(Controller):
             self._choose_sign()
         given["s"][:n] = self.sign
         self._laws.inputs["theta"][:] = self._theta
+        began_with = np.array(self._theta)
         self._laws()
         self._stand_at(n - 1)
         self._theta[:] = self._theta_next
@@ -145,7 +153,9 @@ class BlockController(Controller):
         u = found["u"][:n, self._first_motor :].copy()
         u[np.isnan(u.sum(axis=1))] = nan  # ∞ − ∞ is no number either
         self.failed |= bool(np.isnan(u).any())
-        return Computed(attitude, given["q_d"][:n], rates, found["eps_e"][:n], found["omega_e"][:n], u)
+        theta = np.vstack([began_with, found["theta_next"][: n - 1]])
+        computed = attitude, given["q_d"][:n], rates, found["eps_e"][:n], found["omega_e"][:n]
+        return Computed(*computed, u, given["s"][:n], given["C1"][:n], theta)
 
     def _lay_out(self, t: Array, rows: slice) -> None:
         """The gains of now, and of the plan of now the pieces that hold at times t [s]."""

@@ -10,6 +10,7 @@ from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
 
+from plant_emulator.settings import PlantSettings
 from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.messages import Contract, Lapse
@@ -90,6 +91,18 @@ class LogFiles:
             if role in self.contracts:
                 return from_contract(self.contracts[role].config)
         raise ReviewError(f"{self.name} has no contract of a controller or a plant, so its frames cannot be read")
+
+    @property
+    def plant(self) -> PlantSettings:
+        """The plant's own configuration if the logs have it, else what the controller took for it. Raises as above."""
+        contract = self.contracts.get("plant")
+        return self.settings.plant if contract is None else from_contract(contract.config).plant
+
+    @property
+    def promised(self) -> dict[str, Any] | None:
+        """The certificate in the controller's contract, if there is one."""
+        contract = self.contracts.get("controller")
+        return None if contract is None else contract.certificate
 
     @property
     def name(self) -> str:

@@ -44,9 +44,10 @@ def findings_of(
     for name, why in (("period", "fewer than two measurements"), ("latency", "no measurement was answered")):
         if name not in timing:
             reasons[f"timing.{name}"] = why
+    theorem, unknown = observer.trial.findings()
     return Findings(
         **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},
-        reasons=reasons,
+        reasons=reasons | unknown,
         vehicle=vehicle,
         session=session,
         sessions=sessions,
@@ -58,6 +59,7 @@ def findings_of(
         saturated=observer.saturated,
         invalid=observer.invalid,
         losses=story.losses(vehicle),
+        theorem=theorem,
         marks=story.marks(which, changes, settings.loop.period, observer.clock(AROUND_S)),
     )
 

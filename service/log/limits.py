@@ -27,6 +27,8 @@ UNITS: Final[dict[str, str]] = {
     **{f"timing.period.{name}": "µs" for name in _PERCENTILES},
     **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
     **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
+    **{f"theorem.{name}": "" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "broken")},
+    **{f"theorem.{name}": "°" for name in ("error_deg", "true_error_deg", "radius_deg")},
 }
 """What can be held to a limit, as it is called in the findings, and its unit."""
 
@@ -34,11 +36,15 @@ SHORT: Final[dict[str, str]] = {
     "skipped": "skipped_ticks",
     "gaps": "gap_count",
     **{f"{name}.{p}": f"timing.{name}.{p}" for name in ("latency", "period") for p in _PERCENTILES},
+    **{name: f"theorem.{name}" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "radius_deg")},
+    "settled_error_deg": "theorem.error_deg",
+    "true_settled_error_deg": "theorem.true_error_deg",
+    "lemma_broken": "theorem.broken",
     **{f"age.{name}": f"age_us.{name}" for name in ("p50", "p99", "max")},
 }
 """Other names for some of them."""
 
-NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us."))), *SHORT)
+NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us.", "theorem."))), *SHORT)
 
 
 class LimitError(AeroloopError):

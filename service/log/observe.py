@@ -18,9 +18,11 @@ from protocol.attitude import Quaternion
 from protocol.messages import Telemetry
 from service.config import Settings
 from service.log.codes import codes_in
-from service.log.panels import columns_of, panels_of
+from service.log.grounds import Library
+from service.log.panels import columns_of, panels_of, with_level
 from service.log.report import Array, Gap, Panel, Spread
 from service.log.tallies import BLOCK, Durations, Integers, Outermost, Told
+from service.log.theorem import Trial
 from service.log.thin import ThinnedLines
 from service.log.ticks import Ticks
 
@@ -32,12 +34,14 @@ class Observer:
 
     Args:
         settings: The configuration of its controller.
+        trial: Holds it against the theorem; one of the configuration alone if None.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, trial: Trial | None = None) -> None:
         wire = settings.wire
         self._period = settings.loop.period
-        self._columns = columns_of(settings)
+        self.trial = trial or Trial(Library(settings).of(()), (), settings.loop.period, None)
+        self._columns = columns_of(settings, theta=self.trial.damping_known)
         self._lines = ThinnedLines(2 + len(self._columns))  # k and time of publication, then what is drawn
         self._ticks: list[Ticks] = []
         self._wire = wire
@@ -141,7 +145,8 @@ class Observer:
     def lines(self) -> tuple[Array, list[Panel]]:
         """Times on the law's clock [s] and panels."""
         points = self._lines.points()
-        return points[:, 0] * self._period, panels_of(self._columns, points[:, 2:])
+        panels = panels_of(self._columns, points[:, 2:])
+        return points[:, 0] * self._period, with_level(panels, "z_norm", "guaranteed in the end", self.trial.radius)
 
     def clock(self, within_s: float) -> Callable[[int], float | None]:
         """The law's clock [s] at a time of publication [ns]; None further than this from the session.
@@ -208,6 +213,7 @@ class Observer:
                     latency * 1e-3,
                     periods * 1e-3,
                     self._damping.on(k),
+                    self.trial.ticks(ticks),
                 ]
             )
         )

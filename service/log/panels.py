@@ -8,8 +8,11 @@ has that figure. What the paper has no figure of follows: timing, and what is to
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import groupby
 from typing import Final, Literal, NamedTuple
+
+import numpy as np
 
 from service.config import Settings
 from service.log.report import Array, Line, Panel
@@ -63,9 +66,14 @@ class Column(NamedTuple):
     desired: bool = False
 
 
-def columns_of(settings: Settings) -> list[Column]:
-    """What is kept of every tick, in the order in which it is drawn; as `Observer` gathers it."""
-    return list(_columns(case_of(settings), settings.wire.actuators))
+def columns_of(settings: Settings, *, theta: bool = False) -> list[Column]:
+    """What is kept of every tick, in the order in which it is drawn; as `Observer` gathers it.
+
+    Args:
+        settings: The configuration of the controller.
+        theta: Whether the plant's damping is known, so that V has all its terms.
+    """
+    return list(_columns(case_of(settings), settings.wire.actuators, theta=theta))
 
 
 def panels_of(columns: list[Column], values: Array) -> list[Panel]:
@@ -84,7 +92,19 @@ def panels_of(columns: list[Column], values: Array) -> list[Panel]:
     return panels
 
 
-def _columns(case: Case, actuators: int) -> Iterator[Column]:
+def with_level(panels: list[Panel], group: str, label: str, level: float | None) -> list[Panel]:
+    """Panels, those of a group with a level across them that the others are to stay below; None is no level."""
+    if level is None:
+        return panels
+    return [
+        replace(panel, lines=[*panel.lines, Line(label, np.full(len(panel.lines[0].values), level), desired=True)])
+        if panel.group == group
+        else panel
+        for panel in panels
+    ]
+
+
+def _columns(case: Case, actuators: int, *, theta: bool) -> Iterator[Column]:
     def titled(name: str, quantity: str) -> str:
         return title_of(name, quantity, case)
 
@@ -106,3 +126,7 @@ def _columns(case: Case, actuators: int) -> Iterator[Column]:
     yield Column("period", "Period between measurements", "period", "µs", "period")
     for label in ("θ̂₁", "θ̂₂", "θ̂₃"):
         yield Column("damping_estimate", "Damping estimate", label, "N·m·s/rad", "estimated")
+    yield Column("z_norm", "Error of Theorem 1", "‖z‖", "1", "measured")
+    yield Column("z_norm", "Error of Theorem 1", "‖z‖", "1", "true")
+    yield Column("lyapunov", "Lyapunov function", "V", "N·m", "measured, without θ̃")
+    yield Column("lyapunov", "Lyapunov function", "V", "N·m", "true" if theta else "true, without θ̃")

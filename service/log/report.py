@@ -64,6 +64,52 @@ class Check(BaseModel):
     found: str = Field(description="what was found, with its unit")
 
 
+class LemmaCheck(BaseModel):
+    """An inequality of Lemma 1, or of those that it builds on, held against true states."""
+
+    model_config = ConfigDict(frozen=True)
+
+    equation: str = Field(description="number in the paper")
+    what: str = Field(description="its left-hand side, in the paper's letters")
+    samples: int
+    broken: int = Field(description="samples at which it does not hold")
+    closest: float | None = Field(description="largest left-hand side as a share of the bound")
+    closest_s: float | None = Field(description="when that was, on the law's clock [s]")
+    broken_s: float | None = Field(description="when it was first broken [s]; null where never")
+
+
+class TheoremFindings(BaseModel):
+    """What Theorem 1 promises of a session, and what the session did.
+
+    The transient is three of the law's slower time constant long: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
+    holds: bool | None = Field(description="null where nothing can be promised")
+    radius: float | None = Field(description="√(δ_Q/k), where ‖z‖ ends [1, rad/s]")
+    radius_deg: float | None = Field(description="the attitude error that this allows [deg]")
+    transient_s: float = Field(description="how long the transient is taken to last [s]")
+    until_s: float | None = Field(
+        description="judged until gains or reference first changed, on the law's clock [s]; null: to the end"
+    )
+    z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the quantized signals [1, rad/s]")
+    z_norm_share: float | None = Field(description="that as a share of the radius")
+    error_deg: float | None = Field(description="largest attitude error after the transient, as the controller saw it")
+    true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the true states that were told")
+    true_error_deg: float | None = Field(description="likewise of the attitude error [deg]")
+    damping_known: bool = Field(description="whether the true V that is drawn has its θ̃ term: the plant's θ is known")
+    samples: int = Field(description="true states that belong to a tick that is judged")
+    outside: dict[str, int] = Field(
+        description="how many of them do not satisfy a premise: (C.28) and (C.29), that sensors err by no more than "
+        "the quantizers, and Assumption 3, the attitude error that the certificate assumes"
+    )
+    judged: int = Field(description="how many satisfy all of them; the inequalities are judged by these alone")
+    lemma: list[LemmaCheck]
+    broken: int | None = Field(description="inequalities broken, over all of them and all samples")
+
+
 class Findings(Figures):
     """Figures of merit, and what else a log tells. What could not be had is null, with the reason in `reasons`."""
 
@@ -86,6 +132,7 @@ class Findings(Figures):
     invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
     losses: dict[str, int] = Field(description="messages that the recorder knows it has lost, by topic")
     marks: list[Mark]
+    theorem: TheoremFindings | None = None
     checks: list[Check] = Field(default_factory=list)
 
 

@@ -27,12 +27,14 @@ from service.log.codes import codes_in, levels
 from service.log.files import LogFiles, ReviewError, Which
 from service.log.filling import Read
 from service.log.findings import facts_of, findings_of, name_of
+from service.log.grounds import Library, damping_of
 from service.log.limits import Limit
 from service.log.observe import Observer
 from service.log.pairing import Pairing, Sessions, Taker, without_collections
 from service.log.report import Findings, Report
 from service.log.story import Story
 from service.log.tallies import BLOCK
+from service.log.theorem import Trial
 from service.log.ticks import Tick, Ticks
 
 
@@ -44,6 +46,7 @@ class Session(Pairing):
         changes: What its controller followed from which tick on, in order.
         lapses: Where it did not compute with the plant's levels.
         watch: Called with every tick, in order.
+        trial: Holds it against the theorem; one of the configuration alone if None.
 
     Attributes:
         score: Its figures of merit; complete after `finish`, as is what the observer has found.
@@ -56,11 +59,12 @@ class Session(Pairing):
         changes: Sequence[Change] = (),
         lapses: Sequence[Lapse] = (),
         watch: Callable[[Tick], None] | None = None,
+        trial: Trial | None = None,
     ) -> None:
         super().__init__(settings.wire, settings.loop, lapses)
         self.settings = settings
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
-        self.observer = Observer(settings)
+        self.observer = Observer(settings, trial)
         self._controller = BlockController(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._changes = deque(changes)
         self._watch = watch
@@ -131,6 +135,9 @@ class Session(Pairing):
             computed.attitude_error,
             computed.rate_error,
             voltages,
+            computed.sign[:, 0],
+            computed.gain,
+            computed.damping_estimate,
         )
         valid = ~np.isnan(computed.attitude[:, 0])  # of a measurement without a valid value there is none
         judged = seen.where(valid)
@@ -188,7 +195,10 @@ class Run(Sessions[Session]):
 
     def _truth(self, vehicle: str, payload: bytes, published_ns: int) -> None:
         if session := self._running.get(vehicle):
-            session.observer.truth(Truth.model_validate_json(payload).attitude, published_ns)
+            truth = Truth.model_validate_json(payload)
+            session.observer.truth(truth.attitude, published_ns)
+            if truth.session is None or self.get((vehicle, truth.session)) is session:
+                session.observer.trial.truth(truth.session_tick, truth.attitude, truth.rate)
 
 
 class Review(NamedTuple):
@@ -263,9 +273,12 @@ def read(
         files = LogFiles(paths)
         settings = files.settings
 
+        library, damping = Library(settings, files.promised), damping_of(files.plant)
+
         def session(which: Which) -> Session:
-            told = files.changes.get(which, ()), files.lapses.get(which, ())
-            return Session(settings, *told, watch(which, settings) if watch else None)
+            changes, watched = files.changes.get(which, ()), watch(which, settings) if watch else None
+            trial = Trial(library.of(changes), changes, settings.loop.period, damping)
+            return Session(settings, changes, files.lapses.get(which, ()), watched, trial)
 
         run = Run(session)
         for take, payload, published_ns in files.routed(run.route, progress):

@@ -79,6 +79,10 @@ def _saturated(name: str) -> Callable[[Findings], str | None]:
     return lambda f: percent(f.saturated[name]) if name in f.saturated else None
 
 
+def _theorem(name: str, form: str) -> Callable[[Findings], str | None]:
+    return lambda f: None if f.theorem is None else _digits(form)(getattr(f.theorem, name))
+
+
 _whole, _tenth, _hundredth = _digits(",.0f"), _digits(",.1f"), _digits(",.2f")
 _z_track = _digits(",.2f", 1e4)
 
@@ -104,6 +108,13 @@ FIGURES: Final = (
     _Figure("invalid", "frames without a valid value", "", lambda f: _whole(sum(f.invalid.values()))),
     _Figure("losses", "messages the recorder lost", "", lambda f: _whole(sum(f.losses.values()))),
     _Figure("trips", "trips", "", lambda f: _whole(len(f.trips))),
+    _Figure("theorem.radius", "‖z‖ that the theorem guarantees in the end", "", _theorem("radius", ".4f")),
+    _Figure("theorem.z_norm", "largest ‖z‖ after the transient", "", _theorem("z_norm", ".4f")),
+    _Figure("theorem.true_z_norm", "… of the true state", "", _theorem("true_z_norm", ".4f")),
+    _Figure("theorem.radius_deg", "attitude error that is guaranteed", "°", _theorem("radius_deg", ",.2f")),
+    _Figure("theorem.error_deg", "largest attitude error after the transient", "°", _theorem("error_deg", ",.2f")),
+    _Figure("theorem.true_error_deg", "… of the true state", "°", _theorem("true_error_deg", ",.2f")),
+    _Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _theorem("broken", ",.0f")),
     _Figure("duration_s", "duration", "s", lambda f: seconds(f.duration_s)),
 )
 

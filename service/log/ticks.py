@@ -26,6 +26,9 @@ class Tick(NamedTuple):
         attitude: q as measured. The other quantities of the law likewise, in its units.
         voltages: What was commanded, or, of a measurement that was passed over, what the next command said [V]; NaN
             where a command had no valid value.
+        sign: ±1, the equilibrium approached.
+        gain: C₁'s diagonal [1/s].
+        damping_estimate: θ̂ as the law used it [N·m·s/rad].
     """
 
     k: int
@@ -38,6 +41,9 @@ class Tick(NamedTuple):
     attitude_error: Vector
     rate_error: Vector
     voltages: tuple[float, ...]
+    sign: float
+    gain: Vector
+    damping_estimate: Vector
 
 
 class Ticks(NamedTuple):
@@ -53,6 +59,9 @@ class Ticks(NamedTuple):
     attitude_error: Array
     rate_error: Array
     voltages: Array
+    sign: Array
+    gain: Array
+    damping_estimate: Array
 
     @classmethod
     def joined(cls, blocks: Sequence[Self]) -> Self:
@@ -66,5 +75,5 @@ class Ticks(NamedTuple):
     def each(self) -> Iterator[Tick]:
         """One after the other."""
         latencies = [None if ns != ns else int(ns) for ns in self.latency_ns.tolist()]
-        rows = (map(tuple, column.tolist()) for column in self[3:])
+        rows = (column.tolist() if column.ndim == 1 else map(tuple, column.tolist()) for column in self[3:])
         return map(Tick, self.k.tolist(), self.published_ns.tolist(), latencies, *rows)

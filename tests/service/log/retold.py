@@ -92,5 +92,5 @@ def feed(
     at = START_NS + k * PERIOD_NS
     zero = (0.0, 0.0, 0.0)
     observer.measurement(ZEROS, at)
-    columns = (k, at, float(LATENCY_NS), attitude, desired, zero, zero, zero, zero, (0.0, 0.0))
+    columns = (k, at, float(LATENCY_NS), attitude, desired, zero, zero, zero, zero, (0.0, 0.0), 1.0, zero, zero)
     observer.ticks(Ticks(*(np.array([column]) for column in columns)))

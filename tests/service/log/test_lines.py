@@ -59,6 +59,8 @@ def test_panels_stand_in_the_order_of_the_papers_figures_and_are_named_after_the
         ("latency", "Loop latency"),
         ("period", "Period between measurements"),
         ("damping_estimate", "Damping estimate"),
+        ("z_norm", "Error of Theorem 1"),
+        ("lyapunov", "Lyapunov function"),
     ]
     assert [panel.label for panel in made.panels][:4] == ["η", "ε₁", "ε₂", "ε₃"]
     assert all(line.values.shape == made.time.shape for panel in made.panels for line in panel.lines)
