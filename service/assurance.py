@@ -149,7 +149,7 @@ class Assurance:
             verdict = self.weigh(gains, reference)
             self._role.later(lambda: self._stand_by(gains, reference, verdict))
 
-        threading.Thread(target=weigh, daemon=True).start()
+        threading.Thread(target=weigh, name="weigh", daemon=True).start()
 
     def tell(self) -> None:
         """Tell the verdict, if it is not what was told last."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
 
@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from service.display import figures_table
-from service.log.report import Findings, Mark, Spread
+from service.log.report import Findings, Mark, Spread, TheoremFindings
 
 if TYPE_CHECKING:
     from service.log.replay import SessionReplay
@@ -37,6 +37,9 @@ def review_account(findings: Findings) -> None:
     for label, text in _rows(findings):
         table.add_row(label, text)
     console.print(table)
+    if findings.theorem is not None:
+        console.print()
+        console.print(theorem_table(findings, findings.theorem))
     if findings.marks:
         console.print()
         console.print(_marks_table(findings.marks))
@@ -104,6 +107,43 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
     began = findings.started.replace("T", " ").replace("+00:00", " UTC")
     others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
     yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"
+
+
+def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
+    """What the theorem promises, and what the run did."""
+    table = _labelled()
+
+    def row(label: str, name: str, form: Callable[[float], str]) -> None:
+        value = getattr(found, name)
+        why = findings.reasons.get(f"theorem.{name}", "not known")
+        table.add_row(label, Text(f"— ({why})" if value is None else form(value)))
+
+    table.add_row("the theorem", Text(found.verdict, style="" if found.holds else "bold red"))
+    since = f"since {found.transient_s:.3g} s"
+    row(f"largest ‖z‖ {since}", "z_norm", lambda z: f"{z:.4f}{_beside(found.radius, '.4f')}")
+    row(f"largest error {since}", "error_deg", lambda e: f"{e:.2f}°{_beside(found.radius_deg, '.2f', '°')}")
+    if found.true_z_norm is not None and found.true_error_deg is not None:
+        table.add_row("of the true state", f"‖z‖ {found.true_z_norm:.4f}, error {found.true_error_deg:.2f}°")
+    if found.until_s is not None:
+        table.add_row("judged until", f"{found.until_s:g} s, where gains or reference changed")
+    table.add_row("Lemma 1", Text(_lemma(findings, found), style="bold red" if found.broken else ""))
+    return table
+
+
+def _beside(bound: float | None, form: str, unit: str = "") -> str:
+    return "" if bound is None else f", of {bound:{form}}{unit} guaranteed"
+
+
+def _lemma(findings: Findings, found: TheoremFindings) -> str:
+    """Whether it held: which inequality came closest, or which were broken; and what it was judged by."""
+    if found.broken is None:
+        return f"— ({findings.reasons.get('theorem.broken', 'not known')})"
+    by = f"the {found.judged} of {found.samples} true states that satisfy its premises"
+    if found.broken:
+        which = ", ".join(f"({check.equation}) {check.broken}×" for check in found.lemma if check.broken)
+        return f"broken: {which}, of {by}"
+    closest = max(found.lemma, key=lambda check: check.closest or 0.0)
+    return f"holds at {by}; closest is ({closest.equation}), {100 * (closest.closest or 0.0):.0f} % of its bound"
 
 
 def _marks_table(marks: Sequence[Mark]) -> Table:

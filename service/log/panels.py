@@ -129,4 +129,4 @@ def _columns(case: Case, actuators: int, *, theta: bool) -> Iterator[Column]:
     yield Column("z_norm", "Error of Theorem 1", "‖z‖", "1", "measured")
     yield Column("z_norm", "Error of Theorem 1", "‖z‖", "1", "true")
     yield Column("lyapunov", "Lyapunov function", "V", "N·m", "measured, without θ̃")
-    yield Column("lyapunov", "Lyapunov function", "V", "N·m", "true" if theta else "true, without θ̃")
+    yield Column("lyapunov", "Lyapunov function", "V", "N·m", "true, with θ̃" if theta else "true, without θ̃")

@@ -81,7 +81,7 @@ class LemmaCheck(BaseModel):
 class TheoremFindings(BaseModel):
     """What Theorem 1 promises of a session, and what the session did.
 
-    The transient is three of the law's slower time constant long: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
+    The transient lasts three times the law's slower time constant: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
     """
 
     model_config = ConfigDict(frozen=True)

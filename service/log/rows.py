@@ -86,6 +86,9 @@ def _theorem(name: str, form: str) -> Callable[[Findings], str | None]:
 _whole, _tenth, _hundredth = _digits(",.0f"), _digits(",.1f"), _digits(",.2f")
 _z_track = _digits(",.2f", 1e4)
 
+THEOREM: Final = "theorem."
+"""Keys of what the theorem promises and what became of it begin with this."""
+
 FIGURES: Final = (
     _Figure("z_track", "z_track", "10⁻⁴ s", lambda f: _z_track(f.z_track), main=True),
     _Figure("u_total", "u_total", "V²·s", lambda f: _tenth(f.u_total), main=True),

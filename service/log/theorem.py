@@ -2,7 +2,7 @@
 
 ‖z‖ and V are those that the controller computed, from quantized signals, at every tick; and the true ones at the ticks
 of which an emulator told the true state. A truth says which tick's measurement was taken of it, so nothing is
-interpolated. The transient is three of the law's slower time constant long, by when an initial error has fallen to 5 %.
+interpolated. The transient lasts three times the law's slower time constant, by when an error has fallen to 5 %.
 Everything is judged until an operator first changes gains or reference: from there on another certificate would hold.
 """
 
@@ -219,31 +219,29 @@ class Trial:
 
     def _reasons(self, found: TheoremFindings) -> dict[str, str]:
         reasons = dict[str, str]()
+        no_truth = "the log has no true state of a tick that is judged"
+        if self._untold:
+            no_truth = "the log's true states do not say of which tick they are"
+        changed = f"gains or reference changed at {found.until_s} s"
+        end = "the session ended before" if found.until_s is None else changed
+        short = f"the transient lasts {found.transient_s:.3g} s, and {end}"
+        if found.z_norm is None:
+            reasons |= dict.fromkeys(("z_norm", "z_norm_share", "error_deg"), short)
+        if found.true_z_norm is None:
+            why = short if found.z_norm is None and found.samples else no_truth
+            reasons |= dict.fromkeys(("true_z_norm", "true_error_deg"), why)
+        if found.broken is None:
+            reasons["broken"] = "no true state satisfies the lemma's premises" if found.samples else no_truth
         if found.radius is None:
             nothing = found.verdict.rstrip(".") if found.holds is None else "the theorem does not hold"
             reasons |= dict.fromkeys(("radius", "radius_deg", "z_norm_share"), nothing)
-        if self._untold:
-            no_truth = "the log's true states do not say of which tick they are"
-        else:
-            no_truth = "the log has no true state of a tick that is judged"
-        if found.z_norm is None:
-            end = "it ended before" if found.until_s is None else f"gains or reference changed at {found.until_s:g} s"
-            short = f"the transient lasts {found.transient_s:.3g} s, and {end}"
-            reasons |= dict.fromkeys(("z_norm", "z_norm_share", "error_deg"), short)
-            no_end = short if found.samples else no_truth
-        else:
-            no_end = no_truth
-        if found.true_z_norm is None:
-            reasons |= dict.fromkeys(("true_z_norm", "true_error_deg"), no_end)
-        if found.broken is None:
-            reasons["broken"] = "no true state satisfies the lemma's premises" if found.samples else no_truth
             if self._grounds.bounds is None:
-                reasons["broken"] = reasons["radius"]
+                reasons["broken"] = nothing
         return reasons
 
 
 def transient(law: LawSettings) -> float:
-    """Three of the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near ε̃ = 0, and z₂ by J⁻¹C₂ (C.22) [s]."""
+    """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, and z₂ by J⁻¹C₂ (C.22) [s]."""
     return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
 
 

@@ -35,6 +35,7 @@ from protocol.verbs import (
     Track,
 )
 from service import live
+from service.assurance import Assurance
 from service.controller import Controller
 from service.law import LawSettings
 from service.live import Live
@@ -148,15 +149,19 @@ class Loop:
         k: The next tick.
         session: Name of the session, or "".
         log: Of each session, its frames: (tick, measurement, command).
+        assurance: What the theorem promises of it by a wire; Live asks for it if a wire is given.
     """
 
-    def __init__(self, reference: Reference, settings: ControllerSettings, *, rolls: bool = False) -> None:
+    def __init__(
+        self, reference: Reference, settings: ControllerSettings, *, rolls: bool = False, wire: WireSpec | None = None
+    ) -> None:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(role, "join", lambda _: self.network)
             self.role = Role("controller", "aero", NetworkSettings(timestamps=False), {}, name="controller-7")
         self.configured = reference
-        self.live = Live(self.role, LAW, reference, settings, rolls=rolls)
+        self.assurance = Assurance(self.role, wire or WIRE, LAW, reference, settings)
+        self.live = Live(self.role, LAW, reference, settings, self.assurance if wire else None, rolls=rolls)
         self.live.serve()
         self.controller = self.fresh()
         self.k = 0

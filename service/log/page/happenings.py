@@ -39,13 +39,13 @@ def events(reports: Sequence[Report]) -> Html:
     rows = []
     for index, report in enumerate(reports):
         for mark in report.findings.marks:
-            where: Html | str = "–" if mark.time_s is None else _jump(mark.time_s, index, f"{mark.kind} {mark.text}")
+            where: Html | str = "–" if mark.time_s is None else jump(mark.time_s, index, f"{mark.kind} {mark.text}")
             kind = tag("span", mark.kind, class_="kind grave" if grave(mark) else "kind")
-            rows.append([*_run(reports, index), where, kind, mark.role, mark.text])
+            rows.append([*run_cell(reports, index), where, kind, mark.role, mark.text])
     if not rows:
         return tag("p", "Nothing was told: no event, no change, no loss.", class_="quiet")
     return table(
-        [*_run_column(reports), ("Time [s]", True), ("What", False), ("Who", False), (TEXT, False)], rows, tall=True
+        [*run_column(reports), ("Time [s]", True), ("What", False), ("Who", False), (TEXT, False)], rows, tall=True
     )
 
 
@@ -59,11 +59,11 @@ def gaps(reports: Sequence[Report]) -> Html:
         period = period_s(report)
         for gap in report.findings.gaps:
             lasts = "–" if period is None else f"{1e3 * period * gap.ticks:,.4g}"
-            where = _jump(gap.time_s, index, f"gap of {gap.ticks} ticks")
-            rows.append([*_run(reports, index), where, f"{gap.tick:,}", f"{gap.ticks:,}", lasts])
+            where = jump(gap.time_s, index, f"gap of {gap.ticks} ticks")
+            rows.append([*run_cell(reports, index), where, f"{gap.tick:,}", f"{gap.ticks:,}", lasts])
     columns: list[Column] = [("Time [s]", True), ("From tick", True), ("Ticks", True), ("Length [ms]", True)]
     said = f"{total:,} in all" + (f", the longest {len(rows):,} of them listed" if len(rows) < total else "")
-    return joined([tag("p", f"{said}.", class_="quiet"), table([*_run_column(reports), *columns], rows, tall=True)])
+    return joined([tag("p", f"{said}.", class_="quiet"), table([*run_column(reports), *columns], rows, tall=True)])
 
 
 def timing(reports: Sequence[Report]) -> Html:
@@ -74,17 +74,19 @@ def timing(reports: Sequence[Report]) -> Html:
             spread = report.findings.timing.get(name)
             if spread is not None:
                 points = (spread.p50, spread.p90, spread.p99, spread.p999, spread.max)
-                rows.append([*_run(reports, index), f"{name} as published", *map(micros, points), f"{spread.count:,}"])
+                rows.append(
+                    [*run_cell(reports, index), f"{name} as published", *map(micros, points), f"{spread.count:,}"]
+                )
     for index, report in enumerate(reports):
         age = report.findings.age_us
         if age:
             points_or_not = [micros(age[p]) if p in age else "–" for p in ("p50", "p90", "p99", "p999", "max")]
-            rows.append([*_run(reports, index), "age when used", *points_or_not, "–"])
+            rows.append([*run_cell(reports, index), "age when used", *points_or_not, "–"])
     if not rows:
         reasons = {report.findings.reasons.get("latency_us", "not measured") for report in reports}
         return tag("p", f"No durations: {'; '.join(sorted(reasons))}.", class_="quiet")
     heads = ("p50", "p90", "p99", "p99.9", "longest", "count")
-    return table([*_run_column(reports), ("Duration", False), *((head, True) for head in heads)], rows)
+    return table([*run_column(reports), ("Duration", False), *((head, True) for head in heads)], rows)
 
 
 def spread_title(name: str) -> str:
@@ -101,20 +103,20 @@ def wire(reports: Sequence[Report]) -> Html:
             stream = run.measurement if name == "measurement" else run.command
             rates = ["–" if r is None else f"{r:,.{d}f}" for r, d in ((stream.frames_per_s, 1), (stream.bits_per_s, 0))]
             invalid = f"{run.invalid.get(name, 0):,}"
-            streams.append([*_run(reports, index), name, way, *rates, invalid])
+            streams.append([*run_cell(reports, index), name, way, *rates, invalid])
     for name, symbol in (("attitude", "ε"), ("rate", "ω"), ("voltage", "u")):
         for index, report in enumerate(reports):
             run, signal = report.findings, report.settings.get("wire", {}).get(name, {})
             share = percent(run.saturated[name]) if name in run.saturated else "–"
-            values.append([*_run(reports, index), f"{name} {symbol}", *_quantizer(signal), share])
+            values.append([*run_cell(reports, index), f"{name} {symbol}", *_quantizer(signal), share])
     first = table(
-        [*_run_column(reports), ("Frames", False), ("Direction", False), ("Frames/s", True), ("Bit/s", True),
+        [*run_column(reports), ("Frames", False), ("Direction", False), ("Frames/s", True), ("Bit/s", True),
          ("Without a valid value", True)],
         streams,
     )  # fmt: skip
     second = table(
         [
-            *_run_column(reports),
+            *run_column(reports),
             ("Value", False),
             ("Bits", True),
             ("Limit", True),
@@ -132,15 +134,18 @@ def _quantizer(signal: dict[str, Any]) -> tuple[str, str]:
     return "cont" if bits is None else str(bits), f"±{limit:g}" if isinstance(limit, int | float) else "–"
 
 
-def _jump(time_s: float, run: int, what: str) -> Html:
+def jump(time_s: float, run: int, what: str) -> Html:
+    """A button that takes every time axis to a time of a run."""
     shown = seconds(time_s)
     return tag("button", shown, type="button", class_="jump", data_time=time_s, data_run=run,
                aria_label=f"Show {shown} s: {what}")  # fmt: skip
 
 
-def _run(reports: Sequence[Report], index: int) -> list[Html]:
+def run_cell(reports: Sequence[Report], index: int) -> list[Html]:
+    """A row's first cell where there are several runs."""
     return [run_name(reports[index], index, len(reports))] if len(reports) > 1 else []
 
 
-def _run_column(reports: Sequence[Report]) -> list[Column]:
+def run_column(reports: Sequence[Report]) -> list[Column]:
+    """The head of it."""
     return [("Run", False)] if len(reports) > 1 else []

@@ -15,13 +15,16 @@ from string import Template
 from typing import Final
 
 from service.log.files import ReviewError
-from service.log.page import happenings, setup, verdict
+from service.log.page import happenings, setup, theorem, verdict
 from service.log.page.data import group_titles, page_data, spread_names
 from service.log.page.markup import Html, joined, tag
 from service.log.report import Report
 
 SCRIPTS: Final = ("data.js", "window.js", "panels.js", "spreads.js", "controls.js")
 """In the order in which each uses those before it."""
+
+PROVED: Final = ("z_norm", "lyapunov")
+"""Groups of panels that are the theorem's."""
 
 TIME_UNITS: Final = frozenset({"s", "ms", "µs"})
 
@@ -71,9 +74,10 @@ def write_page(reports: Sequence[Report], out: Path) -> None:
 
 def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
     """What the page has: id, title, contents."""
-    broken = verdict.broken(reports)
+    broken, promised = verdict.broken(reports), theorem.theorem(reports)
     in_time = {panel.group for report in reports for panel in report.panels if panel.unit in TIME_UNITS}
     titles = group_titles(reports)
+    proved = {group: titles.pop(group) for group in PROVED if promised and group in titles}
     several = len(reports) > 1
     drawn = _groups(reports, {group: title for group, title in titles.items() if group not in in_time})
     timing = joined([
@@ -87,6 +91,7 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
         *([("differences", "What differs in the configurations", setup.differing(reports))] if several else []),
         *([("broken", "What is missing from the log", broken)] if broken else []),
         ("tracking", "Tracking", joined([_thinned(reports), drawn])),
+        *([("theorem", "What the theorem promises", joined([promised, _groups(reports, proved)]))] if promised else []),
         ("events", "Events", happenings.events(reports)),
         ("timing", "Timing", timing),
         ("gaps", "Gaps", happenings.gaps(reports)),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from service.log.page.markup import Html, joined, tag
 from service.log.report import Check, Findings, Report
-from service.log.rows import Row, Value, figure_rows, seconds
+from service.log.rows import THEOREM, Row, Value, figure_rows, seconds
 
 
 class Judgement(NamedTuple):
@@ -92,11 +92,11 @@ def _facts(run: Findings) -> list[str]:
 
 def figures(reports: Sequence[Report]) -> Html:
     """Figures of merit: of one run as cards and a table of the rest, of several side by side."""
-    rows = figure_rows([report.findings for report in reports])
+    rows = [row for row in figure_rows([report.findings for report in reports]) if not row.key.startswith(THEOREM)]
     if len(reports) > 1:
-        return _table(reports, rows)
+        return figures_table(reports, rows)
     rest = [row for row in rows if not row.main]
-    more = tag("details", tag("summary", "Every other figure"), _table(reports, rest)) if rest else Html("")
+    more = tag("details", tag("summary", "Every other figure"), figures_table(reports, rest)) if rest else Html("")
     return joined([tag("dl", [_card(row) for row in rows if row.main], class_="cards"), more])
 
 
@@ -116,7 +116,8 @@ def _why(value: Value) -> Html | None:
     return tag("small", value.why) if value.why else None
 
 
-def _table(reports: Sequence[Report], rows: Sequence[Row]) -> Html:
+def figures_table(reports: Sequence[Report], rows: Sequence[Row]) -> Html:
+    """Figures of one run, or of several side by side."""
     several = len(reports) > 1
     head = [run_name(report, index, len(reports)) if several else "" for index, report in enumerate(reports)]
     return tag(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+from plant_emulator.emulator import truth_of
 from plant_emulator.endpoint import Endpoint
 from protocol import topics
 from protocol.messages import Claim, Contract
@@ -34,6 +35,7 @@ def make_log(
     changes: dict[int, tuple[Gains | None, Reference | None]] | None = None,
     spoil: int | None = None,
     chunk_every: int = 100,
+    truth_every: int = 0,
 ) -> None:
     """Write a log.
 
@@ -45,10 +47,12 @@ def make_log(
         changes: Gains and reference that an operator sets, by tick.
         spoil: The tick whose command is not logged as it was sent.
         chunk_every: Close a chunk after so many ticks.
+        truth_every: Tell the true state every so many ticks; 0 is never.
     """
     settings = settings or lockstep()
     wire, loop, changes = settings.wire, settings.loop, changes or {}
-    endpoint = Endpoint(settings.plant.build(loop.period), wire, loop.period_ns, lockstep=True)
+    plant = settings.plant.build(loop.period)
+    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True)
     endpoint.claim(
         Claim(controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
     )
@@ -87,6 +91,8 @@ def make_log(
         assert command is not None
         if k >= begin:
             write("measurement", measurement, at)
+            if truth_every and k % truth_every == 0:
+                write("truth", truth_of(plant, endpoint).encode(), at + 1)
             logged = bytes([command[0], command[1] ^ 0x01]) if k == spoil else command
             write("command", logged, at + 300_000)
             if k % 10 == 0:
