@@ -60,12 +60,13 @@ def review(
         kept = Kept()
         with share_bar("reading", hidden=json) as update:
             judged = read(*logs, watch=None if figures is None else kept.watch, progress=update)
-        if figures is not None:
-            from service.log.plots import draw_figures
-
-            for path in draw_figures(judged.session.settings, kept[judged.which], figures):
-                typer.echo(f"aeroloop: drew {path}", err=True)
         report = judged.report(limits)
+        if figures is not None:
+            from service.log.plots import draw_figures, draw_theorem
+
+            drawn = draw_figures(judged.session.settings, kept[judged.which], figures)
+            for path in [*drawn, *draw_theorem(report, figures)]:
+                typer.echo(f"aeroloop: drew {path}", err=True)
         if html is not None:
             write_html([report], html)
         return report

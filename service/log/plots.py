@@ -1,4 +1,4 @@
-"""The paper's Figures C.4–C.14, drawn from a log into PNG files.
+"""The paper's Figures C.4–C.14, drawn from a log into PNG files; and one of what the theorem bounds.
 
 All five quantities are drawn whatever the case; which of them is which of the paper's figures, panels.py says.
 """
@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from service.config import Settings
 from service.log.files import ReviewError
 from service.log.panels import NUMBERS, case_of, title_of
+from service.log.report import Report
 from service.log.ticks import Tick
 
 Array = npt.NDArray[np.float64]
@@ -74,6 +75,43 @@ def draw_figures(settings: Settings, ticks: Sequence[Tick], folder: Path) -> lis
     except OSError as error:
         raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
     return paths
+
+
+def draw_theorem(report: Report, folder: Path) -> list[Path]:
+    """Draw ‖z‖ with its guaranteed radius, and V, into a PNG file, and return its path; none without ticks.
+
+    Args:
+        report: The run.
+        folder: Where; made if need be.
+
+    Raises:
+        ReviewError: The folder cannot be written.
+    """
+    drawn = [panel for panel in report.panels if panel.group in ("z_norm", "lyapunov")]
+    if not drawn:
+        return []
+    figure = Figure(figsize=(8, 1.5 + 2.0 * len(drawn)), layout="constrained")
+    figure.suptitle("What the theorem bounds", fontsize=12)
+    axes: list[Axes] = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0].tolist()
+    for axis, panel in zip(axes, drawn, strict=True):
+        for line in panel.lines:
+            told = np.isfinite(line.values)  # true states come less often than ticks
+            color, style = ("#c8401e", ":") if line.desired else (None, "-")
+            axis.plot(
+                report.time[told], line.values[told], linewidth=0.9, label=line.label, color=color, linestyle=style
+            )
+        axis.set_ylabel(f"{panel.label}{f' [{panel.unit}]' if panel.unit != '1' else ''}")
+        axis.grid(visible=True, color="0.9")
+        axis.margins(x=0)
+        axis.legend(fontsize=9)
+    axes[-1].set_xlabel("time [s]")
+    path = folder / "theorem.png"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=130)
+    except OSError as error:
+        raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
+    return [path]
 
 
 def _column(ticks: Sequence[Tick], name: str) -> Array:

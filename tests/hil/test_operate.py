@@ -142,6 +142,44 @@ def test_a_configuration_read_again_changes_what_can_change_live_and_names_the_r
     assert not any(isinstance(event, Event) and event.kind == "lost" for event in log.events)
 
 
+def test_a_controller_that_must_be_certified_claims_once_it_is_and_refuses_what_would_not_be(
+    hil: Hil, tmp_path: Path
+) -> None:
+    config = tmp_path / "a.toml"
+    gains = "[law]\nC1 = [{0}, {0}, {0}]\n[controller]\nrequire_certificate = true\nstale_s = 2\n"
+    config.write_text(gains.format(3.0))
+    hil.start(settings=PATIENT, drive=False)
+    network = f"network.rendezvous={hil.settings.network.rendezvous}"
+    controller = subprocess.Popen([*AEROLOOP, "controller", "--config", str(config), "--set", network])
+    try:
+        hil.eventually("the verdict", lambda: hil.happened("fault", "claims no vehicle"))
+        hil.run(0.6)  # it claims four times a second where it may
+        assert hil.state("plant") == "idle"
+        assert "Theorem 1 does not hold" in (hil.status("controller").cause or "")
+        config.write_text(gains.format(0.4))
+        os.kill(controller.pid, signal.SIGHUP)
+        hil.eventually("driving", lambda: hil.state("plant") == "driven")
+        assert "Theorem 1 does not hold" in refused(hil, "set-gains", "--C1", "3", "3", "3")
+        config.write_text(gains.format(3.5))
+        os.kill(controller.pid, signal.SIGHUP)
+        hil.eventually("its refusal", lambda: hil.happened("fault", "not reloaded: controller.require_certificate"))
+        assert hil.state("plant") == "driven"
+    finally:
+        controller.terminate()
+        assert controller.wait(30) == 0
+    log = hil.log
+    said = [event for event in log.events if event.role == "controller" and "Theorem 1" in event.text]
+    # It fails, it holds, and what is asked for beside that changes nothing.
+    assert [event.kind for event in said] == ["fault", "changed", "fault"]
+    assert "Theorem 1 holds" in said[1].text
+    gains_set = [change.gains.C1 for _, change in log.messages("change") if isinstance(change, Change) and change.gains]
+    assert set(gains_set) == {(0.4, 0.4, 0.4)}
+    judged = read(log.path).findings.theorem
+    assert judged is not None
+    assert judged.holds
+    assert judged.samples > 0  # the emulator says of which tick its true states are
+
+
 def test_a_controller_on_a_grid_of_its_own_drives_the_plant_too(hil: Hil) -> None:
     hil.start(settings={**PATIENT, "controller.pace": "clock"})
     hil.run(2.0)

@@ -11,7 +11,7 @@ from protocol.verbs import Gains, Hold, Reference, Sinusoid, Stream, Track
 from service.assurance import UncertifiedError, gains_of
 from service.law import LawSettings
 from service.settings import ControllerSettings
-from tests.service.test_live import LAW, FakeTime, Loop
+from tests.service.test_live import LAW, Loop
 
 WIRE = WireSpec()
 FAILING = Gains(C1=(3.0, 3.0, 3.0))
@@ -38,7 +38,7 @@ class Certified(Loop):
 
 
 @pytest.fixture
-def certified(time: FakeTime) -> Certified:  # noqa: ARG001  # the clock stands still
+def certified() -> Certified:
     """A session of a controller that must be certified, and is."""
     loop = Certified(required=True)
     loop.assurance.tell()
@@ -104,7 +104,7 @@ def test_two_changes_that_hold_by_themselves_are_not_both_taken_if_together_they
     assert certified.controller.gains == gains_of(of(less))
 
 
-def test_where_nothing_is_required_all_is_taken_and_told(time: FakeTime) -> None:  # noqa: ARG001  # it stands still
+def test_where_nothing_is_required_all_is_taken_and_told() -> None:
     loop = Certified(required=False)
     loop.begin()
     asked = [loop.ask("set_gains", FAILING), loop.ask("track", Track(reference=Stream()))]
@@ -127,7 +127,7 @@ def test_where_it_comes_to_rest_is_certified_beside_the_loop(certified: Certifie
     assert certified.assurance.blocks is None
 
 
-def test_what_is_read_again_blocks_and_unblocks_the_next_claim(time: FakeTime) -> None:  # noqa: ARG001  # it stands still
+def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
     loop = Certified(required=True)
     loop.assurance.tell()
     for gains in (FAILING, BETTER):
@@ -145,7 +145,7 @@ def test_what_is_read_again_blocks_and_unblocks_the_next_claim(time: FakeTime) -
     assert [kind for kind, _ in loop.verdicts] == ["started", "changed", "fault"]
 
 
-def test_what_was_not_weighed_beforehand_counts_as_failing_until_it_is(time: FakeTime) -> None:  # noqa: ARG001
+def test_what_was_not_weighed_beforehand_counts_as_failing_until_it_is() -> None:
     loop = Certified(required=True)
     loop.live.adopt(of(BETTER), Sinusoid())
     assert "not known yet" in (loop.assurance.blocks or "")

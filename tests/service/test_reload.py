@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import pytest
 
+from protocol.errors import AeroloopError
 from protocol.role import Action, Role
 from protocol.verbs import Points
 from service.config import Settings, load
@@ -44,6 +45,11 @@ def test_a_configuration_that_is_the_same_says_nothing(role: str) -> None:
         ("controller", "controller.max_reference_rate=2", "controller.max_reference_rate: 1.0 → 2.0"),
         ("controller", "controller.max_reference_tilt_deg=9", "controller.max_reference_tilt_deg: 60.0 → 9.0"),
         ("controller", "controller.auto_arm=true", "controller.auto_arm: False → True"),
+        (
+            "controller",
+            "controller.require_certificate=true",
+            "controller.require_certificate: False → True",
+        ),
         ("plant", "plant.limits.max_tilt_deg=10", "plant.limits.max_tilt_deg: 75.0 → 10.0"),
         ("plant", "plant.watchdog_s=0.2", "plant.watchdog_s: 0.1 → 0.2"),
         ("plant", "plant.truth_rate_hz=5", "plant.truth_rate_hz: 50.0 → 5.0"),
@@ -194,6 +200,22 @@ def test_what_the_theorem_promises_is_told_of_the_new_gains_and_computed_before_
     assert promised == [1.0]
     act()
     assert (promised, role.certificate) == ([1.0], {"holds": False})
+
+
+def test_what_the_promise_refuses_changes_nothing_and_may_be_read_again() -> None:
+    role, taken = Hangup(), list[Settings]()
+
+    def promise(config: dict[str, Any]) -> None:
+        if config["law"]["C1"][0] > 2:
+            raise AeroloopError("no")
+
+    configurations = iter((["law.C1=[3.0, 3.0, 3.0]"], ["law.C1=[1.0, 1.0, 1.0]"]))
+    reload_on_hangup(cast(Role, role), load(), lambda: load(overrides=next(configurations)), taken.append, promise)
+    with pytest.raises(AeroloopError):
+        role.hang_up()
+    role.hang_up()
+    assert [settings.law.C1[0] for settings in taken] == [1.0]
+    assert role.told == [("changed", "configuration read again: law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]")]
 
 
 # Points out of a file

@@ -23,7 +23,7 @@ from service.log.report import Report
 SCRIPTS: Final = ("data.js", "window.js", "panels.js", "spreads.js", "controls.js")
 """In the order in which each uses those before it."""
 
-PROVED: Final = ("z_norm", "lyapunov")
+PROVED: Final[tuple[str, ...]] = ("z_norm", "lyapunov")
 """Groups of panels that are the theorem's."""
 
 TIME_UNITS: Final = frozenset({"s", "ms", "µs"})

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.messages import Percentiles
 from service.figures import Stream
-from service.log.report import Check, Findings, Gap, Line, Mark, Panel, Report, Spread
+from service.log.report import Check, Findings, Gap, LemmaCheck, Line, Mark, Panel, Report, Spread, TheoremFindings
 
 BINS = [(2 ** (i / 16), count) for i, count in ((148, 90), (149, 400), (150, 300), (151, 60), (180, 3), (200, 1))]
 MARKS = (
@@ -29,6 +29,7 @@ def made_report(
     thinned: int = 1,
     phase: float = 0.0,
     turned: bool = False,
+    theorem: TheoremFindings | None = None,
 ) -> Report:
     """Ten seconds of sines, with one trip and one gap.
 
@@ -41,6 +42,7 @@ def made_report(
         thinned: Ticks behind two points.
         phase: Of the measured lines [rad]; the desired ones do not change with it.
         turned: Whether they are turned around.
+        theorem: What became of the theorem.
     """
     time = np.linspace(0.0, 10.0, 501)
     desired, measured = np.sin(time) * (-1.0 if turned else 1.0), np.sin(time - phase) + 0.02 * np.cos(31 * time)
@@ -58,6 +60,8 @@ def made_report(
         Panel("latency", "Loop latency", "latency", "µs",
               [Line("latency", np.where(measured > 1.01, 90_000.0, 600.0))]),
     ]  # fmt: skip
+    if theorem is not None:
+        panels.append(Panel("z_norm", "Error of Theorem 1", "‖z‖", "1", [Line("measured", np.abs(measured))]))
     spread = Spread(count=854, p50=640.0, p90=690.0, p99=2400.0, p999=5900.0, max=6011.0, bins=BINS)
     findings = Findings(
         duration_s=10.0,
@@ -85,6 +89,7 @@ def made_report(
         losses={},
         marks=list(marks),
         checks=list(checks),
+        theorem=theorem,
     )
     usual = {
         "vehicle": "aero",
@@ -101,3 +106,37 @@ def made_report(
         "plant": {"host": "h"},
     }
     return Report(name, findings, time, panels, thinned, usual | (settings or {}), facts)
+
+
+def made_theorem(*, broken: int = 0) -> TheoremFindings:
+    """A theorem that holds of a run, two of whose inequalities were judged; the second was broken so often."""
+    return TheoremFindings(
+        verdict="Theorem 1 holds: in the end ‖z‖ ≤ 0.2004.",
+        holds=True,
+        radius=0.2004,
+        radius_deg=23.01,
+        transient_s=2.0,
+        until_s=8.5,
+        z_norm=0.0638,
+        z_norm_share=0.0638 / 0.2004,
+        error_deg=1.89,
+        true_z_norm=None,
+        true_error_deg=None,
+        damping_known=False,
+        samples=500,
+        outside={"C.28": 0, "C.29": 120, "Assumption 3": 0},
+        judged=380,
+        lemma=[
+            LemmaCheck(equation="C.52", what="‖d₁‖", samples=380, broken=0, closest=0.58, closest_s=7.5, broken_s=None),
+            LemmaCheck(
+                equation="C.57",
+                what="‖Φ − Φ^Q‖",
+                samples=380,
+                broken=broken,
+                closest=1.25 if broken else 0.97,
+                closest_s=4.25,
+                broken_s=3.125 if broken else None,
+            ),
+        ],
+        broken=broken,
+    )

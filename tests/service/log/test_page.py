@@ -23,7 +23,7 @@ from service.log.page.markup import tag
 from service.log.page.page import page, write_page
 from service.log.report import Check, Mark, Panel, Report
 from service.log.rows import figure_rows, micros, percent
-from tests.service.log.made_report import MARKS, made_report
+from tests.service.log.made_report import MARKS, made_report, made_theorem
 
 HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""
 PATIENCE_MS = 120_000
@@ -69,6 +69,34 @@ def test_the_page_says_what_was_asked_and_what_was_found() -> None:
     assert "does not hold: 50" in broken
     assert " Tripped" in Texts(page([made_report()])).texts
     assert " Tracked" in Texts(page([made_report(marks=())])).texts
+
+
+def test_the_page_says_what_the_theorem_promises_and_which_inequality_was_broken() -> None:
+    held = page([made_report(theorem=made_theorem())])
+    texts = Texts(held).texts
+    assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in texts
+    assert {"0.0638", "0.2004", "(C.57)", "97.0"} <= set(texts)
+    (judged,) = (text for text in texts if "belong to a tick" in text)
+    assert "Judged until 8.5 s" in judged
+    assert "At 120 the sensors of the rate err by more than the quantizer, against (C.29)." in judged
+    assert judged.endswith("Lemma 1 is judged by the other 380.")
+    broken = page([made_report(theorem=made_theorem(broken=7))])
+    assert "Show 3.125 s: (C.57) ‖Φ − Φ^Q‖ first broken" in broken
+    assert {"7", "125.0"} <= set(Texts(broken).texts)
+    assert "first broken" not in held
+
+
+def test_where_no_run_was_held_against_the_theorem_the_page_says_nothing_of_it() -> None:
+    assert 'id="theorem"' not in page([made_report()])
+    several = page([made_report("a"), made_report("b", theorem=made_theorem())])
+    assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in Texts(several).texts
+
+
+def test_the_theorems_panels_stand_in_its_own_section_and_nowhere_else() -> None:
+    text = page([made_report(theorem=made_theorem())])
+    _, _, section = text.partition('<section id="theorem"')
+    assert 'data-name="z_norm"' in section.partition("</section>")[0]
+    assert text.count('data-name="z_norm"') == 1
 
 
 def test_what_could_not_be_read_is_told() -> None:

@@ -22,6 +22,7 @@ from service.log.display import review_account
 from service.log.grounds import Library, damping_of
 from service.log.limits import Limit
 from service.log.mcap_records import CONTRACT_METADATA
+from service.log.plots import draw_theorem
 from service.log.report import Findings, Line, TheoremFindings
 from service.log.review import Kept, read, report
 from service.log.tallies import BLOCK
@@ -151,8 +152,8 @@ def test_an_error_larger_than_the_certificate_assumes_is_not_judged(tmp_path: Pa
 
 def test_what_comes_after_an_operators_change_is_not_judged(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    changes = {120: (Gains(C1=(5.0, 5.0, 5.0)), None)}
-    make_log(path, TICKS, settings=lockstep("plant.ideal=true"), changes=changes, truth_every=1)
+    settings = lockstep("plant.ideal=true")
+    make_log(path, TICKS, settings=settings, changes={120: (Gains(C1=(5.0, 5.0, 5.0)), None)}, truth_every=1)
     theorem = found(path)
     assert (theorem.until_s, theorem.samples, theorem.judged) == (0.24, 120, 120)
     assert broken(theorem) == {}
@@ -250,11 +251,11 @@ def test_the_largest_norm_and_error_after_the_transient_are_beside_what_is_guara
     norms = []
     for tick in after:
         rate_d = twin.rotation(np.array(tick.attitude)) @ np.array(tick.desired_rate)
-        rows = [np.array([row]) for row in (tick.attitude, tick.rate, tick.desired, rate_d)]
-        c = coordinates(*rows, np.array([tick.sign]), np.array(settings.law.C1))
+        q, omega, q_d, omega_d = (np.array([row]) for row in (tick.attitude, tick.rate, tick.desired, rate_d))
+        c = coordinates(q, omega, q_d, omega_d, np.array([tick.sign]), np.array(settings.law.C1))
         norms.append(float(c.norm[0]))
     assert theorem.z_norm == pytest.approx(max(norms), rel=1e-9)
-    assert theorem.z_norm_share == theorem.z_norm / theorem.radius
+    assert theorem.z_norm_share == pytest.approx(max(norms) / theorem.radius)
     largest = max(np.linalg.norm(tick.attitude_error) for tick in after)
     assert theorem.error_deg == pytest.approx(np.degrees(2 * np.arcsin(largest)))
     # Of 16 bits, what is measured is what is true to some 1e-4.
@@ -322,6 +323,12 @@ def test_the_norm_is_drawn_with_the_guaranteed_radius_and_v_falls_along_the_run(
     V = line(ideal, "lyapunov", "true, with θ̃").values
     assert V[-1] < V[0]
     assert line(ideal, "lyapunov", "measured, without θ̃").values[-1] < V[-1]
+
+
+def test_the_norm_and_v_are_drawn_beside_the_papers_figures(ideal: Path, tmp_path: Path) -> None:
+    (path,) = draw_theorem(report([ideal]), tmp_path / "figures")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert draw_theorem(replace(report([ideal]), panels=[]), tmp_path) == []
 
 
 def test_the_account_and_the_json_say_what_held(ideal: Path, capfd: pytest.CaptureFixture[str]) -> None:
