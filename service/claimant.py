@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from protocol import topics
 from protocol.clock import LoopSettings
+from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
 from protocol.links import Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release
@@ -22,6 +23,10 @@ from service.hearing import MAILBOX
 log: Final = logging.getLogger("aeroloop")
 
 ANSWER_WAIT_S: Final = 1.0
+
+
+class SessionLostError(AeroloopError):
+    """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
 
 
 class Claimant:

@@ -17,7 +17,6 @@ from pydantic import ValidationError
 
 from protocol import topics
 from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, prepare_process
-from protocol.errors import AeroloopError
 from protocol.frames import WireSpec
 from protocol.links import ZenohLink
 from protocol.messages import Lapse, Status, report, summary
@@ -26,7 +25,7 @@ from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask, Reference
 from service.assurance import Assurance, gains_of
-from service.claimant import Claimant
+from service.claimant import Claimant, SessionLostError
 from service.controller import Controller
 from service.hearing import Heard, Hearing
 from service.law import LawSettings
@@ -44,10 +43,6 @@ STALL_TICKS: Final = 10
 """So many ticks missed in a row are worth a warning."""
 
 State, Trigger = ControllerState, ControllerTrigger
-
-
-class SessionLostError(AeroloopError):
-    """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
 
 
 class Daemon:

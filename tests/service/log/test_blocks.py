@@ -70,7 +70,11 @@ class Run:
         self.changes = [self._change(int(k), rng) for k in ticks]
 
     def _change(self, k: int, rng: np.random.Generator) -> Change:
-        gains = Gains(C2=tuple(rng.uniform(0.05, 0.3, 3)), Gamma=tuple(rng.uniform(0.01, 0.5, 3)))
+        gains = Gains(
+            C1=tuple(rng.uniform(0.1, 0.5, 3)),
+            C2=tuple(rng.uniform(0.05, 0.3, 3)),
+            Gamma=tuple(rng.uniform(0.01, 0.5, 3)),
+        )
         reference = REFERENCES[rng.integers(len(REFERENCES))]
         return Change(
             session="s1",
@@ -85,20 +89,22 @@ class Run:
         return kind(s.wire, s.law, s.reference, s.loop.period, **more)
 
     def one_by_one(self, controller: Controller, first: int = 0) -> Iterator[tuple[list[float], bytes]]:
-        """Of each tick attitude, desired, rate, errors and voltages, NaN where there are none, and the command."""
+        """Of each tick all that `Computed` has, NaN where there is none, and the command."""
         changes = deque(change for change in self.changes if first == 0 or change.tick > self.k[first - 1])
         nothing = [float("nan")]
         for k, row in zip(self.k[first:].tolist(), self.codes[first:].tolist(), strict=True):
             while changes and changes[0].tick <= k:
                 controller.apply(changes.popleft())
             codes = [row[i] if self.wire.measurement.widths[i] is None else int(row[i]) for i in range(6)]
+            theta = controller.damping_estimate
             u = controller.compute(k % 16, codes, k)
             if controller.tick_index == k:
                 c = controller
                 said = [*c.attitude, *c.desired, *c.rate, *c.attitude_error, *c.rate_error]
                 said += nothing * self.wire.actuators if u is None else u
+                said += [c.sign, *c._law.inputs["C1"], *theta]
             else:
-                said = nothing * (17 + self.wire.actuators)
+                said = nothing * (17 + self.wire.actuators + 7)
             sent = controller._no_command if u is None else [e(v) for e, v in zip(controller._encode, u, strict=True)]
             yield said, self.wire.command.pack(k % 16, sent)
 
