@@ -2,8 +2,8 @@
 
 With `controller.require_certificate` a controller of which the theorem does not hold claims no vehicle, and an
 operator's change after which it would not hold is refused. A certificate takes some 10 ms, and 200 ms where remedies
-are sought, so it is computed in the thread of whoever asks for a change and kept; the loop only looks it up. What comes
-unasked is computed in a thread of its own, and counts as not holding until then.
+are sought, so there it is computed in the thread of whoever asks for a change, and kept; the loop only looks it up.
+Otherwise it is computed in a thread of its own once the change is made, and counts as not holding until then.
 """
 
 from __future__ import annotations
@@ -73,6 +73,9 @@ class Assurance:
         law: Its model, and the gains to begin with.
         reference: The reference to begin with.
         settings: How a session begins, and whether the theorem must hold.
+
+    Attributes:
+        required: Whether it must.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class Assurance:
         self._wire = wire
         self._law = law
         self._settings = settings
-        self._required = settings.require_certificate
+        self.required = settings.require_certificate
         self._weighed: deque[tuple[Gains, Reference, Verdict]] = deque(maxlen=KEPT)
         self._now = gains_of(law), reference
         self._verdict: Verdict | None = self.weigh(*self._now)
@@ -104,7 +107,7 @@ class Assurance:
         return verdict
 
     def admit(self, gains: Gains, reference: Reference, *, required: bool | None = None) -> None:
-        """Weigh what is asked for, even where nothing is required: the loop is then spared it.
+        """Refuse what is asked for if it must be certified and is not.
 
         Args:
             gains: All three.
@@ -114,8 +117,10 @@ class Assurance:
         Raises:
             UncertifiedError: It must hold, and would not.
         """
+        if not (self.required if required is None else required):
+            return
         verdict = self.weigh(gains, reference)
-        if not verdict.holds and (self._required if required is None else required):
+        if not verdict.holds:
             raise UncertifiedError(f"controller.require_certificate is set, and then {verdict.text}{verdict.helps}")
 
     def promise(self, gains: Gains, reference: Reference) -> dict[str, Any] | None:
@@ -128,14 +133,10 @@ class Assurance:
     @property
     def blocks(self) -> str | None:
         """Why no vehicle is to be claimed; None if nothing forbids it."""
-        if not self._required or (self._verdict is not None and self._verdict.holds):
+        if not self.required or (self._verdict is not None and self._verdict.holds):
             return None
         why = "it is not known yet whether the theorem holds" if self._verdict is None else self._verdict.text
         return f"claims no vehicle, as controller.require_certificate is set: {why}"
-
-    def require(self, required: bool) -> None:
-        """Whether the theorem must hold from now on."""
-        self._required = required
 
     def take(self, gains: Gains, reference: Reference) -> None:
         """This is in force from now on."""

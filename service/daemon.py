@@ -296,13 +296,14 @@ class Daemon:
         Raises:
             UncertifiedError: It must hold, would not, and a session runs: no vehicle is dropped for a configuration.
         """
-        required = settings.require_certificate and self._claimant.session is not None
-        self._assurance.admit(*self._live.prospect(law, reference), required=required)
+        prospect = self._live.prospect(law, reference)
+        self._assurance.weigh(*prospect)
+        self._assurance.admit(*prospect, required=settings.require_certificate and bool(self._claimant.session))
         return self._assurance.promise(gains_of(law), reference)
 
     def reconfigure(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> None:
         """Take over gains, reference and settings between two ticks."""
-        self._assurance.require(settings.require_certificate)
+        self._assurance.required = settings.require_certificate
         self._live.configure(settings)
         self._live.adopt(law, reference)
         self._take(settings)

@@ -131,7 +131,7 @@ def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
     loop = Certified(required=True)
     loop.assurance.tell()
     for gains in (FAILING, BETTER):
-        loop.assurance.admit(*loop.live.prospect(of(gains), Sinusoid()), required=False)
+        loop.assurance.weigh(*loop.live.prospect(of(gains), Sinusoid()))
         loop.live.adopt(of(gains), Sinusoid())
         blocks = loop.assurance.blocks
         if gains is FAILING:
@@ -158,5 +158,5 @@ def test_what_must_hold_and_does_not_is_not_admitted(certified: Certified) -> No
     with pytest.raises(UncertifiedError, match="does not hold"):
         certified.assurance.admit(gains_of(of(FAILING)), Sinusoid())
     certified.assurance.admit(gains_of(of(FAILING)), Sinusoid(), required=False)
-    certified.assurance.require(False)
+    certified.assurance.required = False
     certified.assurance.admit(gains_of(of(FAILING)), Sinusoid())
