@@ -1,9 +1,9 @@
 """Theorem 1 and Lemma 1 held against a session: what was promised, what the run did, each inequality where truth is.
 
 ‖z‖ and V are those that the controller computed, from quantized signals, at every tick; and the true ones at the ticks
-of which an emulator told the true state. A truth says which tick's measurement was taken of it, so nothing is
-interpolated. The transient lasts three times the law's slower time constant, by when an error has fallen to 5 %.
-Everything is judged until an operator first changes gains or reference: from there on another certificate would hold.
+of which an emulator told the true state. A truth says which tick's measurement was taken of it, so nothing that is
+judged is interpolated. The transient lasts three times the law's slower time constant, by when an error has fallen to
+5 %. All is judged until an operator first changes gains or reference: from there on another certificate would hold.
 """
 
 from __future__ import annotations
@@ -101,6 +101,7 @@ class Trial:
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=2 * BLOCK)
         self._untold = 0  # truths that do not say of which tick they are
         self._before: Ticks | None = None  # the last block: a truth may come a little late
+        self._drawn = np.empty((0, 3))  # the last true state: its tick, ‖z‖ and V
         self._tallies: dict[str, Tally] = {}
         self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
@@ -128,11 +129,12 @@ class Trial:
         place = np.searchsorted(both.k, truths.k)
         there = both.k[place] == truths.k
         if there.any():
-            rows = place[there]
-            at = both.where(rows)
-            true_z, true_V = self._try(at, Truths(*(column[there] for column in truths)))
-            rows -= len(both.k) - len(ticks.k)
-            drawn[rows[rows >= 0], 1], drawn[rows[rows >= 0], 3] = true_z[rows >= 0], true_V[rows >= 0]
+            at = both.where(place[there])
+            true = self._try(at, Truths(*(column[there] for column in truths)))
+            known = np.vstack([self._drawn, np.column_stack([at.k, *true])])
+            self._drawn = known[-1:]
+            for column, values in ((1, known[:, 1]), (3, known[:, 2])):  # a line is drawn from one to the next
+                drawn[:, column] = np.interp(ticks.k, known[:, 0], values, left=nan)
         return drawn
 
     def _settle(self, ticks: Ticks, z: Array) -> None:
