@@ -200,7 +200,11 @@ def test_what_could_not_be_had_breaks_its_limit_and_says_why(whole: Path) -> Non
 KEYS = {
     "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
     "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
-    "gaps", "gap_count", "saturated", "invalid", "losses", "marks", "checks",
+    "gaps", "gap_count", "saturated", "invalid", "losses", "marks", "theorem", "checks",
+}  # fmt: skip
+THEOREM_KEYS = {
+    "verdict", "holds", "radius", "radius_deg", "transient_s", "until_s", "z_norm", "z_norm_share", "error_deg",
+    "true_z_norm", "true_error_deg", "damping_known", "samples", "outside", "judged", "lemma", "broken",
 }  # fmt: skip
 
 
@@ -212,6 +216,7 @@ def test_the_keys_of_the_json_are_stable_and_the_exit_code_says_whether_limits_h
     assert printed.keys() == KEYS
     assert printed["timing"]["latency"].keys() == {"count", "p50", "p90", "p99", "p999", "max", "bins"}
     assert printed["marks"][0].keys() == set(Mark.model_fields)
+    assert printed["theorem"].keys() == THEOREM_KEYS
     assert [check["holds"] for check in printed["checks"]] == [True, True]
     assert execute(["log", "review", str(whole), "--json", "--require", "latency.p50=1"]) == 1
     output = capsys.readouterr()

@@ -339,3 +339,6 @@ def test_the_account_and_the_json_say_what_held(ideal: Path, capfd: pytest.Captu
     assert "holds at the 600 of 600 true states that satisfy its premises" in said
     again = Findings.model_validate(json.loads(findings.model_dump_json()))
     assert again.theorem == findings.theorem
+    assert findings.theorem is not None
+    keys = {"equation", "what", "samples", "broken", "closest", "closest_s", "broken_s"}
+    assert findings.theorem.lemma[0].model_dump().keys() == keys
