@@ -123,8 +123,11 @@ class Trial:
         z, V = measured_norm(ticks, self._grounds.law)
         drawn = np.column_stack([z, np.full(len(z), nan), V, np.full(len(z), nan)])
         self._settle(ticks, z)
-        both = ticks if self._before is None else Ticks.joined([self._before, ticks])
-        self._before = ticks
+        before, self._before = self._before, ticks
+        if not self._truths or self._truths[0][0] > ticks.k[-1]:
+            return drawn
+        late = [] if before is None or before.k[-1] < self._truths[0][0] else [before]
+        both = Ticks.joined([*late, ticks])
         truths = self._take_truths(int(both.k[0]), int(both.k[-1]))
         place = np.searchsorted(both.k, truths.k)
         there = both.k[place] == truths.k
@@ -141,8 +144,8 @@ class Trial:
         """The largest ‖z‖ and attitude error after the transient."""
         after = (ticks.k >= self._settled) & (ticks.k < self._until)
         if after.any():
-            angle = 2 * np.arcsin(np.minimum(1.0, np.linalg.norm(ticks.attitude_error[after], axis=1)))
-            self._seen = _larger(self._seen, z[after], angle)
+            square = (ticks.attitude_error[after] ** 2).sum(axis=1)
+            self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
 
     def _take_truths(self, first: int, last: int) -> Truths:
         """Those of these ticks; earlier ones are forgotten, later ones wait."""

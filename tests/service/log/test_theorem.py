@@ -206,6 +206,18 @@ def test_a_true_state_that_comes_after_its_block_still_counts_and_long_silence_c
     assert np.isfinite(drawn).all()
 
 
+def test_the_true_line_goes_from_one_told_state_to_the_next_and_begins_with_the_first() -> None:
+    one = trial()
+    for k in (10, 30):
+        one.truth(k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.001 * k))
+    norm = one.ticks(block(0, 40))[:, 1]
+    assert np.isnan(norm[:10]).all()
+    assert norm[[10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
+    assert one.findings()[0].samples == 2  # what lies between is drawn, not judged
+    one.truth(50, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.05))
+    assert one.ticks(block(40, 20))[0, 1] == pytest.approx(0.04)
+
+
 def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
     settings = load(overrides=["reference.kind=hold"])
     values = []
