@@ -1,20 +1,18 @@
 """Cells of the paper's experiment, run side by side on every core.
 
 A cell is one lockstep experiment: bits out, bits in, wind or calm, a seed. Cells know nothing of each other, so they go
-to a pool of processes; the configuration travels as its dump, and only figures come back.
+to a pool of processes.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any, NamedTuple
 
 from service.config import Settings
 from service.experiment import run_experiment
 from service.paper import DURATION_S
+from service.workers import Workers
 
 
 class Cell(NamedTuple):
@@ -49,24 +47,9 @@ def run_cell(config: dict[str, Any], cell: Cell) -> Result:
     return Result(figures.z_track * 1e4, figures.u_total)
 
 
-class Pool:
+class Pool(Workers):
     """Processes that run cells, one a core. A context."""
-
-    def __init__(self) -> None:
-        # Spawned, not forked: a fork would inherit threads of whatever the caller has open.
-        self._executor = ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
-
-    def __enter__(self) -> Pool:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._executor.shutdown(cancel_futures=True)
 
     def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:
         """Results of cells in their order; `progress` hears how many are done."""
-        futures = [self._executor.submit(run_cell, settings.contract(), cell) for settings, cell in jobs]
-        for done, future in enumerate(as_completed(futures), 1):
-            future.result()
-            if progress is not None:
-                progress(done)
-        return [future.result() for future in futures]
+        return self.each(run_cell, ((settings.contract(), cell) for settings, cell in jobs), progress)

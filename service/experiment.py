@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterator
+from typing import TypeAlias
 
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Plant
@@ -19,16 +20,30 @@ from service.figures import Figures, Score
 
 NO_CLOCK = "lockstep without a network has no latency"
 
+Watch: TypeAlias = Callable[[int, bytes, bytes], None]
+"""Sees every tick: k, the measurement, the command that answers it; SILENCE where a frame is not sent."""
 
-def run_experiment(settings: Settings, duration_s: float, progress: Callable[[float], None] | None = None) -> Figures:
+
+class LoopEndedError(ValueError):
+    """The loop ended before its time: the plant tripped. One line that says when and why."""
+
+
+def run_experiment(
+    settings: Settings,
+    duration_s: float,
+    progress: Callable[[float], None] | None = None,
+    watch: Watch | None = None,
+) -> Figures:
     """Run the closed loop for `duration_s` of the law's time and return its figures.
 
     Args:
         settings: The configuration.
         duration_s: How long [s].
         progress: Called now and then with the time reached [s].
+        watch: Called at every tick with the frames of both directions, for whoever counts them.
 
     Raises:
+        LoopEndedError: The plant tripped on the way.
         ValueError: The configuration does not make a loop, such as a law that commands 3 motors of a plant with 2.
     """
     loop, wire = settings.loop, settings.wire
@@ -51,12 +66,14 @@ def run_experiment(settings: Settings, duration_s: float, progress: Callable[[fl
         command = controller.tick(measurement, k)
         if command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
-            raise ValueError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
+            raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
             score.error(k, controller.attitude_error, sent=measurement != SILENCE)
         if read := wire.command.unpack(command):
             voltages = [level(code) for code in read[1]]
         score.command(k, voltages, sent=command != SILENCE)
+        if watch is not None and measurement is not None:
+            watch(k, measurement, command)
         measurement = endpoint.tick(command, k + 1)
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)

@@ -1,0 +1,85 @@
+"""What one direction of a loop sends: frames, changes, the time between them, and what they cost.
+
+It is reckoned from the frames of every tick. Sending on change keeps back those that say what the last one said, and
+the other end then holds the same levels, so one run tells what either policy sends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import Field
+
+from protocol.frames import FrameFormat
+from protocol.transmit import Policy, Sender
+from service.bus import BITRATE, bus_bits, classic_frames
+from service.figures import Stream
+
+
+class Traffic(Stream):
+    """Traffic of one direction under one policy, over the time that was judged."""
+
+    changes_per_s: float = Field(description="changes of a component's code, of all components together")
+    component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u₂ u₃")
+    mean_interval_ms: float | None = Field(description="from one frame to the next; null for less than two [ms]")
+    least_interval_ms: float | None = Field(description="the least of these times [ms]")
+    can_frames: int = Field(
+        description="classic CAN frames that a frame fills; more than one is a split, without any header, of what "
+        "this project sends as one CAN FD frame"
+    )
+    can_bits_per_s: float = Field(description="bits on a classic CAN bus, with worst-case stuffing")
+    can_load: float = Field(description="share of a classic bus of 1 Mbit/s; above 1 it does not fit")
+
+
+def sent_ticks(frames: Sequence[bytes], kind: FrameFormat, policy: Policy, heartbeat: int) -> list[int]:
+    """The ticks at which a policy sends.
+
+    Args:
+        frames: The frame of every tick from 0 on.
+        kind: How they are read.
+        policy: When frames are sent.
+        heartbeat: The most ticks from one frame to the next.
+    """
+    sender = Sender(policy, heartbeat)
+    return [k for k, codes in enumerate(_codes(frames, kind)) if sender.due(k, codes)]
+
+
+def traffic(frames: Sequence[bytes], kind: FrameFormat, sent: Sequence[int], period: float) -> Traffic:
+    """The traffic of one direction.
+
+    Args:
+        frames: The frame of every tick from 0 on.
+        kind: How they are read.
+        sent: The ticks at which one was sent.
+        period: Time between ticks [s].
+
+    Raises:
+        ValueError: There are no frames.
+    """
+    if not frames:
+        raise ValueError("no ticks, no traffic")
+    duration = len(frames) * period
+    rate = len(sent) / duration
+    changes = np.count_nonzero(np.diff(np.array(_codes(frames, kind)), axis=0), axis=0) / duration
+    intervals = np.diff(sent) * (period * 1e3)
+    on_bus = rate * bus_bits(kind.size)
+    return Traffic(
+        frames_per_s=rate,
+        bits_per_s=rate * kind.size * 8,
+        changes_per_s=float(changes.sum()),
+        component_changes_per_s=changes.tolist(),
+        mean_interval_ms=float(intervals.mean()) if len(intervals) else None,
+        least_interval_ms=float(intervals.min()) if len(intervals) else None,
+        can_frames=len(classic_frames(kind.size)),
+        can_bits_per_s=on_bus,
+        can_load=on_bus / BITRATE,
+    )
+
+
+def _codes(frames: Sequence[bytes], kind: FrameFormat) -> list[tuple[float, ...]]:
+    """What the frames say. Raises ValueError for a malformed one, which no end sends."""
+    read = [kind.unpack(frame) for frame in frames]
+    if any(one is None for one in read):
+        raise ValueError("a frame is malformed")
+    return [one[1] for one in read if one is not None]
