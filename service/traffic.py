@@ -7,6 +7,7 @@ the other end then holds the same levels, so one run tells what either policy se
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -16,10 +17,14 @@ from protocol.transmit import Policy, Sender
 from service.bus import BITRATE, bus_bits, classic_frames
 from service.figures import Stream
 
+Codes: TypeAlias = tuple[float, ...]
+
 
 class Traffic(Stream):
     """Traffic of one direction under one policy, over the time that was judged."""
 
+    frames_per_s: float
+    bits_per_s: float = Field(description="payload bits, padding included")
     changes_per_s: float = Field(description="changes of a component's code, of all components together")
     component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u₂ u₃")
     mean_interval_ms: float | None = Field(description="from one frame to the next; null for less than two [ms]")
@@ -32,41 +37,51 @@ class Traffic(Stream):
     can_load: float = Field(description="share of a classic bus of 1 Mbit/s; above 1 it does not fit")
 
 
-def sent_ticks(frames: Sequence[bytes], kind: FrameFormat, policy: Policy, heartbeat: int) -> list[int]:
+def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> list[Codes]:
+    """What frames say.
+
+    Raises:
+        ValueError: A frame is malformed, which no end sends.
+    """
+    read = [kind.unpack(frame) for frame in frames]
+    if any(one is None for one in read):
+        raise ValueError("a frame is malformed")
+    return [one[1] for one in read if one is not None]
+
+
+def sent_ticks(codes: Sequence[Codes], policy: Policy, heartbeat: int) -> list[int]:
     """The ticks at which a policy sends.
 
     Args:
-        frames: The frame of every tick from 0 on.
-        kind: How they are read.
+        codes: What there is to say at every tick from 0 on.
         policy: When frames are sent.
         heartbeat: The most ticks from one frame to the next.
     """
     sender = Sender(policy, heartbeat)
-    return [k for k, codes in enumerate(_codes(frames, kind)) if sender.due(k, codes)]
+    return [k for k, said in enumerate(codes) if sender.due(k, said)]
 
 
-def traffic(frames: Sequence[bytes], kind: FrameFormat, sent: Sequence[int], period: float) -> Traffic:
+def traffic(codes: Sequence[Codes], kind: FrameFormat, sent: Sequence[int], period: float) -> Traffic:
     """The traffic of one direction.
 
     Args:
-        frames: The frame of every tick from 0 on.
-        kind: How they are read.
+        codes: What there was to say at every tick from 0 on. Shape (ticks, components).
+        kind: Frames of it.
         sent: The ticks at which one was sent.
         period: Time between ticks [s].
 
     Raises:
-        ValueError: There are no frames.
+        ValueError: There are no ticks.
     """
-    if not frames:
+    if not codes:
         raise ValueError("no ticks, no traffic")
-    duration = len(frames) * period
-    rate = len(sent) / duration
-    changes = np.count_nonzero(np.diff(np.array(_codes(frames, kind)), axis=0), axis=0) / duration
+    duration = len(codes) * period
+    changes = np.count_nonzero(np.diff(np.array(codes), axis=0), axis=0) / duration
     intervals = np.diff(sent) * (period * 1e3)
-    on_bus = rate * bus_bits(kind.size)
+    on_bus = len(sent) * bus_bits(kind.size) / duration
     return Traffic(
-        frames_per_s=rate,
-        bits_per_s=rate * kind.size * 8,
+        frames_per_s=len(sent) / duration,
+        bits_per_s=len(sent) * kind.size * 8 / duration,
         changes_per_s=float(changes.sum()),
         component_changes_per_s=changes.tolist(),
         mean_interval_ms=float(intervals.mean()) if len(intervals) else None,
@@ -75,11 +90,3 @@ def traffic(frames: Sequence[bytes], kind: FrameFormat, sent: Sequence[int], per
         can_bits_per_s=on_bus,
         can_load=on_bus / BITRATE,
     )
-
-
-def _codes(frames: Sequence[bytes], kind: FrameFormat) -> list[tuple[float, ...]]:
-    """What the frames say. Raises ValueError for a malformed one, which no end sends."""
-    read = [kind.unpack(frame) for frame in frames]
-    if any(one is None for one in read):
-        raise ValueError("a frame is malformed")
-    return [one[1] for one in read if one is not None]

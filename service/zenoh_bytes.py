@@ -132,7 +132,7 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
         NetworkError: A session cannot be opened.
     """
     port = _free_port()
-    here = {"rendezvous": "", "gossip": False}  # with gossip they would link directly, around the relay
+    here = {"rendezvous": "", "gossip": False}  # two need none, and it would be counted
     plant_side = network.model_copy(update={**here, "listen": [f"tcp/127.0.0.1:{port}"], "connect": []})
     with Relay(port) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})

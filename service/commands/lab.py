@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,6 +15,7 @@ from service.commands.common import (
     Duration,
     Json,
     Overrides,
+    checked,
     guarded,
     print_figures,
     settings_of,
@@ -21,6 +23,7 @@ from service.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from service.burden import Burden
     from service.calibrate import Calibration
     from service.certificate import Certificate
     from service.figures import Figures
@@ -148,3 +151,63 @@ def certify(
 
         certificate_table(result)
     raise typer.Exit(0 if result.holds else 1)
+
+
+@group.command()
+def burden(
+    bits: Annotated[
+        list[str] | None,
+        typer.Option(metavar="OUT/IN", help="Bits of ε and ω, and of u, such as 8/6; repeated.", show_default=False),
+    ] = None,
+    quantizer: Annotated[
+        list[str] | None, typer.Option(metavar="KIND", help="A kind of quantizer; repeated.", show_default=False)
+    ] = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    duration: Duration = PAPER_DURATION_S,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Weigh error against bits: every number of bits, quantizer, transmit policy and sensor noise, beside float64.
+
+    What is left out is all of it: six pairs of bits, every quantizer, four kinds of sensors.
+    """
+    settings = settings_of(config, overrides)
+
+    def run() -> Burden:
+        from service.burden import measure_burden
+        from service.display import count_bar
+
+        with count_bar("experiments", hidden=json) as update:
+            return measure_burden(settings, cells, duration, update)
+
+    from service.burden_figure import check_path, draw_burden
+    from service.burden_grid import grid
+
+    if figure is not None:
+        checked(lambda: check_path(figure))
+    cells = checked(lambda: grid(settings, bits or (), quantizer or (), sensors or ()))
+    result = guarded(run)
+    if figure is not None:
+        guarded(lambda: draw_burden(result, figure))
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    elif markdown:
+        from service.burden_table import markdown as as_markdown
+
+        typer.echo(as_markdown(result))
+    else:
+        from service.burden_table import burden_table
+
+        burden_table(result)

@@ -1,0 +1,246 @@
+"""What a loop costs and what it gains by it: a grid of bits, quantizers, transmit policies and sensors.
+
+Each cell is one lockstep experiment through real frames. Both policies give the same run, to the last bit, because who
+is sent nothing holds what it has; so a cell is run once, and its frames tell what either policy would have sent. Every
+figure stands beside that of float64 at every tick, under the same sensors. Of all points under the same sensors the
+Pareto front has those that no other beats in error without more bits, or in bits without more error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol.clock import LoopSettings
+from protocol.frames import Kind
+from protocol.transmit import Policy, Transmit
+from service.burden_grid import SENSORS, BurdenError, Cell, cell_settings
+from service.config import Settings
+from service.experiment import LoopEndedError, run_experiment
+from service.figures import Figures
+from service.traffic import Traffic, codes_of, sent_ticks, traffic
+from service.workers import Workers
+from service.zenoh_bytes import LinkBytes, count_bytes
+
+POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
+
+
+class Ratios(BaseModel):
+    """A point's figures over those of float64 at every tick, under the same sensors [1]."""
+
+    model_config = ConfigDict(frozen=True)
+
+    z_track: float
+    u_total: float
+    bits_per_s: float
+    can_bits_per_s: float
+
+
+class LinkRates(BaseModel):
+    """Bytes a second that a Zenoh link carried, counted; headers of TCP and IP not included."""
+
+    model_config = ConfigDict(frozen=True)
+
+    measurement: float
+    command: float
+
+
+class Point(BaseModel):
+    """One cell under one policy. What could not be had is null, with the reason."""
+
+    model_config = ConfigDict(frozen=True)
+
+    bits_out: int | None = Field(description="bits of ε and ω; null is float64")
+    bits_in: int | None = Field(description="bits of u; null is float64")
+    quantizer: Kind | None = Field(description="null where nothing is quantized")
+    sensors: str = Field(description="a name of `Burden.sensors`")
+    transmit: Policy
+    z_track: float | None = Field(default=None, description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]")
+    u_total: float | None = Field(default=None, description="∫ uᵀu dt of the commands as sent [V²·s]")
+    measurement: Traffic | None = None
+    command: Traffic | None = None
+    bits_per_s: float | None = Field(default=None, description="payload bits of both directions, padding included")
+    can_bits_per_s: float | None = Field(default=None, description="of both directions, as `Traffic` has it")
+    can_load: float | None = Field(default=None, description="of both directions; above 1 it does not fit")
+    zenoh_bytes_per_s: LinkRates | None = Field(default=None, description="counted for a few cells only")
+    against_float64: Ratios | None = None
+    pareto: bool = Field(default=False, description="whether it is on the front of z_track against bits_per_s")
+    reason: str | None = Field(default=None, description="why there are no figures")
+
+    @property
+    def bits(self) -> str:
+        """Bits out and in, as they are asked for."""
+        return "/".join("cont" if bits is None else str(bits) for bits in (self.bits_out, self.bits_in))
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether it is what the others stand beside: float64 at every tick."""
+        return self.quantizer is None and self.transmit == "periodic"
+
+
+class Burden(BaseModel):
+    """The grid."""
+
+    model_config = ConfigDict(frozen=True)
+
+    duration_s: float = Field(description="length of each experiment [s]")
+    rate_hz: float = Field(description="ticks a second [Hz]")
+    heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
+    sensors: dict[str, str] = Field(description="what each name stands for")
+    points: list[Point]
+
+    def under(self, sensors: str) -> list[Point]:
+        """The points with these sensors."""
+        return [point for point in self.points if point.sensors == sensors]
+
+
+class Observation(NamedTuple):
+    """What a cell's experiment has shown.
+
+    Attributes:
+        figures: Its figures of merit; None if the loop ended early.
+        traffic: Measurements and commands under each policy.
+        zenoh: Bytes on a Zenoh link under each policy, if they were counted.
+        reason: Why there are no figures.
+    """
+
+    figures: Figures | None
+    traffic: dict[Policy, tuple[Traffic, Traffic]]
+    zenoh: dict[Policy, LinkBytes]
+    reason: str | None = None
+
+
+def measure_burden(
+    settings: Settings,
+    cells: Sequence[Cell],
+    duration_s: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> Burden:
+    """Run a grid on every core.
+
+    Args:
+        settings: The configuration; what a cell says stands in its place.
+        cells: What to run; float64 is among them, for each of the sensors.
+        duration_s: Length of each experiment [s].
+        progress: Called with experiments done and experiments in all.
+
+    Raises:
+        BurdenError: Float64 itself does not keep the loop running, or a cell does not fit the configuration.
+    """
+    jobs = [(cell_settings(settings, cell).contract(), duration_s, cell.counted) for cell in cells]
+    with Workers() as workers:
+        seen = workers.each(observe, jobs, lambda done: progress(done, len(jobs)) if progress else None)
+    points = [point for cell, found in zip(cells, seen, strict=True) for point in _points(cell, found, duration_s)]
+    return Burden(
+        duration_s=duration_s,
+        rate_hz=settings.loop.rate_hz,
+        heartbeat_s=_heartbeat(settings.wire.transmit, settings.loop) * settings.loop.period,
+        sensors={name: SENSORS[name].text for name in dict.fromkeys(cell.sensors for cell in cells)},
+        points=[p for name in dict.fromkeys(cell.sensors for cell in cells) for p in _beside_float64(points, name)],
+    )
+
+
+def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observation:
+    """Run one cell.
+
+    Args:
+        config: A configuration's dump, which sends at every tick.
+        duration_s: How long [s].
+        counted: Whether its frames go over a Zenoh link, too.
+    """
+    settings = Settings.model_validate(config)
+    measurements: list[bytes] = []
+    commands: list[bytes] = []
+
+    def watch(_k: int, measurement: bytes, command: bytes) -> None:
+        measurements.append(measurement)
+        commands.append(command)
+
+    try:
+        figures = run_experiment(settings, duration_s, watch=watch)
+    except LoopEndedError as error:
+        return Observation(None, {}, {}, str(error))
+    wire, period = settings.wire, settings.loop.period
+    heartbeat = _heartbeat(wire.transmit, settings.loop)
+    seen, said = codes_of(measurements, wire.measurement), codes_of(commands, wire.command)
+    rates: dict[Policy, tuple[Traffic, Traffic]] = {}
+    zenoh: dict[Policy, LinkBytes] = {}
+    for policy in POLICIES:
+        out, inp = sent_ticks(seen, policy, heartbeat), sent_ticks(said, policy, heartbeat)
+        rates[policy] = traffic(seen, wire.measurement, out, period), traffic(said, wire.command, inp, period)
+        if counted:
+            zenoh[policy] = count_bytes(settings.network, [measurements[k] for k in out], [commands[k] for k in inp])
+    return Observation(figures, rates, zenoh)
+
+
+def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
+    """Which of these pairs no other is as good as in both, and better in one; less is better."""
+    pairs = list(costs)
+    return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
+
+
+def _heartbeat(transmit: Transmit, loop: LoopSettings) -> int:
+    return transmit.heartbeat_ticks(loop.period_ns)
+
+
+def _points(cell: Cell, found: Observation, duration_s: float) -> list[Point]:
+    def point(policy: Policy, **figures: Any) -> Point:
+        return Point(
+            bits_out=cell.bits_out,
+            bits_in=cell.bits_in,
+            quantizer=cell.quantizer,
+            sensors=cell.sensors,
+            transmit=policy,
+            **figures,
+        )
+
+    if found.figures is None:
+        return [point(policy, reason=found.reason) for policy in POLICIES]
+    points = []
+    for policy, (measurement, command) in found.traffic.items():
+        counted = found.zenoh.get(policy)
+        points.append(
+            point(
+                policy,
+                z_track=found.figures.z_track,
+                u_total=found.figures.u_total,
+                measurement=measurement,
+                command=command,
+                bits_per_s=measurement.bits_per_s + command.bits_per_s,
+                can_bits_per_s=measurement.can_bits_per_s + command.can_bits_per_s,
+                can_load=measurement.can_load + command.can_load,
+                zenoh_bytes_per_s=counted
+                and LinkRates(measurement=counted.measurement / duration_s, command=counted.command / duration_s),
+            )
+        )
+    return points
+
+
+def _beside_float64(points: Sequence[Point], sensors: str) -> list[Point]:
+    """The points with these sensors, compared with their baseline and with each other."""
+    mine = [point for point in points if point.sensors == sensors]
+    baseline = next(point for point in mine if point.is_baseline)
+    if baseline.reason is not None:
+        raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline.reason}")
+    done = [point for point in mine if point.reason is None]
+    front = pareto_front((_known(point.bits_per_s), _known(point.z_track)) for point in done)
+    on_front = {id(point) for point, best in zip(done, front, strict=True) if best}
+    return [
+        point.model_copy(update={"pareto": id(point) in on_front, "against_float64": _ratios(point, baseline)})
+        for point in mine
+    ]
+
+
+def _ratios(point: Point, baseline: Point) -> Ratios | None:
+    if point.reason is not None:
+        return None
+    names = Ratios.model_fields
+    return Ratios(**{name: _known(getattr(point, name)) / _known(getattr(baseline, name)) for name in names})
+
+
+def _known(figure: float | None) -> float:
+    """A figure that is there, because its point has no reason why it should not be."""
+    assert figure is not None
+    return figure

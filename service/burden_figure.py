@@ -1,0 +1,147 @@
+"""The figure of `lab burden`: error against payload bits a second, a panel for each of the sensors.
+
+Both axes are logarithmic. Colour and shape say which quantizer; a full marker sends on change, a hollow one at every
+tick. A line joins the Pareto front, its points labelled with bits out/in; dotted lines mark float64 at every tick.
+"""
+
+from __future__ import annotations
+
+from math import log10
+from pathlib import Path
+from typing import Final
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from service.burden import Burden, Point
+from service.burden_grid import BurdenError
+
+SUFFIXES: Final = (".png", ".svg", ".pdf")
+# Colours that differ in brightness as well, for print and for eyes that see no red.
+_STYLES: Final = {
+    "uniform": ("#1f5fa8", "o"),
+    "hysteresis-uniform": ("#d9731a", "s"),
+    "logarithmic-uniform": ("#2a9d74", "^"),
+    None: ("#222222", "D"),
+}
+_LABEL_WIDTH: Final = 0.15
+_LABEL_HEIGHT: Final = 0.045
+"""Decades that a label covers."""
+_TICKS: Final = [digit * 10**power for power in range(7) for digit in (1, 2, 3, 5)]
+
+
+def check_path(path: Path) -> Path:
+    """The path of a figure. Raises BurdenError if it could not be written."""
+    if path.suffix not in SUFFIXES:
+        raise BurdenError(f"a figure ends in {', '.join(SUFFIXES)}, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise BurdenError(f"there is no folder {path.parent} for the figure")
+    return path
+
+
+def draw_burden(burden: Burden, path: Path) -> None:
+    """Draw the grid into a file.
+
+    Raises:
+        BurdenError: It cannot be written, or there is nothing to draw.
+    """
+    check_path(path)
+    names = [name for name in burden.sensors if any(point.reason is None for point in burden.under(name))]
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(1.2 + 4.4 * columns, 1.2 + 3.3 * rows), layout="constrained")
+    panels: list[Axes] = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten().tolist()
+    for panel, name in zip(panels, names, strict=False):
+        _draw(panel, [point for point in burden.under(name) if point.reason is None])
+        panel.set_title(name.replace("-", " "), fontsize=11)
+    errors = [_place(point)[1] for point in burden.points if point.reason is None]
+    panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
+    for panel in panels[len(names) :]:
+        panel.set_axis_off()
+    for i, panel in enumerate(panels):
+        if i % columns == 0:
+            panel.set_ylabel(r"$z_\mathrm{track}$ [$10^{-4}$ s]")
+        if i >= len(panels) - columns:
+            panel.set_xlabel("payload of measurements and commands [bit/s]", fontsize=9)
+    figure.legend(handles=_legend(burden), loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    try:
+        figure.savefig(path, dpi=150)
+    except OSError as error:
+        raise BurdenError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _place(point: Point) -> tuple[float, float]:
+    assert point.bits_per_s is not None
+    assert point.z_track is not None
+    return point.bits_per_s, point.z_track * 1e4
+
+
+def _draw(panel: Axes, points: list[Point]) -> None:
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.margins(x=0.08)
+    panel.grid(visible=True, color="0.92")
+    panel.set_axisbelow(True)
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(FixedLocator(_TICKS))
+        axis.set_minor_locator(NullLocator())
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 1e3:g} k"))
+    panel.tick_params(labelsize=9)
+    front = sorted({_place(point): point for point in points if point.pareto}.items())
+    panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=1.2, zorder=2)
+    for point in points:
+        color, marker = _STYLES[point.quantizer]
+        panel.plot(
+            *_place(point),
+            marker,
+            color=color,
+            markersize=6,
+            markerfacecolor=color if point.transmit == "on_change" else "white",
+            linestyle="none",
+            zorder=4 if point.pareto else 3,
+        )
+        if point.is_baseline:
+            bits, error = _place(point)
+            panel.axvline(bits, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
+            panel.axhline(error, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
+    _label(panel, [(label_of(point), place) for place, point in front])
+
+
+def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
+    """Label places on a front, to the lower left, where there is nothing; leave out what would cover another label."""
+    there: list[tuple[float, float]] = []
+    for label, (x, y) in labels:
+        if any(
+            abs(log10(x / other)) < _LABEL_WIDTH and abs(log10(y / above)) < _LABEL_HEIGHT for other, above in there
+        ):
+            continue
+        there.append((x, y))
+        panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
+
+
+def label_of(point: Point) -> str:
+    """What a point is called: its bits out/in, or float64."""
+    return "float64" if point.quantizer is None else point.bits
+
+
+def _legend(burden: Burden) -> list[Line2D]:
+    """What colours, markers and lines mean; three columns, filled downwards."""
+    drawn = dict.fromkeys(point.quantizer for point in burden.points if point.quantizer is not None)
+    quantizers = [_key(_STYLES[kind][0], _STYLES[kind][1], kind.removesuffix("-uniform")) for kind in drawn]
+    color, marker = _STYLES[None]
+    return [
+        *quantizers,
+        _key(color, marker, "float64"),
+        _key("0.4", "o", "sent on change"),
+        _key("0.4", "o", "sent at every tick", full=False),
+        Line2D([], [], color="0.45", linewidth=1.2, label="Pareto front, bits out/in"),
+        Line2D([], [], color="0.3", linewidth=0.9, linestyle=":", label="float64 at every tick"),
+    ]
+
+
+def _key(color: str, marker: str, label: str, *, full: bool = True) -> Line2D:
+    face = color if full else "white"
+    return Line2D([], [], color=color, marker=marker, markerfacecolor=face, linestyle="none", markersize=6, label=label)

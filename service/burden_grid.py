@@ -1,0 +1,152 @@
+"""The grid of `lab burden`: what is tried, and the configuration of each cell.
+
+Bits run from where the loop begins to shake to where more of them gain nothing. Sensors run from none at all to a gyro
+whose noise is wider than a step: noise, more than motion, is what changes a level from one tick to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, get_args
+
+from pydantic import ValidationError
+
+from protocol.errors import AeroloopError
+from protocol.frames import Kind, SignalSpec, WireSpec
+from protocol.quantizer import MAX_BITS, MIN_BITS
+from protocol.transmit import Transmit
+from service.config import Settings
+
+BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
+FLOAT64: Final = (None, None)
+COUNTED: Final = ((8, 6), FLOAT64)
+"""Bits out and in of the cells whose bytes are counted on a Zenoh link: the paper's case, and the baseline."""
+QUANTIZERS: Final[tuple[Kind, ...]] = get_args(Kind)
+
+
+class BurdenError(AeroloopError):
+    """The grid cannot be run; one line that says why."""
+
+
+class Sensors(NamedTuple):
+    """What measures.
+
+    Attributes:
+        text: In words.
+        changes: Fields of `plant.sensors`.
+    """
+
+    text: str
+    changes: dict[str, Any]
+
+
+SENSORS: Final = {
+    "perfect": Sensors(
+        "the true attitude and rate, so that all there is comes from the quantizers",
+        {"attitude": "perfect", "rate": "perfect"},
+    ),
+    "encoders": Sensors(
+        "encoders and their filtered derivative, as on the paper's bench",
+        {"attitude": "encoders", "rate": "derivative"},
+    ),
+    "gyro": Sensors(
+        "encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of a step at 8 bits",
+        {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.002},
+    ),
+    "shaken-gyro": Sensors(
+        "encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps at 8 bits",
+        {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02},
+    ),
+}
+"""Whatever else `plant.sensors` says stays as configured."""
+
+
+class Cell(NamedTuple):
+    """One experiment. Bits of None are float64; the quantizer is None where nothing is quantized."""
+
+    bits_out: int | None
+    bits_in: int | None
+    quantizer: Kind | None
+    sensors: str
+    counted: bool
+
+
+def grid(
+    settings: Settings, bits: Sequence[str] = (), quantizers: Sequence[str] = (), sensors: Sequence[str] = ()
+) -> list[Cell]:
+    """The cells of a grid; float64 is always among them. What is left empty is all there is.
+
+    Args:
+        settings: The configuration.
+        bits: Bits out and in, such as 8/6; `cont` for float64.
+        quantizers: Kinds of quantizers.
+        sensors: Names out of SENSORS.
+
+    Raises:
+        BurdenError: Something that there is not, or a cell that the configuration does not allow.
+    """
+    if settings.plant.ideal:
+        raise BurdenError("plant.ideal has no sensors to choose: leave it out, and take --sensors perfect")
+    pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
+    kinds = [_one_of("--quantizer", name, QUANTIZERS) for name in dict.fromkeys(quantizers)] or list(QUANTIZERS)
+    levels = [_one_of("--sensors", name, tuple(SENSORS)) for name in dict.fromkeys(sensors)] or list(SENSORS)
+    counted_with = "encoders" if "encoders" in levels else levels[0]
+    cells = [
+        Cell(*pair, kind, level, pair in COUNTED and kind in (None, kinds[0]) and level == counted_with)
+        for level in levels
+        for pair, of_kinds in (*((pair, kinds) for pair in pairs), (FLOAT64, [None]))
+        for kind in of_kinds
+    ]
+    for cell in cells:
+        cell_settings(settings, cell)
+    return cells
+
+
+def cell_settings(settings: Settings, cell: Cell) -> Settings:
+    """The configuration of a cell, which sends at every tick.
+
+    Raises:
+        BurdenError: The quantizer does not take so few bits, or the plant has no such sensors.
+    """
+    wire, plant = settings.wire, settings.plant
+    out, inp, kind = cell.bits_out, cell.bits_in, cell.quantizer
+    try:
+        chosen = WireSpec(
+            attitude=_quantized(wire.attitude, out, kind),
+            rate=_quantized(wire.rate, out, kind),
+            voltage=_quantized(wire.voltage, inp, kind),
+            actuators=wire.actuators,
+            transmit=Transmit(heartbeat_s=wire.transmit.heartbeat_s),
+        )
+        sensors = plant.sensors.model_copy(update=SENSORS[cell.sensors].changes)
+        measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
+    except ValidationError as error:
+        why = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        bits = "/".join("cont" if one is None else str(one) for one in (out, inp))
+        raise BurdenError(f"{bits} {kind or 'float64'} with sensors {cell.sensors}: {why}") from None
+    return settings.model_copy(update={"wire": chosen, "plant": measured})
+
+
+def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> SignalSpec:
+    """A signal with other bits and another quantizer; parameters stay where they are that quantizer's."""
+    if kind in (None, signal.kind):
+        return signal.with_bits(bits)
+    return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
+
+
+def _pair(text: str) -> tuple[int | None, int | None]:
+    words = text.split("/") if text != "cont" else [text] * 2
+    if len(words) != 2 or not all(_is_bits(word) for word in words):
+        raise BurdenError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
+    out, inp = (None if word == "cont" else int(word) for word in words)
+    return out, inp
+
+
+def _is_bits(word: str) -> bool:
+    return word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS)
+
+
+def _one_of(option: str, name: str, known: Sequence[Any]) -> Any:
+    if name not in known:
+        raise BurdenError(f"{option} takes {', '.join(known)}, not {name!r}")
+    return name

@@ -1,0 +1,150 @@
+"""What a person sees of `lab burden`: a table for each of the sensors, in the terminal or as Markdown.
+
+A row is one experiment, with its cost under either policy; out + in are measurements and commands. In brackets stands
+what it is of float64 at every tick. ★ marks the Pareto front of error against payload bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from service.burden import Burden, Point
+
+HEADER: Final = (
+    "bits out/in",
+    "quantizer",
+    "z_track, 10⁻⁴ s",
+    "u_total, V²·s",
+    "changes/s",
+    "every tick: kbit/s",
+    "CAN kbit/s",
+    "on change: frames/s",
+    "ms between, mean",
+    "least",
+    "kbit/s",
+    "CAN kbit/s",
+)
+_PIPE_WIDTH: Final = 160
+_SPLIT: Final = "†"
+
+
+def burden_table(burden: Burden) -> None:
+    """Print the grid."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = _PIPE_WIDTH  # nobody folds a file's lines back
+    for name, text in burden.sensors.items():
+        table = Table(
+            title=f"sensors {name}: {text}", title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
+        )
+        for i, title in enumerate(HEADER):
+            table.add_column(title, justify="left" if i < 2 else "right", overflow="fold")
+        for row in _rows(burden, name):
+            table.add_row(*(Text(cell) for cell in row))
+        console.print(table)
+        for line in _counted(burden, name):
+            console.print(Text(line))
+        console.print()
+    for line in _notes(burden):
+        console.print(Text(line))
+
+
+def markdown(burden: Burden) -> str:
+    """Write the grid as Markdown."""
+    lines: list[str] = []
+    for name, text in burden.sensors.items():
+        lines += [f"**Sensors `{name}`**: {text}", "", f"| {' | '.join(HEADER)} |"]
+        lines += ["|" + "---|" * 2 + "--:|" * (len(HEADER) - 2)]
+        lines += [f"| {' | '.join(row)} |" for row in _rows(burden, name)]
+        lines += ["", *_counted(burden, name), ""]
+    return "\n".join([*lines, *_notes(burden)])
+
+
+def _rows(burden: Burden, sensors: str) -> Iterator[list[str]]:
+    points = burden.under(sensors)
+    for always, changed in zip(points[::2], points[1::2], strict=True):
+        label = always.quantizer.removesuffix("-uniform") if always.quantizer else "float64"
+        ratios = always.against_float64
+        if (
+            ratios is None
+            or always.z_track is None
+            or always.u_total is None
+            or changed.measurement is None
+            or changed.command is None
+        ):
+            yield [always.bits, label, *["–"] * (len(HEADER) - 2)]
+            continue
+        out, inp = changed.measurement, changed.command
+        yield [
+            always.bits,
+            label,
+            f"{always.z_track * 1e4:.1f} (×{ratios.z_track:.{2 if ratios.z_track < 9.995 else 1}f})",
+            f"{always.u_total:.0f}",
+            f"{out.changes_per_s:.0f} + {inp.changes_per_s:.0f}",
+            _payload(always),
+            _bus(always),
+            f"{out.frames_per_s:.0f} + {inp.frames_per_s:.0f}",
+            f"{_ms(out.mean_interval_ms)} + {_ms(inp.mean_interval_ms)}",
+            f"{_ms(out.least_interval_ms, 'g')} + {_ms(inp.least_interval_ms, 'g')}",
+            _payload(changed),
+            _bus(changed),
+        ]
+
+
+def _payload(point: Point) -> str:
+    if point.bits_per_s is None or point.against_float64 is None:
+        return "–"
+    star = "★ " if point.pareto else ""
+    return f"{star}{point.bits_per_s / 1e3:.1f} ({_share(point.against_float64.bits_per_s)})"
+
+
+def _bus(point: Point) -> str:
+    """Bits a second on the bus, and its load; a split is marked, and so is what no bus carries."""
+    if point.can_bits_per_s is None or point.can_load is None or point.measurement is None or point.command is None:
+        return "–"
+    split = _SPLIT if max(point.measurement.can_frames, point.command.can_frames) > 1 else ""
+    load = _share(point.can_load) + (", too much" if point.can_load > 1 else "")
+    return f"{point.can_bits_per_s / 1e3:.0f} ({load}){split}"
+
+
+def _share(ratio: float) -> str:
+    return f"{100 * ratio:.{0 if ratio > 0.0995 else 1}f} %"
+
+
+def _ms(interval: float | None, digits: str = ".1f") -> str:
+    return "–" if interval is None else f"{interval:{digits}}"
+
+
+def _counted(burden: Burden, sensors: str) -> Iterator[str]:
+    """What was counted on a Zenoh link, and why a row is empty."""
+    points = burden.under(sensors)
+    words = {"periodic": "every tick", "on_change": "on change"}
+    counted = [
+        f"{point.bits} {words[point.transmit]} {rates.measurement / 1e3:.1f} + {rates.command / 1e3:.1f}"
+        for point in points
+        if (rates := point.zenoh_bytes_per_s) is not None
+    ]
+    if counted:
+        yield f"Counted on a Zenoh link, kB/s: {'; '.join(counted)}."
+    for point in points:
+        if point.reason is not None and point.transmit == "periodic":
+            yield f"{point.bits} {point.quantizer}: {point.reason}."
+
+
+def _notes(burden: Burden) -> Iterator[str]:
+    period = 1e3 / burden.rate_hz
+    yield (
+        f"{burden.duration_s:g} s each. Every tick: {burden.rate_hz:g} + {burden.rate_hz:g} frames/s, {period:g} ms "
+        f"apart. On change: at least every {burden.heartbeat_s * 1e3:g} ms. CAN: a classic bus of 1 Mbit/s, worst-case "
+        "stuffing, without heartbeats."
+    )
+    if any(part and part.can_frames > 1 for point in burden.points for part in (point.measurement, point.command)):
+        yield (
+            f"{_SPLIT} A frame of more than 8 bytes, reckoned as the classic frames that its bytes fill; in fact it "
+            "goes as one CAN FD frame."
+        )

@@ -1,0 +1,63 @@
+"""What the counting relay counts: every byte of a made-up stream, and of frames on a Zenoh link more than they hold."""
+
+from __future__ import annotations
+
+import socket
+import threading
+
+import pytest
+
+from protocol.network import NetworkSettings
+from service.zenoh_bytes import Relay, count_bytes
+
+SEVEN, TWO = b"1234567", b"12"
+KEEPALIVES = 60
+"""Bytes that a link may say beside the frames, if this machine is busy for seconds."""
+PLAIN = NetworkSettings(timestamps=False)
+
+
+def test_a_relay_passes_every_byte_on_and_counts_each_direction() -> None:
+    there, back = bytes(range(256)) * 1000, b"ab" * 5000
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        got: list[bytes] = []
+
+        def answer() -> None:
+            taken, _ = server.accept()
+            with taken, taken.makefile("rb") as stream:
+                got.append(stream.read(len(there)))
+                taken.sendall(back)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with Relay(server.getsockname()[1]) as relay:
+            with socket.create_connection(("127.0.0.1", relay.port)) as near, near.makefile("rb") as stream:
+                near.sendall(there)
+                assert stream.read() == back
+            thread.join()
+            assert got == [there]
+            assert (relay.there, relay.back) == (len(there), len(back))
+
+
+def test_a_relay_that_nobody_uses_ends() -> None:
+    with Relay(1) as relay:
+        pass
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", relay.port)).close()
+
+
+def test_a_link_carries_more_than_the_frames_and_the_same_for_each() -> None:
+    few, many = (count_bytes(PLAIN, [SEVEN] * n, [TWO] * 2 * n) for n in (100, 200))
+    assert few.measurement > 100 * len(SEVEN)
+    assert few.command > 200 * len(TWO)
+    for first, second in zip(few, many, strict=True):
+        # A link's sequence numbers begin anywhere: a byte more or less each, on another link.
+        assert abs(second - 2 * first) <= 200 * 2 + KEEPALIVES
+    assert max(count_bytes(PLAIN, [], [])) <= KEEPALIVES
+    longer = count_bytes(PLAIN, [SEVEN * 2] * 100, [])
+    assert longer.measurement - few.measurement == pytest.approx(100 * len(SEVEN), abs=100 + KEEPALIVES)
+
+
+def test_times_and_numbers_cost_what_the_configuration_says() -> None:
+    plain, stamped = count_bytes(PLAIN, [SEVEN] * 100, []), count_bytes(NetworkSettings(), [SEVEN] * 100, [])
+    # 47 bytes each, as `network.timestamps` tells the user.
+    assert stamped.measurement - plain.measurement == pytest.approx(100 * 47, abs=100 + KEEPALIVES)
