@@ -75,6 +75,11 @@ class Point(BaseModel):
         return "/".join("cont" if bits is None else str(bits) for bits in (self.bits_out, self.bits_in))
 
     @property
+    def label(self) -> str:
+        """What to call it for short: its bits, or float64."""
+        return self.bits if self.quantizer else "float64"
+
+    @property
     def is_baseline(self) -> bool:
         """Whether it is what the others stand beside: float64 at every tick."""
         return self.quantizer is None and self.transmit == "periodic"

@@ -107,7 +107,7 @@ def _draw(panel: Axes, points: list[Point]) -> None:
             bits, error = _place(point)
             panel.axvline(bits, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
             panel.axhline(error, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
-    _label(panel, [(label_of(point), place) for place, point in front])
+    _label(panel, [(point.label, place) for place, point in front])
 
 
 def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
@@ -120,11 +120,6 @@ def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
             continue
         there.append((x, y))
         panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
-
-
-def label_of(point: Point) -> str:
-    """What a point is called: its bits out/in, or float64."""
-    return "float64" if point.quantizer is None else point.bits
 
 
 def _legend(burden: Burden) -> list[Line2D]:

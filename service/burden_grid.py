@@ -50,11 +50,11 @@ SENSORS: Final = {
         {"attitude": "encoders", "rate": "derivative"},
     ),
     "gyro": Sensors(
-        "encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of a step at 8 bits",
+        "encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of the 8-bit step",
         {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.002},
     ),
     "shaken-gyro": Sensors(
-        "encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps at 8 bits",
+        "encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps of 8 bits",
         {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02},
     ),
 }

@@ -43,7 +43,8 @@ def burden_table(burden: Burden) -> None:
             title=f"sensors {name}: {text}", title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
         )
         for i, title in enumerate(HEADER):
-            table.add_column(title, justify="left" if i < 2 else "right", overflow="fold")
+            names = i < 2  # of the experiment; the rest is numbers
+            table.add_column(title, justify="left" if names else "right", no_wrap=names, overflow="fold")
         for row in _rows(burden, name):
             table.add_row(*(Text(cell) for cell in row))
         console.print(table)
@@ -113,7 +114,7 @@ def _bus(point: Point) -> str:
 
 
 def _share(ratio: float) -> str:
-    return f"{100 * ratio:.{0 if ratio > 0.0995 else 1}f} %"
+    return f"{100 * ratio:.{0 if ratio > 0.0995 else 1}f}%"
 
 
 def _ms(interval: float | None, digits: str = ".1f") -> str:
@@ -123,9 +124,9 @@ def _ms(interval: float | None, digits: str = ".1f") -> str:
 def _counted(burden: Burden, sensors: str) -> Iterator[str]:
     """What was counted on a Zenoh link, and why a row is empty."""
     points = burden.under(sensors)
-    words = {"periodic": "every tick", "on_change": "on change"}
+    when = {"periodic": "every tick", "on_change": "on change"}
     counted = [
-        f"{point.bits} {words[point.transmit]} {rates.measurement / 1e3:.1f} + {rates.command / 1e3:.1f}"
+        f"{point.label} {when[point.transmit]} {rates.measurement / 1e3:.1f} + {rates.command / 1e3:.1f}"
         for point in points
         if (rates := point.zenoh_bytes_per_s) is not None
     ]
@@ -133,7 +134,7 @@ def _counted(burden: Burden, sensors: str) -> Iterator[str]:
         yield f"Counted on a Zenoh link, kB/s: {'; '.join(counted)}."
     for point in points:
         if point.reason is not None and point.transmit == "periodic":
-            yield f"{point.bits} {point.quantizer}: {point.reason}."
+            yield f"{point.label} {point.quantizer}: {point.reason}."
 
 
 def _notes(burden: Burden) -> Iterator[str]:
