@@ -135,8 +135,10 @@ def measure_burden(
         BurdenError: Float64 itself does not keep the loop running, or a cell does not fit the configuration.
     """
     jobs = [(cell_settings(settings, cell).contract(), duration_s, cell.counted) for cell in cells]
+    told = progress or (lambda _done, _total: None)
+    told(0, len(jobs))
     with Workers() as workers:
-        seen = workers.each(observe, jobs, lambda done: progress(done, len(jobs)) if progress else None)
+        seen = workers.each(observe, jobs, lambda done: told(done, len(jobs)))
     points = [point for cell, found in zip(cells, seen, strict=True) for point in _points(cell, found, duration_s)]
     return Burden(
         duration_s=duration_s,
