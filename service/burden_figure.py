@@ -29,7 +29,7 @@ _STYLES: Final = {
 _LABEL_WIDTH: Final = 0.15
 _LABEL_HEIGHT: Final = 0.045
 """Decades that a label covers."""
-_TICKS: Final = [digit * 10**power for power in range(7) for digit in (1, 2, 3, 5)]
+_TICKS: Final = [digit * 10**power for power in range(-1, 6) for digit in (1, 2, 3, 5)]
 
 
 def check_path(path: Path) -> Path:
@@ -45,26 +45,27 @@ def draw_burden(burden: Burden, path: Path) -> None:
     """Draw the grid into a file.
 
     Raises:
-        BurdenError: It cannot be written, or there is nothing to draw.
+        BurdenError: It cannot be written.
     """
     check_path(path)
-    names = [name for name in burden.sensors if any(point.reason is None for point in burden.under(name))]
+    names = list(burden.sensors)
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(1.2 + 4.4 * columns, 1.2 + 3.3 * rows), layout="constrained")
     panels: list[Axes] = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten().tolist()
     for panel, name in zip(panels, names, strict=False):
         _draw(panel, [point for point in burden.under(name) if point.reason is None])
-        panel.set_title(name.replace("-", " "), fontsize=11)
+        panel.set_title(f"sensors: {name}", fontsize=11)
     errors = [_place(point)[1] for point in burden.points if point.reason is None]
     panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
-    for panel in panels[len(names) :]:
-        panel.set_axis_off()
     for i, panel in enumerate(panels):
+        if i >= len(names):
+            panel.set_axis_off()
         if i % columns == 0:
             panel.set_ylabel(r"$z_\mathrm{track}$ [$10^{-4}$ s]")
-        if i >= len(panels) - columns:
-            panel.set_xlabel("payload of measurements and commands [bit/s]", fontsize=9)
+        if i + columns >= len(names):  # the last of its column
+            panel.set_xlabel("payload of measurements and commands [kbit/s]", fontsize=9)
+            panel.tick_params(labelbottom=True)
     figure.legend(handles=_legend(burden), loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     try:
         figure.savefig(path, dpi=150)
@@ -73,9 +74,10 @@ def draw_burden(burden: Burden, path: Path) -> None:
 
 
 def _place(point: Point) -> tuple[float, float]:
+    """Payload [kbit/s] and error [1e-4 s]."""
     assert point.bits_per_s is not None
     assert point.z_track is not None
-    return point.bits_per_s, point.z_track * 1e4
+    return point.bits_per_s / 1e3, point.z_track * 1e4
 
 
 def _draw(panel: Axes, points: list[Point]) -> None:
@@ -87,8 +89,7 @@ def _draw(panel: Axes, points: list[Point]) -> None:
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_major_locator(FixedLocator(_TICKS))
         axis.set_minor_locator(NullLocator())
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 1e3:g} k"))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.tick_params(labelsize=9)
     front = sorted({_place(point): point for point in points if point.pareto}.items())
     panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=1.2, zorder=2)
@@ -104,8 +105,8 @@ def _draw(panel: Axes, points: list[Point]) -> None:
             zorder=4 if point.pareto else 3,
         )
         if point.is_baseline:
-            bits, error = _place(point)
-            panel.axvline(bits, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
+            payload, error = _place(point)
+            panel.axvline(payload, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
             panel.axhline(error, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
     _label(panel, [(point.label, place) for place, point in front])
 
