@@ -1,7 +1,7 @@
 """What a person sees of `lab burden`: a table for each of the sensors, in the terminal or as Markdown.
 
-A row is one experiment, with its cost under either policy; out + in are measurements and commands. In brackets stands
-what it is of float64 at every tick. ★ marks the Pareto front of error against payload bits.
+A row is one experiment, with its cost under either policy, beside float64 at every tick. What could not be had is a
+dash, with the reason below. In the terminal a column folds where it must; in a pipe or a file, lines stay whole.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ def burden_table(burden: Burden) -> None:
             table.add_row(*(Text(cell) for cell in row))
         console.print(table)
         for line in _counted(burden, name):
-            console.print(Text(line))
+            console.print(Text(line), soft_wrap=not console.is_terminal)
         console.print()
     for line in _notes(burden):
-        console.print(Text(line))
+        console.print(Text(line), soft_wrap=not console.is_terminal)
 
 
 def markdown(burden: Burden) -> str:
@@ -63,7 +63,7 @@ def markdown(burden: Burden) -> str:
         lines += ["|" + "---|" * 2 + "--:|" * (len(HEADER) - 2)]
         lines += [f"| {' | '.join(row)} |" for row in _rows(burden, name)]
         lines += ["", *_counted(burden, name), ""]
-    return "\n".join([*lines, *_notes(burden)])
+    return "\n".join([*lines, "\n\n".join(_notes(burden))])
 
 
 def _rows(burden: Burden, sensors: str) -> Iterator[list[str]]:
@@ -138,11 +138,15 @@ def _counted(burden: Burden, sensors: str) -> Iterator[str]:
 
 
 def _notes(burden: Burden) -> Iterator[str]:
-    period = 1e3 / burden.rate_hz
+    rate, period = burden.rate_hz, 1e3 / burden.rate_hz
     yield (
-        f"{burden.duration_s:g} s each. Every tick: {burden.rate_hz:g} + {burden.rate_hz:g} frames/s, {period:g} ms "
-        f"apart. On change: at least every {burden.heartbeat_s * 1e3:g} ms. CAN: a classic bus of 1 Mbit/s, worst-case "
-        "stuffing, without heartbeats."
+        f"{burden.duration_s:g} s each; of two numbers the first is measurements, the second commands; × and % are of "
+        "float64 at every tick; ★ is on the Pareto front of z_track against payload bits."
+    )
+    yield (
+        f"Every tick: {rate:g} + {rate:g} frames/s, {period:g} ms apart. On change: at least every "
+        f"{burden.heartbeat_s * 1e3:g} ms. CAN: a classic bus of 1 Mbit/s and its load, worst-case stuffing, without "
+        "heartbeats."
     )
     if any(part and part.can_frames > 1 for point in burden.points for part in (point.measurement, point.command)):
         yield (
