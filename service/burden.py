@@ -139,7 +139,7 @@ def measure_burden(
     told(0, len(jobs))
     with Workers() as workers:
         seen = workers.each(observe, jobs, lambda done: told(done, len(jobs)))
-    points = [point for cell, found in zip(cells, seen, strict=True) for point in _points(cell, found, duration_s)]
+    points = [point for cell, found in zip(cells, seen, strict=True) for point in _points(cell, found)]
     return Burden(
         duration_s=duration_s,
         rate_hz=settings.loop.rate_hz,
@@ -192,7 +192,7 @@ def _heartbeat(transmit: Transmit, loop: LoopSettings) -> int:
     return transmit.heartbeat_ticks(loop.period_ns)
 
 
-def _points(cell: Cell, found: Observation, duration_s: float) -> list[Point]:
+def _points(cell: Cell, found: Observation) -> list[Point]:
     def point(policy: Policy, **figures: Any) -> Point:
         return Point(
             bits_out=cell.bits_out,
@@ -207,7 +207,7 @@ def _points(cell: Cell, found: Observation, duration_s: float) -> list[Point]:
         return [point(policy, reason=found.reason) for policy in POLICIES]
     points = []
     for policy, (measurement, command) in found.traffic.items():
-        counted = found.zenoh.get(policy)
+        counted, seconds = found.zenoh.get(policy), found.figures.duration_s
         points.append(
             point(
                 policy,
@@ -219,7 +219,7 @@ def _points(cell: Cell, found: Observation, duration_s: float) -> list[Point]:
                 can_bits_per_s=measurement.can_bits_per_s + command.can_bits_per_s,
                 can_load=measurement.can_load + command.can_load,
                 zenoh_bytes_per_s=counted
-                and LinkRates(measurement=counted.measurement / duration_s, command=counted.command / duration_s),
+                and LinkRates(measurement=counted.measurement / seconds, command=counted.command / seconds),
             )
         )
     return points

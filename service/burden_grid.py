@@ -42,7 +42,7 @@ class Sensors(NamedTuple):
 
 SENSORS: Final = {
     "perfect": Sensors(
-        "the true attitude and rate, so that all there is comes from the quantizers",
+        "the true attitude and rate, so that only quantizers come between the body and the law",
         {"attitude": "perfect", "rate": "perfect"},
     ),
     "encoders": Sensors(

@@ -64,10 +64,10 @@ def test_nothing_and_nonsense_are_refused() -> None:
     "overrides",
     [
         (),
-        ("wire.attitude.kind=hysteresis-uniform", "wire.rate.kind=hysteresis-uniform"),
+        ("wire.attitude.kind=hysteresis-uniform", "wire.voltage.kind=logarithmic-uniform"),
         ('wire.rate.bits="cont"', "wire.transmit.heartbeat_s=0.01"),
     ],
-    ids=["uniform", "hysteresis", "float64 rates"],
+    ids=["uniform", "other quantizers", "float64 rates"],
 )
 def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides: tuple[str, ...]) -> None:
     """The last bit included: frames, their ticks, figures."""
