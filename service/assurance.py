@@ -20,10 +20,10 @@ from protocol.frames import WireSpec
 from protocol.messages import EventKind
 from protocol.role import Role
 from protocol.verbs import Gains, Reference
-from service.certificate import Certificate, certify
-from service.extremes import BoundlessError
 from service.law import LawSettings
 from service.settings import ControllerSettings
+from service.theorem.certificate import Certificate, certify
+from service.theorem.extremes import BoundlessError
 
 KEPT: Final = 8
 """Verdicts that are kept: a few for what runs, and for changes that are being asked for."""

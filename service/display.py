@@ -19,16 +19,16 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from service import paper
 from service.figures import Figures
+from service.lab import paper
 
 if TYPE_CHECKING:
-    from service.calibrate import Calibration
     from service.demo import Progress as DemoProgress
     from service.doctor import Diagnosis
+    from service.lab.calibrate import Calibration
+    from service.lab.tables import Tables
     from service.operate import Statuses
     from service.soak import Soak
-    from service.tables import Tables
 
 _stderr = Console(stderr=True)
 

@@ -11,7 +11,7 @@ import pytest
 from service.cli import execute
 from service.commands.show import EXAMPLES
 from service.config import load
-from service.experiment import run_experiment
+from service.lab.experiment import run_experiment
 
 ROOT = Path(__file__).parent.parent
 

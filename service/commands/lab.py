@@ -23,11 +23,11 @@ from service.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from service.burden import Burden
-    from service.calibrate import Calibration
-    from service.certificate import Certificate
     from service.figures import Figures
-    from service.tables import Tables
+    from service.lab.burden import Burden
+    from service.lab.calibrate import Calibration
+    from service.lab.tables import Tables
+    from service.theorem.certificate import Certificate
 
 group = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
 
@@ -45,7 +45,7 @@ def experiment(
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
 
     def run() -> Figures:
-        from service.experiment import run_experiment
+        from service.lab.experiment import run_experiment
 
         if json:
             return run_experiment(settings, duration)
@@ -70,7 +70,7 @@ def tables(
 
     def run() -> Tables:
         from service.display import count_bar
-        from service.tables import predict
+        from service.lab.tables import predict
 
         with count_bar("cells", hidden=json) as update:
             return predict(settings, seeds, update)
@@ -79,7 +79,7 @@ def tables(
     if json:
         typer.echo(result.model_dump_json(indent=2))
     elif markdown:
-        from service.tables import markdown as as_markdown
+        from service.lab.tables import markdown as as_markdown
 
         typer.echo(as_markdown(result))
     else:
@@ -94,8 +94,8 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
     settings = settings_of(config, overrides)
 
     def run() -> Calibration:
-        from service.calibrate import calibrate
         from service.display import count_bar
+        from service.lab.calibrate import calibrate
 
         with count_bar("experiments", hidden=json) as update:
             return calibrate(settings, lambda runs: update(runs, None))
@@ -132,7 +132,7 @@ def certify(
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
 
     def run() -> Certificate:
-        from service.certificate import certify
+        from service.theorem.certificate import certify
 
         return certify(
             settings.wire,
@@ -147,7 +147,7 @@ def certify(
     if json:
         typer.echo(result.model_dump_json(indent=2))
     else:
-        from service.certificate_table import certificate_table
+        from service.theorem.certificate_table import certificate_table
 
         certificate_table(result)
     raise typer.Exit(0 if result.holds else 1)
@@ -186,14 +186,14 @@ def burden(
     settings = settings_of(config, overrides)
 
     def run() -> Burden:
-        from service.burden import measure_burden
         from service.display import count_bar
+        from service.lab.burden import measure_burden
 
         with count_bar("experiments", hidden=json) as update:
             return measure_burden(settings, cells, duration, update)
 
-    from service.burden_figure import check_path, draw_burden
-    from service.burden_grid import grid
+    from service.lab.burden_figure import check_path, draw_burden
+    from service.lab.burden_grid import grid
 
     if figure is not None:
         checked(lambda: check_path(figure))
@@ -204,10 +204,10 @@ def burden(
     if json:
         typer.echo(result.model_dump_json(indent=2))
     elif markdown:
-        from service.burden_table import markdown as as_markdown
+        from service.lab.burden_table import markdown as as_markdown
 
         typer.echo(as_markdown(result))
     else:
-        from service.burden_table import burden_table
+        from service.lab.burden_table import burden_table
 
         burden_table(result)

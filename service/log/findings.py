@@ -13,7 +13,6 @@ from service.log.files import LogFiles, Which
 from service.log.observe import Observer
 from service.log.report import Findings
 from service.log.story import AROUND_S, Story
-from service.promise import verdict_of
 
 
 def findings_of(
@@ -69,8 +68,6 @@ def facts_of(files: LogFiles, story: Story, vehicle: str) -> dict[str, dict[str,
     facts: dict[str, dict[str, Any]] = {}
     for role, contract in files.contracts.items():
         facts[role] = {"host": contract.host, **contract.facts, "versions": contract.versions}
-        if contract.certificate is not None:
-            facts[role] = {"certificate": verdict_of(contract.certificate), **facts[role]}
     for name, told in files.metadata.items():
         facts.setdefault(name, {}).update(told)
     for (whose, role), status in story.statuses.items():

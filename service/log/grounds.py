@@ -15,10 +15,10 @@ from pydantic import ValidationError
 from plant_emulator.settings import IDEAL_AERO, PlantSettings
 from protocol.attitude import Vector
 from protocol.verbs import Change, Gains, Reference
-from service.certificate import Certificate, Evaluated, bounds_of, certify
 from service.config import Settings
-from service.extremes import BoundlessError
 from service.law import LawSettings
+from service.theorem.certificate import Certificate, Evaluated, bounds_of, certify
+from service.theorem.extremes import BoundlessError
 
 GAINS: Final = ("C1", "C2", "Gamma")
 

@@ -19,11 +19,11 @@ import numpy.typing as npt
 from protocol.attitude import Quaternion, Vector
 from protocol.verbs import Change
 from service.law import LawSettings
-from service.lemma import Inequality, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from service.log.grounds import Grounds
 from service.log.report import Array, LemmaCheck, TheoremFindings
 from service.log.tallies import BLOCK, Integers
 from service.log.ticks import Ticks
+from service.theorem.lemma import Inequality, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 
 Flags = npt.NDArray[np.bool_]
 

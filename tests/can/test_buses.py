@@ -23,9 +23,9 @@ from protocol.messages import Event
 from protocol.states import PlantState, TripCause
 from service.bench import free_rendezvous
 from service.config import load
-from service.experiment import run_experiment
 from service.figures import Figures
 from service.hil import Hil, HilLog
+from service.lab.experiment import run_experiment
 from service.log.review import review
 from tests.can.slcan_adapter import SlcanAdapter
 

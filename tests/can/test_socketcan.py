@@ -16,7 +16,7 @@ from protocol.can_link import CanLink, CanSettings, Heartbeat
 from protocol.frames import WireSpec
 from protocol.states import PlantState, TripCause
 from service.config import load
-from service.experiment import run_experiment
+from service.lab.experiment import run_experiment
 from tests.can.closed_loop import run_on_bus
 from tests.can.in_process import virtual
 from tests.can.kernel import NoSocketCan, run_with_socketcan, vcan_is_up

@@ -326,7 +326,7 @@ def test_commands_that_are_late_for_good_are_refused_although_their_echo_looks_f
 @pytest.mark.parametrize("fault", ["rate:noise=0.1@0.5", "attitude:drop=0.1@0.5", "motors:garble=0.05@0.5"])
 def test_a_fault_does_over_the_network_what_it_does_in_one_process(lockstep: Hil, fault: str) -> None:
     from service.config import load
-    from service.experiment import run_experiment
+    from service.lab.experiment import run_experiment
 
     lockstep.start(settings={"plant.faults": [fault]})
     lockstep.run(2)

@@ -32,8 +32,8 @@ from protocol.messages import Claim, Grant
 from protocol.states import PlantState
 from service.config import Settings, with_bits
 from service.controller import Controller
-from service.experiment import run_experiment
 from service.figures import Score
+from service.lab.experiment import run_experiment
 
 PERIOD = 0.002
 PERIOD_NS = 2_000_000

@@ -10,15 +10,15 @@ import pyarrow.parquet
 import pytest
 
 from protocol.frames import Kind
-from service.cells import Cell, run_cell
-from service.certificate import Certificate, certify
 from service.cli import execute as run
 from service.config import ConfigError, Settings, load, load_over, with_bits
-from service.experiment import run_experiment
+from service.lab.cells import Cell, run_cell
+from service.lab.experiment import run_experiment
 from service.log.export import export
 from service.log.files import LogFiles
 from service.log.replay import SessionReplay, replay
 from service.log.review import read, review
+from service.theorem.certificate import Certificate, certify
 from tests.service.log.made_log import AN_OPERATORS_WORDS, lockstep, make_log
 
 SIGNALS = ("attitude", "rate", "voltage")
@@ -77,7 +77,7 @@ def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str, monkey
         seen.append(settings)
         return run_experiment(settings, duration_s / 500)
 
-    monkeypatch.setattr("service.cells.run_experiment", instead)
+    monkeypatch.setattr("service.lab.cells.run_experiment", instead)
     run_cell(throughout(kind).contract(), Cell(bits_out=9, bits_in=7))
     wire = seen[0].wire
     assert [(signal.kind, signal.bits) for signal in (wire.attitude, wire.rate, wire.voltage)] == [

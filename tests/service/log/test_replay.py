@@ -9,8 +9,8 @@ import pytest
 
 from protocol import topics
 from service.config import load
-from service.experiment import run_experiment
 from service.figures import Figures, Stream
+from service.lab.experiment import run_experiment
 from service.log.files import LogFiles, ReviewError
 from service.log.limits import Limit, LimitError
 from service.log.mcap_records import CHANGE_METADATA, CHUNK, Damage, records

@@ -14,9 +14,7 @@ import pytest
 from plant_emulator.settings import PlantSettings
 from protocol.messages import Contract, Truth
 from protocol.verbs import Change, Gains, Hold, Stream
-from service.certificate import Evaluated, bounds_of
 from service.config import Settings, load
-from service.lemma import coordinates
 from service.log import grounds
 from service.log.display import review_account
 from service.log.grounds import Library, damping_of
@@ -28,7 +26,8 @@ from service.log.review import Kept, read, report
 from service.log.tallies import BLOCK
 from service.log.theorem import Trial
 from service.log.ticks import Ticks
-from service.promise import promise_of
+from service.theorem.certificate import Evaluated, bounds_of, certify
+from service.theorem.lemma import coordinates
 from tests.service import numpy_twin as twin
 from tests.service.log.made_log import SESSION, make_log
 from tests.service.log.retold import Said, retell
@@ -39,6 +38,12 @@ LEMMA = [f"C.{n}" for n in (26, 27, *range(50, 58))]
 
 def lockstep(*overrides: str) -> Settings:
     return load(overrides=["loop.lockstep=true", *overrides])
+
+
+def promised(settings: Settings) -> dict[str, Any]:
+    """The certificate as the controller's contract carries it."""
+    certificate = certify(settings.wire, settings.law, settings.reference, settings.controller)
+    return certificate.model_dump(mode="json")
 
 
 @pytest.fixture(scope="module")
@@ -253,9 +258,8 @@ def test_the_largest_norm_and_error_after_the_transient_are_beside_what_is_guara
     kept = Kept()
     judged = read(tmp_path / "a.mcap", watch=kept.watch)
     theorem = judged.findings.theorem
-    promise = promise_of(settings)
+    promise = promised(settings)
     assert theorem is not None
-    assert promise is not None
     assert theorem.radius is not None
     assert (theorem.holds, theorem.radius) == (True, promise["radius"])
     assert theorem.transient_s == 0.5
@@ -296,8 +300,7 @@ def with_contract(path: Path, out: Path, certificate: dict[str, Any]) -> Path:
 def test_the_contracts_certificate_is_what_counts_unless_the_session_began_with_other_gains(
     ideal: Path, tmp_path: Path
 ) -> None:
-    promise = promise_of(lockstep("plant.ideal=true"))
-    assert promise is not None
+    promise = promised(lockstep("plant.ideal=true"))
     assert found(with_contract(ideal, tmp_path / "a.mcap", {**promise, "radius": 0.5})).radius == 0.5
     library = Library(lockstep(), {**promise, "radius": 0.5})
     assert library.of(()).radius == 0.5

@@ -14,8 +14,8 @@ from pydantic import Field
 
 from protocol.frames import FrameFormat
 from protocol.transmit import Policy, Sender
-from service.bus import BITRATE, bus_bits, classic_frames
 from service.figures import Stream
+from service.lab.bus import BITRATE, bus_bits, classic_frames
 
 Codes: TypeAlias = tuple[float, ...]
 

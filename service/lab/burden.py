@@ -16,13 +16,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from protocol.clock import LoopSettings
 from protocol.frames import Kind
 from protocol.transmit import Policy, Transmit
-from service.burden_grid import SENSORS, BurdenError, Cell, cell_settings
 from service.config import Settings
-from service.experiment import LoopEndedError, run_experiment
 from service.figures import Figures
-from service.traffic import Traffic, codes_of, sent_ticks, traffic
-from service.workers import Workers
-from service.zenoh_bytes import LinkBytes, count_bytes
+from service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings
+from service.lab.experiment import LoopEndedError, run_experiment
+from service.lab.traffic import Traffic, codes_of, sent_ticks, traffic
+from service.lab.workers import Workers
+from service.lab.zenoh_bytes import LinkBytes, count_bytes
 
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 

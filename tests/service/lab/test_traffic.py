@@ -6,10 +6,10 @@ import pytest
 
 from protocol.frames import FrameFormat
 from protocol.transmit import SILENCE
-from service.burden import POLICIES, observe
 from service.config import Settings, load
-from service.experiment import run_experiment
-from service.traffic import codes_of, sent_ticks, traffic
+from service.lab.burden import POLICIES, observe
+from service.lab.experiment import run_experiment
+from service.lab.traffic import codes_of, sent_ticks, traffic
 
 KIND = FrameFormat([6, 6])
 CODES = [(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)]

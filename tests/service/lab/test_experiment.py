@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.config import Settings, load, with_bits
-from service.experiment import run_experiment
 from service.figures import Figures
+from service.lab.experiment import run_experiment
 from tests.service.numpy_twin import Sinusoids
 
 IDEAL = load(overrides=["plant.ideal=true"])

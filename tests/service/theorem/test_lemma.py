@@ -17,11 +17,11 @@ from protocol.frames import SignalSpec, WireSpec
 from protocol.quantizer import Quantizer
 from protocol.symbolic import Compiled
 from protocol.verbs import Sinusoid
-from service.certificate import Evaluated, evaluate, known
-from service.extremes import extremes
 from service.law import LawSettings
-from service.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from service.reference import Plan, reference_function
+from service.theorem.certificate import Evaluated, evaluate, known
+from service.theorem.extremes import extremes
+from service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.service import numpy_twin as twin
 from tests.service.twin_body import body_of
 

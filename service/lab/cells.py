@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from service.config import Settings
-from service.experiment import run_experiment
-from service.paper import DURATION_S
-from service.workers import Workers
+from service.lab.experiment import run_experiment
+from service.lab.paper import DURATION_S
+from service.lab.workers import Workers
 
 
 class Cell(NamedTuple):

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from service.certificate import Certificate
+from service.theorem.certificate import Certificate
 
 
 def certificate_table(certificate: Certificate) -> None:

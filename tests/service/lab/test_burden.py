@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
-from service.burden import Burden, pareto_front
-from service.burden_figure import draw_burden
-from service.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
-from service.burden_table import HEADER, markdown
 from service.cli import execute
 from service.config import load
+from service.lab.burden import Burden, pareto_front
+from service.lab.burden_figure import draw_burden
+from service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
+from service.lab.burden_table import HEADER, markdown
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from service import paper
-from service.calibrate import TOLERANCE
-from service.cells import Cell, Pool, Result, run_cell
 from service.config import load
-from service.tables import Tables, markdown, predict
+from service.lab import paper
+from service.lab.calibrate import TOLERANCE
+from service.lab.cells import Cell, Pool, Result, run_cell
+from service.lab.tables import Tables, markdown, predict
 
 BENCH = load()
 

@@ -1,6 +1,6 @@
 """Theorem 1 and Corollary 1 for a configuration: whether bits, gains and reference satisfy them, and by how much.
 
-All is computed from the effective configuration, by the equations of `service.bounds`. What the theorem needs and no
+All is computed from the effective configuration, by the equations of `bounds`. What the theorem needs and no
 configuration can know is assumed: the damping (law.damping_bound), the disturbance, that no command saturates, and how
 large the attitude error gets, because q's error grows without end where η nears 0. That last bound is by default
 controller.start_within_deg, within which a session begins; where the theorem guarantees less than that, it is widened
@@ -21,11 +21,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.frames import SignalSpec, WireSpec
 from protocol.verbs import Reference
-from service.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
-from service.extremes import Extremes, extremes
 from service.law import LawSettings
-from service.remedies import Remedy, remedies
 from service.settings import ControllerSettings
+from service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
+from service.theorem.extremes import Extremes, extremes
+from service.theorem.remedies import Remedy, remedies
 
 _ROUNDS: Final = 500
 _AGREED: Final = 1e-9

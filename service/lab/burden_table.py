@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from service.burden import Burden, Point
+from service.lab.burden import Burden, Point
 
 HEADER: Final = (
     "bits out/in",

@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from protocol.network import NetworkSettings
-from service.zenoh_bytes import Relay, count_bytes
+from service.lab.zenoh_bytes import Relay, count_bytes
 
 SEVEN, TWO = b"1234567", b"12"
 KEEPALIVES = 60

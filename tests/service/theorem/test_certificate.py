@@ -14,20 +14,20 @@ from protocol.attitude import IDENTITY, received_quaternion, sent_vector
 from protocol.frames import SignalSpec, WireSpec
 from protocol.symbolic import Compiled
 from protocol.verbs import Hold, Points, Reference, Sinusoid, Stream
-from service.bounds import attitude_error
-from service.certificate import Certificate, bounds_of, certify
 from service.cli import execute as run
 from service.config import Settings, load, load_over
 from service.controller import Controller
-from service.extremes import BoundlessError, extremes
 from service.law import LawSettings
-from service.lemma import Samples, coordinates, lemma_inequalities
 from service.reference import Plan, reference_function
 from service.settings import ControllerSettings
+from service.theorem.bounds import attitude_error
+from service.theorem.certificate import Certificate, bounds_of, certify
+from service.theorem.extremes import BoundlessError, extremes
+from service.theorem.lemma import Samples, coordinates, lemma_inequalities
 from tests.service import numpy_twin as twin
 
 PAPER = Settings()
-EXAMPLES = Path(__file__).parents[2] / "service" / "examples"
+EXAMPLES = Path(__file__).parents[3] / "service" / "examples"
 STILL = Hold(attitude=(0.0, 0.0, 0.0))
 KEYS = ["holds", "margin", "c0", "delta_V1", "delta_V2", "delta_Q", "k", "radius", "radius_deg", "terms"]
 

@@ -15,9 +15,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.errors import AeroloopError
-from service import paper
-from service.cells import Cell, Pool
 from service.config import Settings
+from service.lab import paper
+from service.lab.cells import Cell, Pool
 
 MEASURED_YAW_COULOMB: Final = 0.0037
 """Coulomb friction of the yaw axis as measured from spin-downs of another Aero [N·m]."""

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from service.burden import Burden, Point
-from service.burden_grid import BurdenError
+from service.lab.burden import Burden, Point
+from service.lab.burden_grid import BurdenError
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
 # Colours that differ in brightness as well, for print and for eyes that see no red.
