@@ -17,10 +17,11 @@ from plant_emulator.settings import PlantSettings
 from plant_emulator.tenancy import Tenancy
 from protocol.can_link import HEARTBEAT_S, SILENT_S, CanLink, CanSettings, Heartbeat, fingerprint
 from protocol.clock import FIRST_COMMAND_S, LoopSettings, prepare_process
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.role import Role
 from protocol.states import PlantState, PlantTrigger, TripCause
 from protocol.transmit import SILENCE
+from protocol.wire import WireSpec
 
 WAIT_S: Final = 0.01
 REOPEN_S: Final = 0.5

@@ -16,10 +16,10 @@ from plant_emulator.front import Front
 from plant_emulator.plant import Plant
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
-from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.states import TripCause
 from protocol.transmit import SILENCE
+from protocol.wire import WireSpec
 
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6

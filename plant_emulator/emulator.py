@@ -20,12 +20,12 @@ from plant_emulator.presence import Presence
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings
 from protocol.errors import AeroloopError
-from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.messages import Truth
 from protocol.role import Role
 from protocol.transmit import SILENCE
 from protocol.verbs import Advance, Answer, Inject
+from protocol.wire import WireSpec
 
 
 def truth_of(plant: EmulatedPlant, endpoint: Endpoint) -> Truth:

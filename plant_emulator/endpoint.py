@@ -15,9 +15,10 @@ from plant_emulator.plant import Measurement, Plant
 from plant_emulator.tenancy import Tenancy
 from protocol.attitude import sent_vector
 from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.states import PlantState, PlantTrigger, TripCause
 from protocol.transmit import SILENCE, Sender
+from protocol.wire import WireSpec
 
 
 class Endpoint(Tenancy):

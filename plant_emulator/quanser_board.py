@@ -11,9 +11,9 @@ from plant_emulator.driver import Driver
 from plant_emulator.quanser_usb import QuanserPlant
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings
-from protocol.frames import WireSpec
 from protocol.links import Arrival
 from protocol.states import PlantState
+from protocol.wire import WireSpec
 
 
 class BoardDriver(Driver):

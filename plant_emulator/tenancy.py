@@ -18,9 +18,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from protocol.frames import WireSpec
 from protocol.messages import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal
 from protocol.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
+from protocol.wire import WireSpec
 
 
 class Notice(NamedTuple):

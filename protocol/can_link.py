@@ -23,11 +23,12 @@ import can
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.errors import AeroloopError
-from protocol.frames import FrameFormat, WireSpec
+from protocol.frames import FrameFormat
 from protocol.links import Arrival, Link, Mailbox
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.states import PlantState, TripCause
 from protocol.transmit import SILENCE
+from protocol.wire import WireSpec
 
 MEASUREMENT_ID: Final = 0x100
 COMMAND_ID: Final = 0x200

@@ -32,11 +32,12 @@ from protocol.can_link import (
     PLANT_HEARTBEAT_ID,
     number_of,
 )
-from protocol.frames import COUNTER_BITS, FrameFormat, SignalSpec, WireSpec
+from protocol.frames import COUNTER_BITS, FrameFormat
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
 from protocol.states import PlantState, TripCause
+from protocol.wire import SignalSpec, WireSpec
 
 NO_VALID_VALUE: Final = "no_valid_value"
 """Name of the code −2^(R−1)."""

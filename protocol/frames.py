@@ -1,4 +1,4 @@
-"""Frames: level indices ↔ bytes, and the spec from which every scale and width derives.
+"""Frames: level indices ↔ bytes, and which tick a frame is of.
 
 Sans-I/O. A frame is a 4-bit counter and R-bit codes, most significant bit first, with zero bits up to the byte:
 
@@ -13,163 +13,17 @@ what a caller passes wrongly raises ValueError.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from math import isinf
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final
 
 from bitstruct.c import compile as compile_bits
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from protocol.hysteresis import HysteresisQuantizer
-from protocol.logarithmic import LogarithmicQuantizer
-from protocol.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
-from protocol.transmit import Transmit
+if TYPE_CHECKING:
+    from protocol.wire import WireSpec
 
 COUNTER_BITS: Final = 4
 COUNTERS: Final = 1 << COUNTER_BITS
 """The counter runs 0…15 and round again."""
-
-
-def bits_or_continuous(value: object) -> object:
-    """The word "cont" stands for no quantization wherever a person writes bits (TOML has no null)."""
-    return None if value == "cont" else value
-
-
-Bits: TypeAlias = Annotated[
-    Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)] | None,
-    BeforeValidator(bits_or_continuous),
-]
-
-
-Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
-
-_OWNER: Final[dict[str, Kind]] = {"hysteresis": "hysteresis-uniform", "threshold": "logarithmic-uniform"}
-"""Parameters that only one kind of quantizer has."""
-
-
-class SignalSpec(BaseModel):
-    """How one signal is quantized. The range runs from −limit to +limit, in the signal's unit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
-    limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
-    deadzone: float | None = Field(
-        default=None,
-        gt=0,
-        allow_inf_nan=False,
-        description="y0 of (C.14) [signal's unit]; half a step if left out, a quarter of that if logarithmic-uniform",
-    )
-    kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
-    hysteresis: float | None = Field(
-        default=None,
-        gt=0,
-        allow_inf_nan=False,
-        description="h: how much farther a level is held [signal's unit]; half a step if left out; hysteresis-uniform",
-    )
-    threshold: float | None = Field(
-        default=None,
-        gt=0,
-        allow_inf_nan=False,
-        description="where steps stop growing [signal's unit]; limit/4 if left out; logarithmic-uniform",
-    )
-
-    @model_validator(mode="after")
-    def _makes_a_quantizer(self) -> SignalSpec:
-        if self.deadzone is not None and self.deadzone >= self.limit:
-            raise ValueError(f"the dead zone {self.deadzone} must be smaller than the limit {self.limit}")
-        for name, owner in _OWNER.items():
-            if getattr(self, name) is not None and self.kind != owner:
-                raise ValueError(f'{name} belongs to kind = "{owner}", and kind is "{self.kind}"')
-        if self.kind != "uniform":
-            self.quantizer()  # has bounds of its own, which depend on the bits
-        return self
-
-    def quantizer(self) -> Quantizer:
-        """A quantizer of one element of this signal, with its own count of saturations and its own memory."""
-        if self.bits is None:
-            return Continuous(self.limit)
-        if self.kind == "hysteresis-uniform":
-            return HysteresisQuantizer(self.bits, self.limit, self.deadzone, self.hysteresis)
-        if self.kind == "logarithmic-uniform":
-            return LogarithmicQuantizer(self.bits, self.limit, self.deadzone, self.threshold)
-        return UniformQuantizer(self.bits, self.limit, self.deadzone)
-
-    def with_bits(self, bits: int | None) -> SignalSpec:
-        """The same with other bits. Raises ValueError where the kind takes no such number, or not with the rest."""
-        changed = self.model_copy(update={"bits": bits})
-        if self.kind != "uniform":
-            changed.quantizer()
-        return changed
-
-
-class WireSpec(BaseModel):
-    """Everything the two ends must agree on to read each other's frames. The default is the paper's 8/6-bit Aero."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    attitude: SignalSpec = Field(
-        default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]"
-    )
-    rate: SignalSpec = Field(
-        default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]"
-    )
-    voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
-    actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
-    transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
-
-    @cached_property
-    def measurement(self) -> FrameFormat:
-        """Format of a measurement frame: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃."""
-        return FrameFormat([self.attitude.bits] * 3 + [self.rate.bits] * 3)
-
-    @cached_property
-    def command(self) -> FrameFormat:
-        """Format of a command frame: u₂ u₃, or u₁ u₂ u₃."""
-        return FrameFormat([self.voltage.bits] * self.actuators)
-
-    def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
-        """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont.".
-
-        Raises:
-            ValueError: A signal's kind takes no such number of bits.
-        """
-        return WireSpec(
-            attitude=self.attitude.with_bits(out),
-            rate=self.rate.with_bits(out),
-            voltage=self.voltage.with_bits(inp),
-            actuators=self.actuators,
-            transmit=self.transmit,
-        )
-
-    def agreed(self) -> dict[str, Any]:
-        """What two ends tell each other of it, as JSON: what they use, so that one that knows no more understands it.
-
-        A uniform signal tells nothing of other kinds, and frames that are sent as ever nothing of when.
-        """
-        told = self.model_dump(mode="json")
-        for name in ("attitude", "rate", "voltage"):
-            if told[name]["kind"] == "uniform":
-                for unused in ("kind", *_OWNER):
-                    del told[name][unused]
-        if self.transmit == Transmit():
-            del told["transmit"]
-        return told
-
-    def differences(self, other: WireSpec) -> list[str]:
-        """Where two specs differ, one line a field: `rate.bits: 8, not 10`. Empty if they are the same wire."""
-        mine, theirs = _flat(self.model_dump()), _flat(other.model_dump())
-        return [f"{name}: {mine[name]}, not {theirs[name]}" for name in mine if mine[name] != theirs[name]]
-
-
-def _flat(tree: dict[str, object], prefix: str = "") -> dict[str, object]:
-    leaves: dict[str, object] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            leaves |= _flat(value, f"{prefix}{name}.")
-        else:
-            leaves[prefix + name] = value
-    return leaves
 
 
 class FrameFormat:

@@ -11,9 +11,9 @@ from pydantic import AfterValidator, Field, PlainSerializer, StringConstraints
 
 from protocol import verbs
 from protocol.clock import Histogram, LoopTiming
-from protocol.frames import WireSpec
 from protocol.topics import TOPICS, Topic
 from protocol.verbs import Message
+from protocol.wire import WireSpec
 
 PROTOCOL_VERSION: Final = 1
 

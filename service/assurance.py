@@ -16,10 +16,10 @@ from contextlib import contextmanager
 from typing import Any, Final, NamedTuple
 
 from protocol.errors import AeroloopError
-from protocol.frames import WireSpec
 from protocol.messages import EventKind
 from protocol.role import Role
 from protocol.verbs import Gains, Reference
+from protocol.wire import WireSpec
 from service.law import LawSettings
 from service.settings import ControllerSettings
 from service.theorem.certificate import Certificate, certify

@@ -13,11 +13,11 @@ from pydantic import ValidationError
 from protocol import topics
 from protocol.clock import LoopSettings
 from protocol.errors import AeroloopError
-from protocol.frames import WireSpec
 from protocol.links import Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release
 from protocol.role import Role
 from protocol.verbs import Answer
+from protocol.wire import WireSpec
 from service.hearing import MAILBOX
 
 log: Final = logging.getLogger("aeroloop")

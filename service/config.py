@@ -26,10 +26,10 @@ from protocol import topics
 from protocol.can_link import CanSettings
 from protocol.clock import LoopSettings
 from protocol.errors import AeroloopError
-from protocol.frames import WireSpec
 from protocol.network import NetworkSettings
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.verbs import Reference, Sinusoid
+from protocol.wire import WireSpec
 from service.law import LawSettings
 from service.settings import ControllerSettings, RecorderSettings
 

@@ -11,10 +11,11 @@ from array import array
 from collections.abc import Callable, Sequence
 
 from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.symbolic import Compiled
 from protocol.transmit import SILENCE, Sender
 from protocol.verbs import Change, Gains, Reference
+from protocol.wire import WireSpec
 from service.law import LawSettings, law_function
 from service.reference import Motion, Plan
 

@@ -17,13 +17,13 @@ from pydantic import ValidationError
 
 from protocol import topics
 from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, prepare_process
-from protocol.frames import WireSpec
 from protocol.links import ZenohLink
 from protocol.messages import Lapse, Status, report, summary
 from protocol.role import Role
 from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask, Reference
+from protocol.wire import WireSpec
 from service.assurance import Assurance, gains_of
 from service.claimant import Claimant, SessionLostError
 from service.controller import Controller

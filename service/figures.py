@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.attitude import angle
 from protocol.clock import WATCHDOG_S
-from protocol.frames import FrameFormat, WireSpec
+from protocol.frames import FrameFormat
 from protocol.messages import Percentiles
+from protocol.wire import WireSpec
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

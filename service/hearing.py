@@ -12,9 +12,10 @@ import time
 from typing import Final, NamedTuple
 
 from protocol.clock import LoopSettings, TickGrid
-from protocol.frames import TickCounter, WireSpec
+from protocol.frames import TickCounter
 from protocol.links import Arrival, Link
 from protocol.transmit import SILENCE
+from protocol.wire import WireSpec
 
 MAILBOX: Final = 16
 """Frames that may wait where silence is heard: of one that another displaced, it could not be told that it was late."""

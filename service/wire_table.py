@@ -5,10 +5,11 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Column, Table
 
-from protocol.frames import FrameFormat, SignalSpec, WireSpec
+from protocol.frames import FrameFormat
 from protocol.hysteresis import HysteresisQuantizer
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.quantizer import Quantizer, UniformQuantizer
+from protocol.wire import SignalSpec, WireSpec
 
 
 def wire_table(wire: WireSpec) -> None:

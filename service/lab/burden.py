@@ -14,8 +14,8 @@ from typing import Any, Final, NamedTuple, get_args
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.clock import LoopSettings
-from protocol.frames import Kind
 from protocol.transmit import Policy, Transmit
+from protocol.wire import Kind
 from service.config import Settings
 from service.figures import Figures
 from service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings

@@ -12,9 +12,9 @@ from typing import Any, Final, NamedTuple, get_args
 from pydantic import ValidationError
 
 from protocol.errors import AeroloopError
-from protocol.frames import Kind, SignalSpec, WireSpec
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.transmit import Transmit
+from protocol.wire import Kind, SignalSpec, WireSpec
 from service.config import Settings
 
 BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")

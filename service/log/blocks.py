@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from protocol.attitude import Quaternion
-from protocol.frames import WireSpec
 from protocol.symbolic import Buffer, Compiled
 from protocol.verbs import Change, Reference
+from protocol.wire import WireSpec
 from service.controller import Controller
 from service.law import LawSettings
 from service.log.codes import encoded_by, levels

@@ -10,10 +10,11 @@ from math import nan
 
 import numpy as np
 
-from protocol.frames import FrameFormat, SignalSpec
+from protocol.frames import FrameFormat
 from protocol.hysteresis import HysteresisQuantizer
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.quantizer import TIE, CodedQuantizer, Quantizer, UniformQuantizer
+from protocol.wire import SignalSpec
 from service.log.report import Array
 
 

@@ -16,8 +16,8 @@ from pydantic import ValidationError
 
 from protocol import attitude, topics, verbs
 from protocol.clock import LoopSettings
-from protocol.frames import WireSpec
 from protocol.messages import Contract, Event, Loss, Status, Telemetry, Truth
+from protocol.wire import WireSpec
 from service.log import views
 from service.log.body import WORLD, desired_frame_of, frame_of, scene, timestamp
 from service.log.schemas import Shape as Shape

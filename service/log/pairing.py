@@ -17,9 +17,10 @@ from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTERS, TickCounter, WireSpec
+from protocol.frames import COUNTERS, TickCounter
 from protocol.messages import Lapse, Telemetry
 from protocol.topics import Address
+from protocol.wire import WireSpec
 from service.log.files import Which
 from service.log.filling import Filler, Lapses, Read
 

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.frames import SignalSpec
 from protocol.messages import Lapse, Telemetry
 from protocol.verbs import Change
+from protocol.wire import SignalSpec
 from service.config import Settings, load_over
 from service.figures import added, squares
 from service.log.blocks import BlockController

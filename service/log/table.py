@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.frames import WireSpec
+from protocol.wire import WireSpec
 from service.log.spool import Records
 
 Array = npt.NDArray[Any]

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from protocol.frames import SignalSpec
+from protocol.wire import SignalSpec
 from service.log.report import Array, Spread
 
 BLOCK: Final = 4096

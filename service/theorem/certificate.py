@@ -19,8 +19,8 @@ from typing import Any, Final, get_type_hints
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.frames import SignalSpec, WireSpec
 from protocol.verbs import Reference
+from protocol.wire import SignalSpec, WireSpec
 from service.law import LawSettings
 from service.settings import ControllerSettings
 from service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1

@@ -13,9 +13,9 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.frames import WireSpec
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.verbs import MAX_GAIN
+from protocol.wire import WireSpec
 from service.law import LawSettings
 
 Holds = Callable[[WireSpec, LawSettings], bool]

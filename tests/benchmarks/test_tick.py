@@ -13,9 +13,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.settings import PlantSettings
-from protocol.frames import WireSpec
 from protocol.messages import Claim
 from protocol.verbs import Sinusoid
+from protocol.wire import WireSpec
 from service.controller import Controller
 from service.law import LawSettings
 from tests.service import numpy_twin as twin

@@ -18,11 +18,11 @@ from plant_emulator.settings import PlantSettings
 from protocol import topics
 from protocol.can_link import CanLink, Heartbeat, fingerprint, number_of
 from protocol.clock import LoopSettings
-from protocol.frames import WireSpec
 from protocol.messages import Claim, Event, Grant, Refusal, Release
 from protocol.role import Role
 from protocol.states import PlantState, TripCause
 from protocol.verbs import Answer, Ask
+from protocol.wire import WireSpec
 from tests.can.in_process import virtual
 from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
 

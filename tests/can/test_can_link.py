@@ -29,9 +29,9 @@ from protocol.can_link import (
     fingerprint,
     number_of,
 )
-from protocol.frames import WireSpec
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.states import PlantState, TripCause
+from protocol.wire import WireSpec
 from tests.can.in_process import Flaws, Stranger, virtual
 from tests.protocol.gathering import PATIENCE_S, eventually
 

@@ -27,9 +27,9 @@ from protocol.can_link import (
     fingerprint,
 )
 from protocol.clock import LoopSettings
-from protocol.frames import WireSpec
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState, TripCause
+from protocol.wire import WireSpec
 from tests.can.in_process import Flaws, Stranger, virtual
 from tests.protocol.gathering import PATIENCE_S
 

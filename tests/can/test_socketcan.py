@@ -13,8 +13,8 @@ import can
 import pytest
 
 from protocol.can_link import CanLink, CanSettings, Heartbeat
-from protocol.frames import WireSpec
 from protocol.states import PlantState, TripCause
+from protocol.wire import WireSpec
 from service.config import load
 from service.lab.experiment import run_experiment
 from tests.can.closed_loop import run_on_bus

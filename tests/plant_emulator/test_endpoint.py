@@ -14,9 +14,10 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Vector
-from protocol.frames import COUNTERS, SignalSpec, WireSpec
+from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState, TripCause
+from protocol.wire import SignalSpec, WireSpec
 
 WIRE = WireSpec()
 CONTINUOUS = WireSpec().with_bits(None, None)

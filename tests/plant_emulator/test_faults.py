@@ -18,9 +18,9 @@ from plant_emulator.faulty_stream import FaultyStream
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Quaternion, Vector
-from protocol.frames import WireSpec
 from protocol.messages import Claim, Grant
 from protocol.states import PlantState
+from protocol.wire import WireSpec
 
 PERIOD = 0.1
 LIMIT = 24.0

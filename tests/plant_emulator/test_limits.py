@@ -13,9 +13,10 @@ from plant_emulator.endpoint import Endpoint
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState
+from protocol.wire import WireSpec
 
 WIRE = WireSpec()
 PERIOD_NS = 2_000_000

@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 
 from protocol.can_link import Heartbeat, number_of
 from protocol.dbc import dbc
-from protocol.frames import COUNTERS, FrameFormat, SignalSpec, WireSpec
+from protocol.frames import COUNTERS, FrameFormat
 from protocol.quantizer import UniformQuantizer
 from protocol.states import PlantState, TripCause
+from protocol.wire import SignalSpec, WireSpec
 from tests.protocol.test_frames import codes_of, specs
 from tests.protocol.test_spec_document import FRAME_ROWS, Row, as_bits
 

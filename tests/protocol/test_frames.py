@@ -19,15 +19,14 @@ from pydantic import ValidationError
 from protocol.frames import (
     COUNTERS,
     FrameFormat,
-    SignalSpec,
     TickCounter,
-    WireSpec,
     pack_command,
     pack_measurement,
     unpack_command,
     unpack_measurement,
 )
 from protocol.quantizer import Continuous, UniformQuantizer
+from protocol.wire import SignalSpec, WireSpec
 
 Widths = tuple[int | None, ...]
 

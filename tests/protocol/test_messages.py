@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from protocol.clock import Histogram
-from protocol.frames import SignalSpec, WireSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
     Claim,
@@ -44,6 +43,7 @@ from protocol.verbs import (
     Stream,
     Track,
 )
+from protocol.wire import SignalSpec, WireSpec
 
 LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
 

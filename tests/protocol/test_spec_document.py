@@ -13,11 +13,12 @@ from typing import Final
 import pytest
 
 import protocol
-from protocol.frames import FrameFormat, SignalSpec, WireSpec
+from protocol.frames import FrameFormat
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
 from protocol.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
 from protocol.topics import TOPICS
+from protocol.wire import SignalSpec, WireSpec
 
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
 

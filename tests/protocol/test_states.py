@@ -22,7 +22,7 @@ from plant_emulator.plant import Measurement, Plant
 from protocol import clock
 from protocol.attitude import IDENTITY
 from protocol.clock import Throttle
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import (
     CONTROLLER_TABLE,
@@ -34,6 +34,7 @@ from protocol.states import (
     PlantTrigger,
     TripCause,
 )
+from protocol.wire import WireSpec
 
 # The tables
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.frames import Kind, SignalSpec, WireSpec
 from protocol.hysteresis import HysteresisQuantizer
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.quantizer import CodedQuantizer, UniformQuantizer
+from protocol.wire import Kind, SignalSpec, WireSpec
 
 
 @pytest.mark.parametrize(

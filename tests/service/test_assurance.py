@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from protocol.frames import WireSpec
 from protocol.verbs import Gains, Hold, Reference, Sinusoid, Stream, Track
+from protocol.wire import WireSpec
 from service.assurance import UncertifiedError, gains_of
 from service.law import LawSettings
 from service.settings import ControllerSettings

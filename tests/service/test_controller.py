@@ -14,9 +14,10 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.settings import IDEAL_AERO, PlantSettings
 from protocol.attitude import Quaternion, Vector, sent_vector
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant
 from protocol.verbs import Sinusoid
+from protocol.wire import WireSpec
 from service.controller import Controller
 from service.law import LawSettings
 from tests.service import numpy_twin as twin

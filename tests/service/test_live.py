@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol import clock, role, topics
-from protocol.frames import COUNTERS, SignalSpec, WireSpec
+from protocol.frames import COUNTERS
 from protocol.messages import Event
 from protocol.network import NetworkSettings
 from protocol.role import Role
@@ -34,6 +34,7 @@ from protocol.verbs import (
     Stream,
     Track,
 )
+from protocol.wire import SignalSpec, WireSpec
 from service import live
 from service.assurance import Assurance
 from service.controller import Controller

@@ -9,7 +9,7 @@ from typing import get_args
 import pyarrow.parquet
 import pytest
 
-from protocol.frames import Kind
+from protocol.wire import Kind
 from service.cli import execute as run
 from service.config import ConfigError, Settings, load, load_over, with_bits
 from service.lab.cells import Cell, run_cell

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from plant_emulator.endpoint import Endpoint
-from protocol.frames import SignalSpec
 from protocol.messages import Claim, Grant
 from protocol.verbs import Sinusoid
+from protocol.wire import SignalSpec
 from service.config import Settings, load, with_bits
 from service.controller import Controller
 from tests.service import numpy_twin as twin

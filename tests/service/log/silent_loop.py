@@ -14,10 +14,11 @@ from typing import Literal
 import pytest
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTERS, WireSpec
+from protocol.frames import COUNTERS
 from protocol.links import Arrival, Link
 from protocol.messages import Lapse, Telemetry
 from protocol.transmit import Policy, Sender, Transmit
+from protocol.wire import WireSpec
 from service import hearing
 
 PERIOD_NS = 2_000_000

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from protocol.attitude import IDENTITY, Quaternion, received_quaternion
-from protocol.frames import FrameFormat, Kind, SignalSpec
+from protocol.frames import FrameFormat
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.quantizer import CodedQuantizer
 from protocol.verbs import Change, Gains, Hold, Points, Reference, Sinusoid
+from protocol.wire import Kind, SignalSpec
 from service.config import Settings, load
 from service.controller import Controller
 from service.figures import Score

@@ -16,8 +16,8 @@ import pytest
 import scipy.io
 
 from protocol.attitude import to_euler
-from protocol.frames import WireSpec
 from protocol.messages import Telemetry
+from protocol.wire import WireSpec
 from service.cli import execute
 from service.config import Settings, from_contract, load
 from service.log import spool

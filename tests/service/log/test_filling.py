@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.frames import WireSpec
 from protocol.messages import Lapse, Telemetry
 from protocol.transmit import Policy
+from protocol.wire import WireSpec
 from service.log.filling import Read
 from service.log.pairing import Pairing
 from tests.service.log.silent_loop import LOOP, Codes, Logged, run, wire_of

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from protocol.attitude import IDENTITY, received_quaternion, sent_vector
-from protocol.frames import SignalSpec, WireSpec
 from protocol.symbolic import Compiled
 from protocol.verbs import Hold, Points, Reference, Sinusoid, Stream
+from protocol.wire import SignalSpec, WireSpec
 from service.cli import execute as run
 from service.config import Settings, load, load_over
 from service.controller import Controller

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from protocol.attitude import IDENTITY, Vector, received_quaternion, sent_vector
-from protocol.frames import SignalSpec, WireSpec
 from protocol.quantizer import Quantizer
 from protocol.symbolic import Compiled
 from protocol.verbs import Sinusoid
+from protocol.wire import SignalSpec, WireSpec
 from service.law import LawSettings
 from service.reference import Plan, reference_function
 from service.theorem.certificate import Evaluated, evaluate, known
