@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.clock import LoopSettings
 from protocol.transmit import Policy, Transmit
-from protocol.wire import Kind
 from service.config import Settings
 from service.figures import Figures
 from service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings
@@ -54,7 +53,10 @@ class Point(BaseModel):
 
     bits_out: int | None = Field(description="bits of ε and ω; null is float64")
     bits_in: int | None = Field(description="bits of u; null is float64")
-    quantizer: Kind | None = Field(description="null where nothing is quantized")
+    quantizer: str | None = Field(
+        description="the kind of every signal, or hysteresis-rate: hysteresis-uniform for ω, uniform for the others; "
+        "null where nothing is quantized"
+    )
     sensors: str = Field(description="a name of `Burden.sensors`")
     transmit: Policy
     z_track: float | None = Field(default=None, description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]")

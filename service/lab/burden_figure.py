@@ -17,6 +17,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from service.lab.burden import Burden, Point
 from service.lab.burden_grid import BurdenError
+from service.lab.burden_table import short_name
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
 # Colours that differ in brightness as well, for print and for eyes that see no red.
@@ -24,6 +25,7 @@ _STYLES: Final = {
     "uniform": ("#1f5fa8", "o"),
     "hysteresis-uniform": ("#d9731a", "s"),
     "logarithmic-uniform": ("#2a9d74", "^"),
+    "hysteresis-rate": ("#8b3fa0", "p"),
     None: ("#222222", "D"),
 }
 _LABEL_WIDTH: Final = 0.15
@@ -126,7 +128,7 @@ def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
 def _legend(burden: Burden) -> list[Line2D]:
     """What colours, markers and lines mean; three columns, filled downwards."""
     drawn = dict.fromkeys(point.quantizer for point in burden.points if point.quantizer is not None)
-    quantizers = [_key(_STYLES[kind][0], _STYLES[kind][1], kind.removesuffix("-uniform")) for kind in drawn]
+    quantizers = [_key(_STYLES[kind][0], _STYLES[kind][1], short_name(kind)) for kind in drawn]
     color, marker = _STYLES[None]
     return [
         *quantizers,

@@ -1,7 +1,8 @@
 """The grid of `lab burden`: what is tried, and the configuration of each cell.
 
 Bits run from where the loop begins to shake to where more of them gain nothing. Sensors run from none at all to a gyro
-whose noise is wider than a step: noise, more than motion, is what changes a level from one tick to the next.
+whose noise is wider than a step: noise, more than motion, is what changes a level from one tick to the next. So besides
+one kind of quantizer for all signals there is hysteresis on the rate alone, which is where the noise is.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
 FLOAT64: Final = (None, None)
 COUNTED: Final = ((8, 6), FLOAT64)
 """Bits out and in of the cells whose bytes are counted on a Zenoh link: the paper's case, and the baseline."""
-QUANTIZERS: Final[tuple[Kind, ...]] = get_args(Kind)
+QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
+    **{kind: (kind, kind, kind) for kind in get_args(Kind)},
+    "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
+}
+"""Kinds for ε, ω and u, by what to call them together."""
 
 
 class BurdenError(AeroloopError):
@@ -66,7 +71,7 @@ class Cell(NamedTuple):
 
     bits_out: int | None
     bits_in: int | None
-    quantizer: Kind | None
+    quantizer: str | None
     sensors: str
     counted: bool
 
@@ -79,7 +84,7 @@ def grid(
     Args:
         settings: The configuration.
         bits: Bits out and in, such as 8/6; `cont` for float64.
-        quantizers: Kinds of quantizers.
+        quantizers: Names out of QUANTIZERS.
         sensors: Names out of SENSORS.
 
     Raises:
@@ -88,7 +93,7 @@ def grid(
     if settings.plant.ideal:
         raise BurdenError("plant.ideal has no sensors to choose: leave it out, and take --sensors perfect")
     pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
-    kinds = [_one_of("--quantizer", name, QUANTIZERS) for name in dict.fromkeys(quantizers)] or list(QUANTIZERS)
+    kinds = [_one_of("--quantizer", name, tuple(QUANTIZERS)) for name in dict.fromkeys(quantizers)] or list(QUANTIZERS)
     levels = [_one_of("--sensors", name, tuple(SENSORS)) for name in dict.fromkeys(sensors)] or list(SENSORS)
     counted_with = "encoders" if "encoders" in levels else levels[0]
     cells = [
@@ -109,12 +114,13 @@ def cell_settings(settings: Settings, cell: Cell) -> Settings:
         BurdenError: The quantizer does not take so few bits, or the plant has no such sensors.
     """
     wire, plant = settings.wire, settings.plant
-    out, inp, kind = cell.bits_out, cell.bits_in, cell.quantizer
+    out, inp = cell.bits_out, cell.bits_in
+    attitude, rate, voltage = QUANTIZERS[cell.quantizer] if cell.quantizer else (None, None, None)
     try:
         chosen = WireSpec(
-            attitude=_quantized(wire.attitude, out, kind),
-            rate=_quantized(wire.rate, out, kind),
-            voltage=_quantized(wire.voltage, inp, kind),
+            attitude=_quantized(wire.attitude, out, attitude),
+            rate=_quantized(wire.rate, out, rate),
+            voltage=_quantized(wire.voltage, inp, voltage),
             actuators=wire.actuators,
             transmit=Transmit(heartbeat_s=wire.transmit.heartbeat_s),
         )
@@ -123,7 +129,7 @@ def cell_settings(settings: Settings, cell: Cell) -> Settings:
     except ValidationError as error:
         why = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
         bits = "/".join("cont" if one is None else str(one) for one in (out, inp))
-        raise BurdenError(f"{bits} {kind or 'float64'} with sensors {cell.sensors}: {why}") from None
+        raise BurdenError(f"{bits} {cell.quantizer or 'float64'} with sensors {cell.sensors}: {why}") from None
     return settings.model_copy(update={"wire": chosen, "plant": measured})
 
 

@@ -66,10 +66,15 @@ def markdown(burden: Burden) -> str:
     return "\n".join([*lines, "\n\n".join(_notes(burden))])
 
 
+def short_name(quantizer: str) -> str:
+    """What a table or a legend calls a quantizer."""
+    return "hysteresis on ω" if quantizer == "hysteresis-rate" else quantizer.removesuffix("-uniform")
+
+
 def _rows(burden: Burden, sensors: str) -> Iterator[list[str]]:
     points = burden.under(sensors)
     for always, changed in zip(points[::2], points[1::2], strict=True):
-        label = always.quantizer.removesuffix("-uniform") if always.quantizer else "float64"
+        label = short_name(always.quantizer) if always.quantizer else "float64"
         ratios = always.against_float64
         if (
             ratios is None

@@ -67,8 +67,16 @@ def test_parameters_of_one_quantizer_are_not_anothers() -> None:
     mine = load(overrides=["wire.rate.kind=hysteresis-uniform", "wire.rate.hysteresis=0.02"])
     for cell in grid(mine, ["8/6"], sensors=["perfect"]):
         rate = cell_settings(mine, cell).wire.rate
-        assert rate.kind == (cell.quantizer or "hysteresis-uniform")
+        assert rate.kind == (QUANTIZERS[cell.quantizer][1] if cell.quantizer else "hysteresis-uniform")
         assert rate.hysteresis == (0.02 if rate.kind == "hysteresis-uniform" else None)
+
+
+def test_hysteresis_on_the_rate_leaves_the_other_signals_uniform() -> None:
+    [cell] = [c for c in grid(load(), ["8/6"], ["hysteresis-rate"], ["perfect"]) if c.quantizer]
+    wire = cell_settings(load(), cell).wire
+    assert [signal.kind for signal in (wire.attitude, wire.rate, wire.voltage)] == list(QUANTIZERS["hysteresis-rate"])
+    assert wire.rate.kind == "hysteresis-uniform"
+    assert wire.attitude.kind == wire.voltage.kind == "uniform"
 
 
 @pytest.mark.parametrize(
