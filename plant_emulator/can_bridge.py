@@ -78,7 +78,7 @@ class Relay(Tenancy):
         """
         if self.session is None:
             return None
-        if self._is_silence(frame, "command"):
+        if self._is_silence(frame, "command") and self.state is PlantState.DRIVEN:
             self._fresh_ns = now_ns
             return frame
         read = self.wire.command.unpack(frame)
@@ -138,7 +138,7 @@ class Bridge:
             armed=settings.armed_at_start,
         )
         self._changed = Condition()
-        self._bus = CanLink(bus, wire, "controller", self._changed)
+        self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
         self._presence = Presence(role, loop, self._relay, latest_s=settings.watchdog_s, changed=self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._beat_due = 0.0

@@ -42,7 +42,7 @@ class CanFront(Front):
         self._settings = settings
         self._loop = loop
         self._endpoint = endpoint
-        self._bus = CanLink(settings, endpoint.wire, "plant")
+        self._bus = CanLink(settings, endpoint.wire, "plant", lockstep=loop.lockstep)
         self._fingerprint = fingerprint(endpoint.wire, loop.period_ns, lockstep=loop.lockstep)
         self._number = -1  # of the session
         self._throttle = Throttle()

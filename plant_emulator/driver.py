@@ -16,6 +16,7 @@ from plant_emulator.front import Front
 from plant_emulator.plant import Plant
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
+from protocol.frames import COUNTERS
 from protocol.links import Arrival
 from protocol.states import TripCause
 from protocol.transmit import SILENCE
@@ -51,6 +52,7 @@ class Driver:
         self._settings = settings
         self._stop = stop
         self._k = -1
+        self._counter = 0  # of the measurement sent last
         self.endpoint = Endpoint(
             plant,
             wire,
@@ -124,8 +126,13 @@ class Driver:
         frame = self.endpoint.tick(arrival.frame if arrival is not None and in_time else None, k)
         echo = None
         for sent in self._outgoing(frame):
-            echo = self.endpoint.counter if sent == SILENCE else self.endpoint.wire.measurement.counter(sent)
-            self._front.send(sent, self.endpoint.counter if echo is None else echo)
+            echo = self.endpoint.wire.measurement.counter(sent)
+            # What has no counter is for who reads it, in lockstep, of the tick after the last.
+            follows = (self._counter + 1) % COUNTERS if self._loop.lockstep else self.endpoint.counter
+            self._counter = follows if echo is None else echo
+            if sent == SILENCE:
+                echo = self._counter
+            self._front.send(sent, self._counter)
         self._k = k
         self._front.after_tick(k)
         return echo

@@ -72,16 +72,17 @@ class Emulator(Driver):
         if self._commands.idle:
             return arrival
         frame, sent_ns = (arrival.frame, arrival.published_ns) if arrival else (None, 0)
-        passed = self._commands.passes(frame or None, self._faulty.time, sent_ns)
-        if not passed:  # silence is no frame: nothing befalls it
-            return arrival if frame == SILENCE else None
+        passed = self._commands.passes(frame, self._faulty.time, sent_ns)
+        if not passed:
+            return None
         return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns)
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
         if self._measurements.idle:
             return super()._outgoing(frame)
-        passed = self._measurements.passes(frame or None, self._faulty.time)
-        return [SILENCE] if frame == SILENCE and not passed else passed
+        if frame == SILENCE and not self._loop.lockstep:  # then it is no frame, and nothing befalls it
+            return self._measurements.passes(None, self._faulty.time) or [SILENCE]
+        return self._measurements.passes(frame, self._faulty.time)
 
 
 class EmulatorOnZenoh(Emulator):

@@ -63,6 +63,9 @@ class Endpoint(Tenancy):
         transmit = wire.transmit
         self._sender = Sender(transmit.measurement, transmit.heartbeat_ticks(period_ns))
         self._hears_silence = lockstep and transmit.command == "on_change"
+        # Who hears silence on a clock learns that values are valid again from the next frame that reaches it in time.
+        clocked = transmit.measurement == "on_change" and not lockstep
+        self._forgiven = transmit.heartbeat_ticks(period_ns) if clocked else 0
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
         self.protect(watchdog_s, guard)
@@ -148,7 +151,7 @@ class Endpoint(Tenancy):
         if self.session is None:
             return
         if frame == SILENCE and self._hears_silence and self._said:
-            read: tuple[int, tuple[float, ...]] | None = self.counter, self._said
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % COUNTERS, self._said)
         else:
             read = self.wire.command.unpack(frame)
         if read is None:
@@ -162,7 +165,7 @@ class Endpoint(Tenancy):
             return
         voltages = tuple(self._level(code) for code in codes)
         if not isfinite(sum(voltages)):
-            if self._unmeasured[echo]:
+            if any(self._unmeasured[(echo - ago) % COUNTERS] for ago in range(self._forgiven + 1)):
                 voltages = self._off  # the right answer; how long it may go on is the guard's to say
             else:
                 self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
@@ -193,6 +196,7 @@ class Endpoint(Tenancy):
             quantizer.reset()
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
+        self._unmeasured = [False] * COUNTERS
         self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
         self._said, self._echo, self._answered = (), -1, -1
         self._sender.forget()

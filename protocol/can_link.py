@@ -140,6 +140,7 @@ class CanLink(Link):
         wire: Sizes of the frames.
         end: Which end this is.
         changed: Notified when a frame comes; see Mailbox.
+        lockstep: Whether an empty frame may stand for one that says nothing new.
 
     Attributes:
         heard: The other end's last heartbeat, or None.
@@ -152,7 +153,13 @@ class CanLink(Link):
     """
 
     def __init__(
-        self, settings: CanSettings, wire: WireSpec, end: End, changed: threading.Condition | None = None
+        self,
+        settings: CanSettings,
+        wire: WireSpec,
+        end: End,
+        changed: threading.Condition | None = None,
+        *,
+        lockstep: bool = False,
     ) -> None:
         check_widths(settings, wire)
         plant = end == "plant"
@@ -163,7 +170,7 @@ class CanLink(Link):
         self._heard_id = (CONTROLLER_HEARTBEAT_ID if plant else PLANT_HEARTBEAT_ID) + settings.node
         self._receives = wire.command if plant else wire.measurement
         transmit = wire.transmit
-        self._may_be_silent = (transmit.command if plant else transmit.measurement) == "on_change"
+        self._may_be_silent = lockstep and (transmit.command if plant else transmit.measurement) == "on_change"
         self._mailbox = Mailbox(changed)
         self._unsent = 0
         self._open = False

@@ -16,11 +16,19 @@ import zenoh
 
 
 class Arrival(NamedTuple):
-    """A frame, when it arrived on `time.monotonic_ns()`, and when it was published on its sender's wall clock [ns]."""
+    """A frame as it arrived.
+
+    Attributes:
+        frame: Its bytes.
+        at_ns: When it arrived, on `time.monotonic_ns()`.
+        published_ns: When it was published, on its sender's wall clock [ns].
+        number: How many its sender had sent before it in this session; None if it does not number them.
+    """
 
     frame: bytes
     at_ns: int
     published_ns: int
+    number: int | None = None
 
 
 def published_ns(sample: zenoh.Sample, arrived_ns: int) -> int:
@@ -93,9 +101,9 @@ class Mailbox:
         self._changed = changed or Condition()
         self._arrivals: deque[Arrival] = deque(maxlen=depth)
 
-    def put(self, frame: bytes, published_ns: int = 0) -> None:
+    def put(self, frame: bytes, published_ns: int = 0, number: int | None = None) -> None:
         """Put a frame in the slot, in place of the oldest if it is full."""
-        arrival = Arrival(frame, time.monotonic_ns(), published_ns)
+        arrival = Arrival(frame, time.monotonic_ns(), published_ns, number)
         with self._changed:
             self._arrivals.append(arrival)
             self._changed.notify()
@@ -143,7 +151,11 @@ class ZenohLink(Link):
         self._mailbox = mailbox or Mailbox()
         self._subscriber = session.declare_subscriber(
             receive_key,
-            lambda sample: self._mailbox.put(sample.payload.to_bytes(), published_ns(sample, time.time_ns())),
+            lambda sample: self._mailbox.put(
+                sample.payload.to_bytes(),
+                published_ns(sample, time.time_ns()),
+                sample.source_info.source_sn if sample.source_info is not None else None,
+            ),
         )
         publisher = session.declare_publisher(
             send_key,

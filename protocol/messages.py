@@ -199,9 +199,10 @@ class Lapse(Message):
     """
 
     session: str
-    kind: Literal["late", "missed"] = Field(
-        description="late: the measurement of this tick was first used some ticks later; missed: so many ticks from "
-        "this one on were not computed"
+    kind: Literal["late", "lost", "missed"] = Field(
+        description="late: the measurement of this tick was first used some ticks later; lost: of the frames between "
+        "that of this tick and the one so many ticks later none came; missed: so many ticks from this one on were not "
+        "computed"
     )
     tick: int
     ticks: int = Field(ge=1, description="how many ticks")

@@ -9,6 +9,7 @@ frame stands for it, `SILENCE`, which says as much and is no frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import copysign
 from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -48,7 +49,7 @@ class Transmit(BaseModel):
         Args:
             period_ns: Period of a tick [ns].
         """
-        return max(1, min(MOST_TICKS, int(self.heartbeat_s * 1e9 / period_ns)))
+        return max(1, min(MOST_TICKS, round(self.heartbeat_s * 1e9) // period_ns))
 
 
 class Sender:
@@ -63,7 +64,7 @@ class Sender:
         self._always = policy == "periodic"
         self._heartbeat = heartbeat
         self._said: Sequence[float] | None = None
-        self._at = 0
+        self._at: int | None = None
 
     def due(self, k: int, codes: Sequence[float]) -> bool:
         """Whether a frame with these codes is to be sent at tick k; if so, it counts as sent.
@@ -74,11 +75,20 @@ class Sender:
         """
         if self._always:
             return True
-        if codes == self._said and k - self._at < self._heartbeat:
+        since = None if self._at is None else k - self._at
+        if since is not None and since < self._heartbeat and self._said is not None and _same(codes, self._said):
             return False
-        self._said, self._at = codes, k
+        # With ticks missed, its counter may be that of the last frame, and it be taken for that one's repetition: then
+        # the next tick has to say it again.
+        self._said = None if since is not None and since % (MOST_TICKS + 1) == 0 else codes
+        self._at = k
         return True
 
     def forget(self) -> None:
         """A session begins: whatever comes is to be sent."""
-        self._said = None
+        self._said = self._at = None
+
+
+def _same(codes: Sequence[float], said: Sequence[float]) -> bool:
+    """Whether two frames have the same bits: 0.0 and −0.0 are equal and have not."""
+    return codes == said and all(copysign(1, a) == copysign(1, b) for a, b in zip(codes, said, strict=True) if a == 0)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tomli_w
-from pydantic import Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints, ValidationError, model_validator
 from pydantic_settings import (
     BaseSettings,
     PydanticBaseSettingsSource,
@@ -71,6 +71,24 @@ class Settings(BaseSettings):
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """`--set` over environment over file."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
+    @model_validator(mode="after")
+    def _heartbeat_keeps_both_ends_alive(self) -> Settings:
+        """One frame may be lost. A loop so slow that every tick has a frame is as it is without `on_change`."""
+        transmit, loop = self.wire.transmit, self.loop
+        ticks = transmit.heartbeat_ticks(loop.period_ns)
+        every_s = ticks * loop.period
+        for sends, name, patience_s in (
+            ("command", "plant.watchdog_s", self.plant.watchdog_s),
+            ("measurement", "controller.stale_s", self.controller.stale_s),
+        ):
+            sparse = getattr(transmit, sends) == "on_change" and ticks > 1 and not loop.lockstep
+            if sparse and every_s > patience_s / 2:
+                raise ValueError(
+                    f"wire.transmit.heartbeat_s lets {every_s * 1e3:g} ms pass without a {sends}, more than half of "
+                    f"{name}, which is {patience_s * 1e3:g} ms"
+                )
+        return self
 
     def contract(self) -> dict[str, Any]:
         """The effective configuration, for a role's contract."""

@@ -66,6 +66,7 @@ class Controller:
         self._encode = [q.encode for q in self._voltage]
         self._no_command = [q.invalid for q in self._voltage]
         self._sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(round(period * 1e9)))
+        self._hears_silence = wire.transmit.measurement == "on_change"
         self._held: Sequence[float] | None = None  # codes of the last measurement
         self._read, self._write = wire.measurement.unpack, wire.command.pack
         self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
@@ -86,7 +87,7 @@ class Controller:
         """
         if frame is None:
             return None
-        if frame == SILENCE and self._held is not None:
+        if frame == SILENCE and self._hears_silence and self._held is not None:
             return self.answer(k % COUNTERS, self._held, k)
         read = self._read(frame)
         if read is None:
@@ -95,13 +96,14 @@ class Controller:
         self._held = read[1]
         return self.answer(*read, k)
 
-    def hold(self, frame: bytes) -> None:
-        """Go on with the levels of a measurement that came after its tick was over; malformed bytes change nothing."""
+    def hold(self, frame: bytes) -> bool:
+        """Go on with the levels of a measurement that came after its tick was over. False if it is malformed."""
         read = self._read(frame)
         if read is None:
             self.refused += 1
-        else:
-            self._held = read[1]
+            return False
+        self._held = read[1]
+        return True
 
     def answer(self, counter: int, codes: Sequence[float], k: int) -> bytes:
         """The command frame that answers a measurement with this counter and these codes; see `tick`."""
@@ -139,7 +141,7 @@ class Controller:
     def attitude_of(self, frame: bytes) -> Quaternion | None:
         """The attitude that a measurement says; None if it is malformed or says no valid value."""
         read = self._read(frame)
-        codes = self._held if frame == SILENCE else None if read is None else read[1]
+        codes = read[1] if read is not None else self._held if frame == SILENCE and self._hears_silence else None
         if codes is None:
             return None
         x, y, z = (self._attitude_level(code) for code in codes[:3])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import zenoh
 from pydantic import ValidationError
@@ -27,7 +27,7 @@ from protocol.wire import WireSpec
 from service.assurance import Assurance, gains_of
 from service.claimant import Claimant, SessionLostError
 from service.controller import Controller
-from service.hearing import Heard, Hearing
+from service.hearing import Heard, Hearing, Slip
 from service.law import LawSettings
 from service.live import Live
 from service.settings import ControllerSettings
@@ -146,7 +146,8 @@ class Daemon:
             if heard is None:
                 continue
             if heard.late:
-                self._hold(heard, k)
+                self._received += 1
+                self._tell(hearing.lapses(heard, k, used=controller.hold(heard.frame)))
                 continue
             if timing:
                 timing.woke(heard.due_ns)
@@ -156,8 +157,7 @@ class Daemon:
             command = controller.tick(heard.frame, heard.tick)
             if command or (command is not None and self._loop.lockstep):
                 link.send(command)
-            if heard.missed and hearing.must_tell:
-                self._lapse("missed", k + 1, heard.missed)
+            self._tell(hearing.lapses(heard, k, used=command is not None))
             k = heard.tick
             self._account(command, heard)
             if timing:
@@ -167,15 +167,10 @@ class Daemon:
     def _may_go_on(self) -> bool:
         return not self._role.stop.is_set() and self._machine.state not in (State.HOLDING, State.FAULTED)
 
-    def _hold(self, heard: Heard, k: int) -> None:
-        """A measurement came when tick k, its own or a later one, was over: the next tick has its levels."""
-        self._received += 1
-        self._controller.hold(heard.frame)
-        self._lapse("late", heard.tick, k + 1 - heard.tick)
-
-    def _lapse(self, kind: Literal["late", "missed"], tick: int, ticks: int) -> None:
-        assert self._claimant.session is not None
-        self._role.publish("lapse", Lapse(session=self._claimant.session, kind=kind, tick=tick, ticks=ticks))
+    def _tell(self, lapses: list[Slip]) -> None:
+        for kind, tick, ticks in lapses:
+            assert self._claimant.session is not None
+            self._role.publish("lapse", Lapse(session=self._claimant.session, kind=kind, tick=tick, ticks=ticks))
 
     def _account(self, command: bytes | None, heard: Heard) -> None:
         measured = heard.tick

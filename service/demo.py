@@ -20,6 +20,7 @@ from service.config import Settings
 from service.figures import Figures
 from service.log.review import review
 from service.log.rolling import parts
+from service.payload import PayloadRate
 
 REFRESH_S = 0.1
 
@@ -33,6 +34,7 @@ class Progress:
     error_rad: float = 0.0
     voltages: tuple[float, ...] = ()
     statuses: dict[str, Status] = field(default_factory=dict)
+    payload: PayloadRate = field(default_factory=PayloadRate)
 
     def hear(self, sample: zenoh.Sample) -> None:
         """Take in a telemetry or status message."""
@@ -46,7 +48,9 @@ class Progress:
             self.error_rad = angle(*telemetry.attitude_error)
             self.voltages = telemetry.voltages
         elif address.topic.name == "status" and address.role is not None:
-            self.statuses[address.role] = Status.model_validate_json(payload)
+            self.statuses[address.role] = status = Status.model_validate_json(payload)
+            if address.role == "controller":
+                self.payload.hear(status)
 
     @property
     def rate_hz(self) -> float:
@@ -60,9 +64,8 @@ class Progress:
 
     @property
     def bits_per_s(self) -> tuple[float, float]:
-        """Payload bits a second of measurements and commands, at the present rate."""
-        wire = self.settings.wire
-        return 8 * wire.measurement.size * self.rate_hz, 8 * wire.command.size * self.rate_hz
+        """Payload bits a second of measurements and commands, now."""
+        return self.payload.bits_per_s(self.settings.wire)
 
 
 def run_demo(

@@ -25,6 +25,7 @@ from protocol.attitude import angle, to_euler
 from protocol.messages import Contract, Event, Status, Telemetry, Truth
 from protocol.network import NetworkSettings, join
 from service.config import ConfigError, Settings, from_contract
+from service.payload import PayloadRate
 
 REFRESH_S: Final = 0.2
 SILENT_S: Final = 3.0
@@ -40,6 +41,7 @@ class Vehicle:
     telemetry: Telemetry | None = None
     truth: Truth | None = None
     settings: Settings | None = None
+    payload: PayloadRate = field(default_factory=PayloadRate)
 
 
 class Top:
@@ -60,7 +62,10 @@ class Top:
             try:
                 match address.topic.name:
                     case "status" if address.role is not None:
-                        vehicle.statuses[address.role] = time.monotonic(), Status.model_validate_json(payload)
+                        status = Status.model_validate_json(payload)
+                        vehicle.statuses[address.role] = time.monotonic(), status
+                        if address.role == "controller":
+                            vehicle.payload.hear(status)
                     case "telemetry":
                         vehicle.telemetry = Telemetry.model_validate_json(payload)
                     case "truth":
@@ -92,12 +97,9 @@ def _flight(vehicle: Vehicle) -> Text:
     if vehicle.telemetry is not None:
         parts.append(f"error {degrees(angle(*vehicle.telemetry.attitude_error)):5.2f}°")
         parts.append("volts " + " ".join(f"{u:+6.1f}" for u in vehicle.telemetry.voltages))
-    controller = vehicle.statuses.get("controller")
-    if vehicle.settings is not None and controller is not None:
-        wire, rate = vehicle.settings.wire, controller[1].rate_hz
-        parts.append(
-            f"{8 * wire.measurement.size * rate / 1000:.1f} + {8 * wire.command.size * rate / 1000:.1f} kbit/s"
-        )
+    if vehicle.settings is not None and "controller" in vehicle.statuses:
+        measured, commanded = vehicle.payload.bits_per_s(vehicle.settings.wire)
+        parts.append(f"{measured / 1000:.1f} + {commanded / 1000:.1f} kbit/s")
     return Text("   ".join(parts) or "no telemetry")
 
 

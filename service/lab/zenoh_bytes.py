@@ -109,8 +109,8 @@ class _Tally(Mailbox):
         self._missing = expected
         self.complete = threading.Event()
 
-    def put(self, frame: bytes, published_ns: int = 0) -> None:
-        super().put(frame, published_ns)
+    def put(self, frame: bytes, published_ns: int = 0, number: int | None = None) -> None:
+        super().put(frame, published_ns, number)
         self._missing -= 1
         if self._missing == 0:
             self.complete.set()

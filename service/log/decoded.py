@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from protocol import attitude, topics, verbs
 from protocol.clock import LoopSettings
 from protocol.messages import Contract, Event, Loss, Status, Telemetry, Truth
+from protocol.transmit import SILENCE
 from protocol.wire import WireSpec
 from service.log import views
 from service.log.body import WORLD, desired_frame_of, frame_of, scene, timestamp
@@ -90,6 +91,7 @@ class _Wire:
     def __init__(self, contract: Contract) -> None:
         spec = WireSpec.model_validate(contract.config["wire"])
         voltage = spec.voltage.quantizer()
+        self.silent = {name for name in ("measurement", "command") if getattr(spec.transmit, name) == "on_change"}
         self.role = contract.role
         self.kind = str(contract.config["plant"]["kind"])
         self.period = LoopSettings.model_validate(contract.config["loop"]).period
@@ -150,6 +152,8 @@ class Decoder:
         """
         topic, vehicle, _, _ = address
         name = topic.name
+        if payload == SILENCE and (wire := self._wires.get(vehicle)) and name in wire.silent:
+            return []
         if self._slot_ns and name in LIMITED:
             source, slot = (name, vehicle), published_ns // self._slot_ns
             if self._slots.get(source) == slot:

@@ -58,6 +58,7 @@ class Filler:
         self._on_grid = on_grid and not loop.lockstep
         self._last: Read | None = None
         self._grid_ns = 0  # when the tick of the last frame was due, by the earliest publications
+        self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep)  # as the controller has it
 
     def reads(self, frame: bytes, published_ns: int) -> list[Read] | None:
         """The frame with those before it that were not sent, in order; None if it is malformed.
@@ -74,11 +75,15 @@ class Filler:
         counter = self._counter(frame)
         if counter is None:
             return None
-        if last is None:
+        before, now = self._ticks.tick, self._ticks.advance(counter, published_ns) if self._on_grid else None
+        if self._on_grid and now is None:
+            return []  # not newer than the last, so the controller did not hear it either
+        if last is None or self._lockstep:  # where each silent tick has its message, there is nothing to fill in
             self._grid_ns = published_ns
             self._last = Read(counter, frame, published_ns, published_ns)
             return [self._last]
-        ticks, before_ns = self._ticks_since(last, counter, published_ns), self._grid_ns
+        ticks = self._ticks_since(last, counter, published_ns) if now is None else now - before
+        before_ns = self._grid_ns
         elapsed_ns = ticks * self._period_ns
         self._grid_ns = min(before_ns + elapsed_ns + elapsed_ns // _DRIFT, published_ns)
         if self._on_grid:
@@ -91,8 +96,6 @@ class Filler:
     def _ticks_since(self, last: Read, counter: int, published_ns: int) -> int:
         """How many ticks a frame is after the last: as many as its counter and its time, if it is late, allow."""
         steps = (counter - last.counter - 1) % COUNTERS + 1
-        if self._lockstep:
-            return steps
         elapsed = (published_ns - self._grid_ns) / self._period_ns
         early = COUNTERS - 1 - TickCounter.LATE
         return max(steps, steps + floor((elapsed + early - steps) / COUNTERS) * COUNTERS)
@@ -118,6 +121,7 @@ class Lapses:
     def __init__(self, lapses: Sequence[Lapse]) -> None:
         self._lapses = deque(sorted(lapses, key=lambda lapse: lapse.tick))
         self._missed_before = 0  # ticks before this one
+        self._lost = -1, -1  # of the frames between these ticks none came
         self._late: dict[int, int] = {}  # from which tick on the measurement of a tick was used
         self._coming: deque[tuple[int, Read]] = deque()
         self._used: Read | None = None  # the measurement whose levels the last tick had
@@ -133,13 +137,15 @@ class Lapses:
             lapse = self._lapses.popleft()
             if lapse.kind == "missed":
                 self._missed_before = max(self._missed_before, lapse.tick + lapse.ticks)
+            elif lapse.kind == "lost":
+                self._lost = lapse.tick, lapse.tick + lapse.ticks
             else:
                 self._late[lapse.tick] = lapse.tick + lapse.ticks
         while self._coming and self._coming[0][0] <= k:
             self._used = self._coming.popleft()[1]
         if (since := self._late.pop(k, None)) is not None:
             self._coming.append((since, measurement))
-        elif measurement.sent or self._used is None:
+        elif (measurement.sent and not self._lost[0] < k < self._lost[1]) or self._used is None:
             self._used = measurement
             self._coming.clear()
         if k < self._missed_before:

@@ -11,6 +11,7 @@ from plant_emulator.can_node import CanFront
 from plant_emulator.emulator import Emulator
 from protocol.can_link import HEARTBEAT_S, CanLink, CanSettings, Heartbeat, fingerprint
 from protocol.states import PlantState
+from protocol.transmit import SILENCE
 from service.config import Settings
 from service.controller import Controller
 from service.figures import Figures, Score
@@ -24,10 +25,11 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
     controller = Controller(wire, settings.law, settings.reference, loop.period)
     score = Score(wire, loop.period, settings.plant.watchdog_s)
     level = wire.voltage.quantizer().level
+    voltages: list[float] = []
     over = Event()
     node = Emulator(loop, wire, settings.plant, over)
     front = CanFront(bus, loop, node.endpoint)
-    link = CanLink(bus, wire, "controller")
+    link = CanLink(bus, wire, "controller", lockstep=True)
     granted = Heartbeat(PlantState.GRANTED, 1, fingerprint(wire, loop.period_ns, lockstep=True))
 
     def beat() -> None:
@@ -44,10 +46,12 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
             assert arrival is not None, f"no measurement {k}: the node is {node.endpoint.cause or node.endpoint.state}"
             command = controller.tick(arrival.frame, k)
             assert command is not None
-            read = wire.command.unpack(command)
-            assert read is not None
-            score.error(k, controller.attitude_error)
-            score.command(k, [level(code) for code in read[1]])
+            if read := wire.command.unpack(command):
+                voltages = [level(code) for code in read[1]]
+            else:
+                assert command == SILENCE
+            score.error(k, controller.attitude_error, sent=arrival.frame != SILENCE)
+            score.command(k, voltages, sent=command != SILENCE)
             link.send(command)
     finally:
         over.set()

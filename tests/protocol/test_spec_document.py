@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from enum import StrEnum
 from itertools import takewhile
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +18,7 @@ from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
 from protocol.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
 from protocol.topics import TOPICS
+from protocol.transmit import Sender, Transmit
 from protocol.wire import SignalSpec, WireSpec
 
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
@@ -25,6 +26,7 @@ SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
 QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
 KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes | levels |"
 FRAMES: Final = "| frame | bits of ε, ω / u | actuators | counter | codes | hex |"
+SENT: Final = "| heartbeat_s | period in ms | codes | ticks that send |"
 REFUSED: Final = "| frame | bits of ε, ω / u | actuators | hex | why |"
 
 Row = tuple[str, ...]
@@ -57,6 +59,7 @@ QUANTIZER_ROWS: Final = rows(QUANTIZER, "Golden vectors")
 KIND_ROWS: Final = rows(KINDS, "Golden vectors")
 FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
 REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
+SENT_ROWS: Final = rows(SENT, "Golden vectors")
 
 
 def number(text: str) -> int:
@@ -92,6 +95,7 @@ def as_bits(text: str) -> int | str:
         pytest.param(KIND_ROWS, 14, id="kinds"),
         pytest.param(FRAME_ROWS, 8, id="frames"),
         pytest.param(REFUSED_ROWS, 4, id="refused"),
+        pytest.param(SENT_ROWS, 8, id="sent"),
     ],
 )
 def test_the_golden_vectors_are_there(found: list[Row], least: int) -> None:
@@ -149,6 +153,15 @@ def test_golden_vectors_that_must_be_refused_are_refused(row: Row) -> None:
     frame, bits, actuators, text, why = row
     assert why
     assert form(frame, bits, actuators).unpack(bytes.fromhex(text)) is None
+
+
+@pytest.mark.parametrize("row", SENT_ROWS, ids=" ".join)
+def test_frames_are_sent_as_their_golden_vectors_say(row: Row) -> None:
+    heartbeat_s, period_ms, codes, ticks = row
+    heartbeat = Transmit(heartbeat_s=float(heartbeat_s)).heartbeat_ticks(int(period_ms) * 1_000_000)
+    sender, invalid = Sender("on_change", heartbeat), [nan]  # an end has one list that says no valid value
+    computed = [(k, invalid if code == "NaN" else [float(code)]) for k, code in enumerate(codes.split()) if code != "."]
+    assert [k for k, code in computed if sender.due(k, code)] == [int(tick) for tick in ticks.split()]
 
 
 def test_the_table_of_topics_is_that_of_the_code() -> None:

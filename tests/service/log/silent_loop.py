@@ -1,4 +1,4 @@
-"""A loop that sends only what is new, in simulated time: frames that are late, ticks that are missed, on either side.
+"""A loop that sends only what is new, in simulated time: frames late, lost or malformed, ticks missed on either side.
 
 Plant and controller are the project's own parts for it (Sender, Hearing); the network, the clock and what is measured
 are made up. What comes out is what a recorder would have, and what the controller really used at each tick.
@@ -17,7 +17,7 @@ from protocol.clock import LoopSettings
 from protocol.frames import COUNTERS
 from protocol.links import Arrival, Link
 from protocol.messages import Lapse, Telemetry
-from protocol.transmit import Policy, Sender, Transmit
+from protocol.transmit import SILENCE, Policy, Sender, Transmit
 from protocol.wire import WireSpec
 from service import hearing
 
@@ -42,6 +42,9 @@ class Wire(Link):
 
     def monotonic_ns(self) -> int:
         return self.now_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.pass_time(self.now_ns + round(seconds * 1e9))
 
     def pass_time(self, until_ns: int) -> None:
         self.now_ns = max(self.now_ns, until_ns)
@@ -92,21 +95,28 @@ class Logged:
     last: int = -1
 
 
-def run(seed: int, wire: WireSpec, monkeypatch: pytest.MonkeyPatch, ticks: int = 400) -> Logged:
-    """A session of so many ticks; which are late and missed, the seed says."""
+def run(seed: int, wire: WireSpec, monkeypatch: pytest.MonkeyPatch, *, own_grid: bool = False) -> Logged:
+    """A session of 400 ticks; which are late, missed and malformed, the seed says."""
     chance = random.Random(seed)
     hitch = chance.choice([0.0, 0.01, 0.1])  # how often anything takes longer than it should
+    # In ticks. Where each measurement is answered however late it is, three of the worst must stay below 12 ticks, for
+    # four bits of a command's echo tell no more.
+    worst = chance.choice([3, 9]) if wire.transmit.measurement == "on_change" else 3
 
     def takes(usual_ns: int) -> int:
         longer = chance.random() < hitch
-        return round(chance.uniform(0.5, 1.0) * usual_ns + (chance.uniform(0, 3) * PERIOD_NS if longer else 0))
+        return round(chance.uniform(0.5, 1.0) * usual_ns + (chance.uniform(0, worst) * PERIOD_NS if longer else 0))
 
     logged = Logged()
-    arrivals = _plant(wire, ticks, takes, chance, logged)
+    arrivals = _plant(wire, 400, takes, chance, logged)
     link = Wire(arrivals, hearing.MAILBOX if wire.transmit.measurement == "on_change" else 1)
     monkeypatch.setattr(hearing, "time", link)
-    heard_by = hearing.Hearing(link, LOOP, wire, own_grid=False)
+    if own_grid:
+        link.now_ns = chance.randrange(PERIOD_NS)
+        monkeypatch.setattr("protocol.clock.time", link)
+    heard_by = hearing.Hearing(link, LOOP, wire, own_grid=own_grid)
     sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(PERIOD_NS))
+    k = -1
     held: Codes = ()
     said: Codes = (0, 0)
     while not link.over:
@@ -115,15 +125,15 @@ def run(seed: int, wire: WireSpec, monkeypatch: pytest.MonkeyPatch, ticks: int =
             continue
         read = wire.measurement.unpack(heard.frame)
         held = read[1] if read else held  # type: ignore[assignment]  # codes of a quantized wire are whole
+        used = read is not None or (heard.frame == SILENCE and not heard.late)
+        lapses = heard_by.lapses(heard, k, used=used)
+        logged.lapses += [Lapse(session="s", kind=kind, tick=tick, ticks=ticks) for kind, tick, ticks in lapses]
         if heard.late:
-            since = heard_by.tick + 1 - heard.tick
-            logged.lapses.append(Lapse(session="s", kind="late", tick=heard.tick, ticks=since))
             continue
-        if heard.missed and heard_by.must_tell:
-            first = heard.tick - heard.missed
-            logged.lapses.append(Lapse(session="s", kind="missed", tick=first, ticks=heard.missed))
-        link.pass_time(link.now_ns + takes(200_000))
         k = heard.tick
+        if not used:
+            continue
+        link.pass_time(link.now_ns + takes(200_000))
         said = (said[0] + chance.choice([0, 0, 0, 1, -1]), said[1])
         said = (max(-31, min(31, said[0])), said[1])
         logged.used[k], logged.commanded[k] = held, said
@@ -139,6 +149,8 @@ def run(seed: int, wire: WireSpec, monkeypatch: pytest.MonkeyPatch, ticks: int =
 
 def _plant(wire: WireSpec, ticks: int, takes, chance: random.Random, logged: Logged) -> list[Arrival]:  # type: ignore[no-untyped-def]
     sender = Sender(wire.transmit.measurement, wire.transmit.heartbeat_ticks(PERIOD_NS))
+    garbled, lost = chance.choice([0.0, 0.05]), chance.choice([0.0, 0.05])  # lost on the way to the controller only
+    number = 0
     codes: Codes = (0,) * 6
     arrivals: list[Arrival] = []
     k = done_ns = arrived_ns = 0
@@ -148,8 +160,12 @@ def _plant(wire: WireSpec, ticks: int, takes, chance: random.Random, logged: Log
             codes = (*codes[:5], max(-127, min(127, codes[5] + chance.choice([-1, 1]))))
         if sender.due(k, codes):
             frame = wire.measurement.pack(k % COUNTERS, codes)
+            if k and chance.random() < garbled:
+                frame = frame[:-1] + b"\1"  # as it reaches the recorder, too: its padding is not zero
             arrived_ns = max(arrived_ns + 1000, published_ns + takes(150_000))
-            arrivals.append(Arrival(frame, arrived_ns, START_NS + published_ns))
+            if chance.random() >= lost:
+                arrivals.append(Arrival(frame, arrived_ns, START_NS + published_ns, number))
+            number += 1
             logged.messages.append(("measurement", frame, START_NS + published_ns))
         done_ns = published_ns
         k = max(k + 1, -(-done_ns // PERIOD_NS))  # the grid goes on; what was missed is skipped

@@ -303,6 +303,17 @@ def test_frames_give_nothing_before_a_contract_and_are_read_by_the_plants() -> N
     assert len(decoder.take(address("measurement"), payload, NOW)) == 3
 
 
+def test_silence_in_lockstep_shows_nothing_new_and_takes_no_frames_turn() -> None:
+    decoder = Decoder(25.0)
+    decoder.configure(contract("plant", "wire.transmit.measurement=on_change"))
+    frame = WIRE.measurement.pack(3, (1, 2, 3, 4, 5, 6))
+    assert decoder.take(address("measurement"), b"", NOW) == []
+    assert decoder.take(address("measurement"), frame, NOW + 1)
+    assert decoder.malformed == 0
+    assert decoder.take(address("command"), b"", NOW) == []  # which are periodic
+    assert decoder.malformed == 1
+
+
 def test_a_contract_of_another_version_changes_nothing_and_is_counted() -> None:
     decoder = configured()
     decoder.configure(Contract(role="plant", vehicle="aero", host="h", versions={}, config={"wire": {"bits": 3}}))

@@ -55,18 +55,20 @@ def read(wire: WireSpec, logged: Logged) -> Paired:
 
 
 @pytest.mark.parametrize(("measurement", "command"), POLICIES)
-@pytest.mark.parametrize("seed", range(50))
+@pytest.mark.parametrize(("seed", "own_grid"), [*((i, False) for i in range(50)), *((i, True) for i in range(50, 70))])
 def test_a_log_says_what_was_used_and_commanded_at_every_tick(
-    seed: int, measurement: Policy, command: Policy, monkeypatch: pytest.MonkeyPatch
+    seed: int, own_grid: bool, measurement: Policy, command: Policy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wire = wire_of(measurement, command)
-    logged = run(seed, wire, monkeypatch)
+    logged = run(seed, wire, monkeypatch, own_grid=own_grid)
     paired = read(wire, logged)
     known = max(paired.found)
     assert known >= logged.last - 15  # silence at the very end is not told from the end
     expected = {k: (logged.used[k], logged.commanded[k]) for k in logged.used if k <= known}
     assert paired.found == expected
-    # What is filled in is no frame that was sent.
+    # What is filled in is no frame that was sent, and what is malformed is counted.
     sent = [(payload, at_ns) for topic, payload, at_ns in logged.messages if topic == "measurement"]
-    assert [frame for frame in paired.frames if frame[1] is not None] == sent
-    assert len(paired.frames) == sum(topic != "telemetry" for topic, _, _ in logged.messages)
+    whole = [frame for frame in sent if wire.measurement.counter(frame[0]) is not None]
+    assert [frame for frame in paired.frames if frame[1] is not None] == whole
+    assert paired.malformed == len(sent) - len(whole)
+    assert len(paired.frames) + paired.malformed == sum(topic != "telemetry" for topic, _, _ in logged.messages)

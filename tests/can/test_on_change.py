@@ -1,0 +1,172 @@
+"""A bus on which only changes are sent: in lockstep an empty frame stands for the others, in real time none comes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from plant_emulator.can_bridge import Relay
+from plant_emulator.can_node import CanFront
+from plant_emulator.endpoint import Endpoint
+from protocol.can_link import COMMAND_ID, MEASUREMENT_ID, CanLink
+from protocol.clock import LoopSettings
+from protocol.messages import Claim, Grant
+from protocol.states import PlantState
+from protocol.transmit import SILENCE, Policy, Transmit
+from protocol.wire import WireSpec
+from service.config import load
+from service.hil import Hil
+from service.lab.experiment import run_experiment
+from tests.can.closed_loop import PATIENCE_S, run_on_bus
+from tests.can.in_process import Stranger, virtual
+from tests.can.test_relay import FIRST_COMMAND_NS, NOW, PERIOD_NS, WATCHDOG_NS, Still, command, measurement
+
+POLICIES: list[tuple[Policy, Policy]] = [
+    ("on_change", "on_change"),
+    ("on_change", "periodic"),
+    ("periodic", "on_change"),
+]
+
+
+def wire_of(measurement: Policy, command: Policy) -> WireSpec:
+    return WireSpec(transmit=Transmit(measurement=measurement, command=command))
+
+
+BOTH = wire_of("on_change", "on_change")
+
+
+@pytest.mark.parametrize(("measurement", "command"), POLICIES)
+def test_in_lockstep_the_figures_over_a_bus_are_those_of_the_experiment(
+    measurement: Policy, command: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plant_emulator.can_node.SILENT_S", PATIENCE_S)  # a slow machine is no silent peer
+    settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
+    settings = settings.model_copy(update={"wire": wire_of(measurement, command)})
+    direct = run_experiment(settings, 0.5)
+    on_bus = run_on_bus(virtual(), settings, 0.5)
+    assert on_bus.model_dump(exclude={"reasons"}) == direct.model_dump(exclude={"reasons"})
+
+
+# The link
+
+
+@pytest.mark.parametrize("end", ["plant", "controller"])
+@pytest.mark.parametrize("lockstep", [False, True])
+@pytest.mark.parametrize("wire", [WireSpec(), *(wire_of(*policies) for policies in POLICIES)], ids=str)
+def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_silence_sends(
+    wire: WireSpec, lockstep: bool, end: str
+) -> None:
+    bus = virtual()
+    hears = wire.transmit.command if end == "plant" else wire.transmit.measurement
+    link = CanLink(bus, wire, end, lockstep=lockstep)  # type: ignore[arg-type]  # is one of both
+    try:
+        with Stranger(bus) as stranger:
+            frame = bytes(2) if end == "plant" else bytes(7)
+            identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
+            stranger.say(identifier, frame)
+            stranger.say(identifier, SILENCE)
+            stranger.settle(link)
+            arrival = link.take()
+            assert arrival is not None
+            expected = lockstep and hears == "on_change"
+            assert (arrival.frame, link.refused) == ((SILENCE, 0) if expected else (frame, 1))
+    finally:
+        link.close()
+
+
+# The node
+
+
+@pytest.fixture(params=[False, True], ids=["real time", "lockstep"])
+def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanFront, Stranger, bool]]:
+    """A node's front, somebody who hears what it sends, and whether it is in lockstep."""
+    bus = virtual()
+    endpoint = Endpoint(Still(), BOTH, PERIOD_NS, lockstep=request.param)
+    front = CanFront(bus, LoopSettings(lockstep=request.param), endpoint)
+    with Stranger(bus) as stranger:
+        yield front, stranger, request.param
+        front.leave()
+
+
+def test_a_node_sends_silence_where_it_could_not_be_heard_only(node: tuple[CanFront, Stranger, bool]) -> None:
+    front, stranger, lockstep = node
+    for counter, frame in enumerate((measurement(0), SILENCE, SILENCE, measurement(3))):
+        front.send(frame, counter)
+    said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
+    silence = [SILENCE, SILENCE] if lockstep else []
+    assert said == [measurement(0), *silence, measurement(3)]
+
+
+# The bridge's relay
+
+
+def relay(wire: WireSpec = BOTH, *, lockstep: bool = True) -> Relay:
+    """A relay in a session, which has looked at the clock at NOW."""
+    it = Relay(wire, PERIOD_NS, lockstep=lockstep, watchdog_s=0.1, armed=True)
+    claim = Claim(controller="a", session="s", period_ns=PERIOD_NS, lockstep=lockstep, auto_arm=False, wire=wire)
+    assert isinstance(it.claim(claim), Grant)
+    it.watch(NOW)
+    return it
+
+
+def test_silence_passes_in_lockstep_and_has_the_counter_after_the_last() -> None:
+    it = relay()
+    assert it.measurement(measurement(0)) is not None
+    for k in range(1, 15):
+        assert it.measurement(SILENCE) == SILENCE
+        assert it.counter == k
+    assert it.command(command(0), NOW) is not None
+    assert it.command(SILENCE, NOW) == SILENCE
+    assert it.refused == 0
+
+
+def test_silence_does_not_pass_before_a_sessions_first_frame() -> None:
+    it = relay()
+    assert it.measurement(SILENCE) is None
+    assert it.command(SILENCE, NOW + FIRST_COMMAND_NS) is None
+    it.watch(NOW + FIRST_COMMAND_NS + 1)
+    assert it.state is PlantState.TRIPPED  # it was no first command either
+
+
+@pytest.mark.parametrize(("wire", "lockstep"), [(BOTH, False), (WireSpec(), True), (WireSpec(), False)])
+def test_an_empty_frame_is_refused_elsewhere_and_feeds_no_watchdog(wire: WireSpec, lockstep: bool) -> None:
+    it = relay(wire, lockstep=lockstep)
+    it.measurement(measurement(0))
+    it.command(command(0), NOW)
+    assert it.measurement(SILENCE) is None
+    assert it.command(SILENCE, NOW + WATCHDOG_NS) is None
+    assert it.refused == 2
+    it.watch(NOW + WATCHDOG_NS + 1)
+    assert (it.state is PlantState.TRIPPED) == (not lockstep)
+
+
+def test_commands_that_stop_trip_the_bridge_though_the_last_is_held() -> None:
+    it = relay(lockstep=False)
+    it.command(command(0), NOW)
+    it.watch(NOW + WATCHDOG_NS)
+    assert it.trip is None
+    it.watch(NOW + WATCHDOG_NS + 1)
+    assert it.state is PlantState.TRIPPED
+
+
+# On real processes
+
+
+def test_in_real_time_a_loop_over_a_bus_goes_on_with_fewer_frames(tmp_path: Path) -> None:
+    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+    with Hil(tmp_path, plant="can-node") as hil:
+        hil.start(settings={**patient, "wire.transmit": "on_change"})
+        hil.run(1.5)
+        log = hil.log
+    figures = log.figures
+    ticks_per_s = 500
+    assert figures.trips == []
+    assert figures.duration_s > 1
+    for stream in (figures.measurement, figures.command):
+        assert stream.frames_per_s is not None
+        assert ticks_per_s / 15 * 0.9 < stream.frames_per_s < 0.85 * ticks_per_s
+    assert figures.final_error_deg is not None
+    assert figures.final_error_deg < 10
+    assert all(frame for name in ("measurement", "command") for _, frame in log.messages(name))

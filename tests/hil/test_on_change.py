@@ -1,0 +1,160 @@
+"""A loop that sends only what is new, as a user runs it: real processes, an operator's verbs, and what its log tells.
+
+Most of it looks at one run in real time, of a body at rest that an operator turns and that rests again.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from protocol.messages import Event, Loss, Status
+from service.cli import execute
+from service.figures import Figures
+from service.hil import Hil, HilLog
+from service.log.replay import replay
+from service.log.review import Kept, read, review
+from tests.hil.test_faults import PATIENT, SLACK_S, TOLD, WATCHDOG_S, last_command_ns, seconds_driven_after
+from tests.hil.test_operate import done
+from tests.hil.test_processes import FIGURES, aeroloop
+
+ON_CHANGE = {"wire.transmit": "on_change"}
+RATE = 500
+
+
+class Run(NamedTuple):
+    """A run in real time that is over."""
+
+    log: HilLog
+    figures: Figures
+    plant: Status
+    controller: Status
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    """Hold, turn by 8 degrees in half a second, other gains, hold."""
+    with Hil(tmp_path_factory.mktemp("run")) as hil:
+        hil.start(settings={**PATIENT, **ON_CHANGE, "reference.kind": "hold"})
+        hil.run(0.3)
+        done(hil, "goto", "0", "-5", "8", "--in", "0.5")
+        done(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
+        hil.run(1.0)
+        told = hil.status("plant").ticks
+        hil.eventually("a status", lambda: hil.status("plant").ticks > told)
+        plant, controller = hil.status("plant"), hil.status("controller")
+        log = hil.log
+        yield Run(log, log.figures, plant, controller)
+
+
+def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit(tmp_path: Path) -> None:
+    cell = ("--duration", "2", "--set", "wire.transmit=on_change")
+    log = tmp_path / "a.mcap"
+    demo = aeroloop("demo", "--lockstep", "--log", str(log), *cell)
+    experiment = aeroloop("lab", "experiment", *cell)
+    assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}
+    assert (demo["skipped_ticks"], demo["trips"]) == (0, [])
+    assert demo["measurement"]["frames_per_s"] < RATE
+    assert demo["command"]["frames_per_s"] < RATE
+    (session,) = replay([log])
+    assert (session.commands, session.differing) == (2 * RATE, 0)
+
+
+def test_in_lockstep_frames_that_are_lost_or_late_end_no_session_and_the_log_is_computed_again(tmp_path: Path) -> None:
+    faults = ["measurement:drop=0.1", "command:drop=0.1", "measurement:delay=0.006@0.5", "command:garble=0.02"]
+    log = tmp_path / "a.mcap"
+    demo = aeroloop(
+        "demo", "--lockstep", "--log", str(log), "--duration", "1.5",
+        "--set", "wire.transmit=on_change", "--set", f"plant.faults={json.dumps(faults)}",
+    )  # fmt: skip
+    assert demo["trips"] == []
+    assert demo["duration_s"] == pytest.approx(1.5, abs=0.04)  # the last ones may be among those that were lost
+    assert demo["final_error_deg"] < 10
+    (session,) = replay([log])
+    assert session.commands > RATE
+    assert session.differing == 0
+
+
+def test_in_real_time_fewer_frames_do_and_every_tick_is_judged(run: Run) -> None:
+    figures = run.figures
+    for stream in (figures.measurement, figures.command):
+        assert stream.frames_per_s is not None
+        assert RATE / 15 * 0.9 < stream.frames_per_s < 0.7 * RATE  # at rest it is the heartbeat's
+    assert figures.trips == []
+    assert figures.skipped_ticks is not None
+    assert figures.skipped_ticks < 0.5 * RATE * figures.duration_s
+    assert figures.final_error_deg is not None
+    assert figures.final_error_deg < 3
+    assert all(frame for name in ("measurement", "command") for _, frame in run.log.messages(name))
+
+
+def test_a_log_of_a_loop_that_was_silent_while_an_operator_spoke_is_computed_again_byte_for_byte(run: Run) -> None:
+    if any(isinstance(loss, Loss) for _, loss in run.log.messages("loss")):
+        pytest.skip("this machine lost messages on their way to the recorder")
+    (session,) = replay([run.log.path])
+    assert session.commands > 0.5 * RATE * run.figures.duration_s
+    assert session.differing == 0
+
+
+def test_status_counts_the_frames_and_the_ticks_apart(run: Run) -> None:
+    assert 0 < run.plant.sent < 0.7 * run.plant.ticks
+    assert 0 < run.controller.sent < 0.7 * run.controller.ticks
+    assert run.controller.rate_hz > 0.5 * RATE
+    assert run.plant.received <= run.controller.sent + RATE  # told up to a second apart
+    assert run.plant.refused == run.controller.refused == 0
+
+
+def test_an_export_has_a_row_a_tick(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "a.csv"
+    assert execute(["log", "export", str(run.log.path), "--to", "csv", "--out", str(out)]) == 0
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    ticks = [int(row["tick"]) for row in rows]
+    assert ticks == sorted(set(ticks))
+    kept = Kept()
+    judged = read(run.log.path, watch=kept.watch)
+    assert ticks == [tick.k for tick in kept[judged.which]]
+    assert len(ticks) > 0.5 * RATE * run.figures.duration_s
+
+
+def test_what_is_whole_of_a_log_that_was_cut_is_still_computed_again(run: Run, tmp_path: Path) -> None:
+    cut, out = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
+    content = run.log.path.read_bytes()
+    cut.write_bytes(content[: len(content) * 6 // 10])
+    assert execute(["log", "recover", str(cut), str(out)]) == 0
+    if not any(isinstance(loss, Loss) for _, loss in run.log.messages("loss")):
+        assert all(session.differing == 0 for session in replay([out]))
+    assert 0.2 < review(out).duration_s < run.figures.duration_s
+
+
+def moments(log: HilLog, kind: str) -> list[int]:
+    """When events of a kind were told [ns]."""
+    return [at for at, event in log.messages("event") if isinstance(event, Event) and event.kind == kind]
+
+
+def test_the_motors_are_at_rest_in_time_when_a_controller_dies_that_was_silent_anyway(hil: Hil) -> None:
+    hil.start(settings={**TOLD, **ON_CHANGE})
+    hil.run(0.5)
+    hil.kill("controller")
+    hil.eventually("the trip", lambda: hil.happened("tripped", "is gone") or hil.happened("tripped", "no fresh"))
+    hil.run(0.3)
+    log = hil.log
+    assert seconds_driven_after(log, last_command_ns(log)) < WATCHDOG_S + SLACK_S
+
+
+def test_a_plant_that_stands_still_is_given_up_as_soon_as_it_is_stale_and_not_taken_for_silent(hil: Hil) -> None:
+    hil.start(settings={**PATIENT, **ON_CHANGE, "controller.stale_s": 0.1, "reference.kind": "hold"})
+    hil.run(0.5)
+    hil.pause("plant")
+    hil.eventually("the controller's notice", lambda: hil.happened("lost", "no measurement for"))
+    hil.resume("plant")
+    hil.eventually("a new session", lambda: sum(event.kind == "claimed" for event in hil.events) >= 3)
+    log = hil.log
+    lost = moments(log, "lost")[0]
+    last = max(at for at, _ in log.messages("measurement") if at < lost)
+    assert 0.1 - 1e-3 < (lost - last) * 1e-9 < 0.1 + SLACK_S

@@ -1,0 +1,172 @@
+"""Sending only on change costs nothing but frames: in lockstep the same figures to the last bit, in fewer of them."""
+
+from __future__ import annotations
+
+from math import cos, sin
+from pathlib import Path
+
+import pytest
+
+import service.examples
+from protocol.attitude import sent_vector
+from protocol.frames import COUNTERS
+from protocol.transmit import SILENCE, Policy, Transmit
+from protocol.verbs import Sinusoid
+from protocol.wire import WireSpec
+from service.config import ConfigError, Settings, load, with_bits
+from service.controller import Controller
+from service.figures import Figures
+from service.lab.experiment import run_experiment
+from service.law import LawSettings
+
+PERIOD = 0.002
+DURATION = 1.5
+POLICIES: list[tuple[Policy, Policy]] = [
+    ("on_change", "on_change"),
+    ("on_change", "periodic"),
+    ("periodic", "on_change"),
+]
+GAPS = ('plant.faults=["rate:off@0.2..0.3", "attitude.z:off@0.6..0.602"]', "plant.limits.max_invalid_s=1")
+RIGID_BODY = Path(service.examples.__path__[0]) / "rigid-body.toml"
+LOOPS = {
+    "Aero": load(),
+    "Aero with gaps": load(overrides=GAPS),
+    "rigid body": load(RIGID_BODY),
+    "rigid body with gaps": load(RIGID_BODY, GAPS),
+}
+
+
+def sending(settings: Settings, measurement: Policy, command: Policy) -> Settings:
+    transmit = Transmit(measurement=measurement, command=command)
+    return settings.model_copy(update={"wire": settings.wire.model_copy(update={"transmit": transmit})})
+
+
+def cost_aside(figures: Figures) -> Figures:
+    """All that does not count frames."""
+    none = figures.measurement.model_copy(update={"frames_per_s": None, "bits_per_s": None})
+    return figures.model_copy(update={"measurement": none, "command": none})
+
+
+@pytest.mark.parametrize(("measurement", "command"), POLICIES)
+@pytest.mark.parametrize(("out", "inp"), [("8", "6"), ("3", "2"), ("cont", "cont")])
+@pytest.mark.parametrize("loop", LOOPS)
+def test_in_lockstep_the_figures_are_those_of_a_frame_every_tick(
+    loop: str, out: str, inp: str, measurement: Policy, command: Policy
+) -> None:
+    settings = with_bits(LOOPS[loop], out, inp)
+    periodic = run_experiment(settings, DURATION)
+    sparse = run_experiment(sending(settings, measurement, command), DURATION)
+    assert cost_aside(sparse) == cost_aside(periodic)
+    for direction, policy in (("measurement", measurement), ("command", command)):
+        now, ever = getattr(sparse, direction).frames_per_s, getattr(periodic, direction).frames_per_s
+        if policy == "periodic":
+            assert now == ever
+        elif out == "cont":  # a float64 may well change at every tick
+            assert now <= ever
+        else:
+            assert 1 / (15 * PERIOD) <= now < 0.9 * ever
+
+
+# The controller by itself
+
+WIRE = WireSpec(transmit=Transmit(measurement="on_change", command="on_change"))
+
+
+def controller(wire: WireSpec = WIRE) -> Controller:
+    return Controller(wire, LawSettings(), Sinusoid(), PERIOD)
+
+
+def measurement(k: int, yaw: float = 0.1) -> bytes:
+    attitude, rate = WIRE.attitude.quantizer(), WIRE.rate.quantizer()
+    turned = sent_vector((cos(yaw / 2), 0.0, 0.0, sin(yaw / 2)))
+    codes = [*(attitude.encode(x) for x in turned), *(rate.encode(0.2) for _ in range(3))]
+    return WIRE.measurement.pack(k % COUNTERS, codes)
+
+
+def test_silence_is_computed_as_the_frame_that_was_not_sent_would_be() -> None:
+    told, heard = controller(), controller()
+    for k in range(60):
+        changed = k in (0, 7, 30)
+        yaw = 0.1 if k < 7 else 0.3 if k < 30 else -0.2
+        assert heard.tick(measurement(k, yaw) if changed else SILENCE, k) == told.tick(measurement(k, yaw), k)
+        assert (heard.voltages, heard.damping_estimate) == (told.voltages, told.damping_estimate)
+        assert (heard.tick_index, heard.counter) == (k, k % COUNTERS)
+
+
+def test_a_command_is_sent_when_its_codes_change_or_the_heartbeat_is_due() -> None:
+    sparse, periodic = controller(), controller(WireSpec())
+    last, sent_at = b"", 0
+    for k in range(200):
+        frame = periodic.tick(measurement(k), k)
+        assert frame is not None
+        codes = bytes([frame[0] & 0x0F]) + frame[1:]
+        due = codes != last or k - sent_at == 15
+        assert sparse.tick(measurement(k), k) == (frame if due else SILENCE)
+        if due:
+            last, sent_at = codes, k
+
+
+@pytest.mark.parametrize("wire", [WIRE, WireSpec()], ids=["on_change", "periodic"])
+def test_an_empty_frame_is_refused_where_it_can_stand_for_nothing(wire: WireSpec) -> None:
+    """Before a session's first frame, and on a wire that has a frame every tick."""
+    law = controller(wire)
+    assert law.tick(SILENCE, 0) is None
+    assert law.refused == 1
+    assert law.attitude_of(SILENCE) is None
+    assert law.tick(measurement(1), 1)
+    answered = law.tick(SILENCE, 2)
+    assert (answered is None, law.refused, law.attitude_of(SILENCE) is None) == (
+        (False, 1, False) if wire is WIRE else (True, 2, True)
+    )
+
+
+def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_hold_nothing() -> None:
+    late, told = controller(), controller()
+    for law in (late, told):
+        law.tick(measurement(0), 0)
+        law.tick(SILENCE, 1)
+    assert late.hold(measurement(1, 0.3))
+    assert not late.hold(SILENCE)
+    assert not late.hold(measurement(1)[:-1])
+    assert late.refused == 2
+    assert late.tick_index == 1  # nothing was computed
+    assert late.tick(SILENCE, 2) == told.tick(measurement(2, 0.3), 2)
+
+
+# What cannot work is refused
+
+
+@pytest.mark.parametrize(
+    ("overrides", "names"),
+    [
+        (("plant.watchdog_s=0.05",), "plant.watchdog_s, which is 50 ms"),
+        (("controller.stale_s=0.059",), "controller.stale_s, which is 59 ms"),
+        (("wire.transmit.heartbeat_s=0.06", "loop.rate_hz=100"), "60 ms pass without a command"),
+        (("loop.rate_hz=250", "wire.transmit.heartbeat_s=1"), "60 ms pass without a command"),
+    ],
+)
+def test_a_heartbeat_that_cannot_keep_both_ends_alive_is_refused_in_one_line(
+    overrides: tuple[str, ...], names: str
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load(overrides=["wire.transmit.measurement=on_change", "wire.transmit.command=on_change", *overrides])
+    assert names in str(refused.value)
+    assert "wire.transmit.heartbeat_s" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("plant.watchdog_s=0.06", "controller.stale_s=0.06"),
+        ("loop.rate_hz=1000", "plant.watchdog_s=0.03", "controller.stale_s=0.03"),  # 15 ticks are 15 ms
+        ("loop.rate_hz=5",),  # a period alone is longer, and every tick has a frame as ever
+        ("loop.rate_hz=100", "wire.transmit.heartbeat_s=0.05"),
+        ("loop.lockstep=true", "plant.watchdog_s=0.01"),  # silence travels there, and is an answer
+        ("wire.transmit.command=periodic", "plant.watchdog_s=0.01"),  # each end's own direction counts
+        ("wire.transmit.measurement=periodic", "controller.stale_s=0.01"),
+    ],
+)
+def test_a_heartbeat_that_does_is_taken(overrides: tuple[str, ...]) -> None:
+    both = ("wire.transmit.measurement=on_change", "wire.transmit.command=on_change")
+    assert load(overrides=[*both, *overrides]).wire.transmit.heartbeat_s <= 1
