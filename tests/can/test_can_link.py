@@ -86,7 +86,7 @@ def both_ends(settings: CanSettings, wire: WireSpec = PAPER) -> Iterator[tuple[C
 def crosses(sender: CanLink, receiver: CanLink, stranger: Stranger, size: int, length: int) -> None:
     """Any bytes of this size cross, in a frame of this length."""
 
-    @settings(deadline=None, max_examples=30)
+    @settings(max_examples=30)
     @given(payload=st.binary(min_size=size, max_size=size))
     def cross(payload: bytes) -> None:
         sender.send(payload)
@@ -288,7 +288,7 @@ def test_a_controllers_heartbeat_carries_the_number_of_the_session() -> None:
             assert next_heartbeat(plant)[:3] == (PlantState.GRANTED, number, MARK)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(state=st.sampled_from(PlantState), number=st.integers(0, 15), mark=st.binary(min_size=7, max_size=7))
 def test_a_heartbeat_has_eight_bytes_and_is_read_as_it_was_written(state: PlantState, number: int, mark: bytes) -> None:
     packed = Heartbeat(state, number, mark).pack()
@@ -355,7 +355,7 @@ def _size(frame: str, bits: dict[str, int | None], actuators: int) -> int:
     return size
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(attitude=WIDTHS, rate=WIDTHS, voltage=WIDTHS, actuators=st.sampled_from([2, 3]))
 def test_a_spec_that_does_not_fit_is_refused_with_the_widths_that_would(
     attitude: int | None, rate: int | None, voltage: int | None, actuators: int

@@ -82,7 +82,7 @@ def driven(*, lockstep: bool = False) -> Relay:
     return it
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     counter=st.integers(0, 15),
     codes=st.lists(st.integers(-128, 127), min_size=6, max_size=6),

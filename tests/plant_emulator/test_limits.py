@@ -242,4 +242,4 @@ class PlantEnd(RuleBasedStateMachine):
 
 
 TestPlantEnd = PlantEnd.TestCase
-TestPlantEnd.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestPlantEnd.settings = settings(max_examples=150, stateful_step_count=40)

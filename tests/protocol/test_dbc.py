@@ -220,7 +220,7 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
         assert told["echo"] == code % COUNTERS
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(spec=specs, counter=st.integers(0, COUNTERS - 1), data=st.data())
 def test_any_codes_of_any_wire_decode(spec: WireSpec, counter: int, data: st.DataObject) -> None:
     for message, layout, of in frames(spec):

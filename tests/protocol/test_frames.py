@@ -130,7 +130,7 @@ both_frames = pytest.mark.parametrize(
 
 
 @both_frames
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(spec=wires, counter=counters, data=st.data())
 def test_a_frame_is_the_bits_of_the_spec_and_unpacks_to_what_was_packed(
     pack: Pack,
@@ -222,7 +222,7 @@ def test_an_infinite_float_is_refused_in_every_place() -> None:
 
 
 @both_frames
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(spec=wires, data=st.data())
 def test_any_bytes_are_refused_or_are_exactly_what_packing_gives(
     pack: Pack, unpack: Unpack, widths_of: Callable[[WireSpec], Widths], spec: WireSpec, data: st.DataObject

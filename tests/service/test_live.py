@@ -663,7 +663,7 @@ def test_a_configured_reference_beyond_the_limits_is_told_and_ends_nothing(loop:
 far = st.tuples(st.just(0.0), st.integers(-65, 65).map(float), st.integers(-180, 180).map(float))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     sent=st.lists(st.tuples(far, st.integers(1, 400)), min_size=2, max_size=10),
     within_s=st.sampled_from([0.02, 0.2, 1.0]),
@@ -721,7 +721,7 @@ steps: st.SearchStrategy[tuple[str, Any]] = st.one_of(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     configured=st.one_of(st.just(Sinusoid()), st.just(LEVEL), st.just(Stream())),
     history=st.lists(steps, min_size=4, max_size=25),

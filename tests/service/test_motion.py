@@ -174,7 +174,7 @@ def rounding(around: Sequence[tuple[Array, Array, Array]], t: float, within_s: f
     return 30 * EPS * 15 * size * (5 / T) ** orders + 2 * EPS * (t + T) * 15 * size * (5 / T) ** (orders + 1)
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(first=references, then=references, t=seconds(0, 20), within_s=withins, ease_s=st.just(0.0) | seconds(0.02, 1.0))
 def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
     first: Reference, then: Reference, t: float, within_s: float, ease_s: float
@@ -200,7 +200,7 @@ def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
             assert np.abs(before[order] - after[order]).max() <= tolerance[order]
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(
     first=references,
     changes=st.lists(st.tuples(references, seconds(0, 3), withins), min_size=1, max_size=4),
@@ -222,7 +222,7 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
             assert np.abs(was - now).max() <= tolerance
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(first=references, then=references, t=seconds(0.1, 10), within_s=withins)
 def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_acceleration(
     first: Reference, then: Reference, t: float, within_s: float
@@ -265,7 +265,7 @@ def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_a
 # Arriving
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(first=references, target=holds, t=seconds(0, 10), within_s=withins)
 def test_going_somewhere_ends_there_exactly_and_at_rest(
     first: Reference, target: Hold, t: float, within_s: float
@@ -281,7 +281,7 @@ def test_going_somewhere_ends_there_exactly_and_at_rest(
     assert followed.at(1e4)[0] == pytest.approx(quaternion(np.radians(target.attitude)), abs=8 * EPS)
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(first=references, points=some_points(), t=seconds(0, 10), within_s=withins)
 def test_points_are_passed_each_at_its_time_from_rest_to_rest(
     first: Reference, points: Points, t: float, within_s: float
@@ -305,7 +305,7 @@ def test_points_are_passed_each_at_its_time_from_rest_to_rest(
     assert not np.any(followed.at(start + points.times[-1] + 1.0)[1])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(points=some_points())
 def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> None:
     plan = Plan.of(points)
@@ -317,7 +317,7 @@ def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> N
             assert np.abs(before - after).max() <= tolerance[order]
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(first=references, t=seconds(0, 10), within_s=withins)
 def test_resting_comes_to_rest_where_even_braking_ends(first: Reference, t: float, within_s: float) -> None:
     followed = Followed(first)
@@ -345,7 +345,7 @@ def test_resting_from_an_even_turn_only_ever_slows_down() -> None:
 # The loop's function
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(
     first=references,
     changes=st.lists(st.tuples(references, seconds(0.05, 3), withins), max_size=3),
@@ -489,7 +489,7 @@ polynomial (the least Σ|w| of weights w that give every quartic's value there f
 direction that is fastest at any time is such a quartic."""
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(first=references, target=holds, t=seconds(0, 5), within_s=seconds(0.2, 5.0))
 def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hold, t: float, within_s: float) -> None:
     """Without roll, where Σ rate² is all; from any state, so from any acceleration."""
@@ -512,7 +512,7 @@ def test_the_fastest_is_found_where_it_falls_between_samples() -> None:
     assert np.abs(rates).max() <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(start=holds, target=holds, within_s=seconds(0.2, 5.0))
 def test_from_rest_to_rest_the_fastest_is_that_of_the_angular_velocity_itself(
     start: Hold, target: Hold, within_s: float
@@ -524,7 +524,7 @@ def test_from_rest_to_rest_the_fastest_is_that_of_the_angular_velocity_itself(
     assert followed.plan.fastest() == pytest.approx(fastest, rel=2e-3, abs=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(amplitude=triples(60), frequency=frequencies)
 def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
     amplitude: tuple[float, float, float], frequency: float
@@ -536,7 +536,7 @@ def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
     assert followed.plan.fastest() == pytest.approx(fastest, rel=5e-3, abs=1e-9)
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(start=holds, target=holds, asked_s=withins, rate=st.integers(1, 40).map(lambda n: n / 10))
 def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
     start: Hold, target: Hold, asked_s: float, rate: float
