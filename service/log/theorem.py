@@ -3,7 +3,8 @@
 ‖z‖ and V are those that the controller computed, from quantized signals, at every tick; and the true ones at the ticks
 of which an emulator told the true state. A truth says which tick's measurement was taken of it, so nothing that is
 judged is interpolated. The transient lasts three times the law's slower time constant, by when an error has fallen to
-5 %. All is judged until an operator first changes gains or reference: from there on another certificate would hold.
+5 %. All is judged until gains or reference first change, by an operator or because the session begins far from its
+reference: from there on another certificate would hold.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ class Trial:
 
     Args:
         grounds: What it is held against.
-        changes: What its controller followed from which tick on, in order; the first is what it began with.
+        changes: What its controller followed from which tick on, in order; the first is what it began with, unless the
+            log lacks that.
         period: Time between ticks [s].
         damping: θ of the plant, if that is known [N·m·s/rad].
 
@@ -97,7 +99,9 @@ class Trial:
         self._period = period
         self._damping = damping
         self.damping_known = damping is not None
-        self._until = changes[1].tick if len(changes) > 1 else inf
+        # A log that begins within a session may lack what it began with.
+        later = changes[1:] if changes and changes[0].tick == 0 else changes
+        self._until = later[0].tick if later else inf
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=2 * BLOCK)
         self._untold = 0  # truths that do not say of which tick they are
         self._before: Ticks | None = None  # the last block: a truth may come a little late
