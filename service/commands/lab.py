@@ -160,7 +160,13 @@ def burden(
         typer.Option(metavar="OUT/IN", help="Bits of ε and ω, and of u, such as 8/6; repeated.", show_default=False),
     ] = None,
     quantizer: Annotated[
-        list[str] | None, typer.Option(metavar="KIND", help="A kind of quantizer; repeated.", show_default=False)
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
+            "the rest); repeated.",
+            show_default=False,
+        ),
     ] = None,
     sensors: Annotated[
         list[str] | None,
@@ -192,15 +198,14 @@ def burden(
         with count_bar("experiments", hidden=json) as update:
             return measure_burden(settings, cells, duration, update)
 
-    from service.lab.burden_figure import check_path, draw_burden
     from service.lab.burden_grid import grid
 
     if figure is not None:
+        from service.lab.burden_figure import check_path
+
         checked(lambda: check_path(figure))
     cells = checked(lambda: grid(settings, bits or (), quantizer or (), sensors or ()))
     result = guarded(run)
-    if figure is not None:
-        guarded(lambda: draw_burden(result, figure))
     if json:
         typer.echo(result.model_dump_json(indent=2))
     elif markdown:
@@ -211,3 +216,7 @@ def burden(
         from service.lab.burden_table import burden_table
 
         burden_table(result)
+    if figure is not None:  # last, so that a disk that is full costs no table
+        from service.lab.burden_figure import draw_burden
+
+        guarded(lambda: draw_burden(result, figure))

@@ -134,7 +134,8 @@ def measure_burden(
         progress: Called with experiments done and experiments in all.
 
     Raises:
-        BurdenError: Float64 itself does not keep the loop running, or a cell does not fit the configuration.
+        BurdenError: Float64 itself does not keep the loop running, or makes no error at all; or a cell does not fit the
+            configuration.
     """
     jobs = [(cell_settings(settings, cell).contract(), duration_s, cell.counted) for cell in cells]
     told = progress or (lambda _done, _total: None)
@@ -233,6 +234,8 @@ def _beside_float64(points: Sequence[Point], sensors: str) -> list[Point]:
     baseline = next(point for point in mine if point.is_baseline)
     if baseline.reason is not None:
         raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline.reason}")
+    if not (baseline.z_track and baseline.u_total):
+        raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing compares with that; let the body move")
     done = [point for point in mine if point.reason is None]
     front = pareto_front((_known(point.bits_per_s), _known(point.z_track)) for point in done)
     on_front = {id(point) for point, best in zip(done, front, strict=True) if best}

@@ -131,7 +131,7 @@ def _counted(burden: Burden, sensors: str) -> Iterator[str]:
     points = burden.under(sensors)
     when = {"periodic": "every tick", "on_change": "on change"}
     counted = [
-        f"{point.label} {when[point.transmit]} {rates.measurement / 1e3:.1f} + {rates.command / 1e3:.1f}"
+        f"{_name(point)} {when[point.transmit]} {rates.measurement / 1e3:.1f} + {rates.command / 1e3:.1f}"
         for point in points
         if (rates := point.zenoh_bytes_per_s) is not None
     ]
@@ -139,7 +139,11 @@ def _counted(burden: Burden, sensors: str) -> Iterator[str]:
         yield f"Counted on a Zenoh link, kB/s: {'; '.join(counted)}."
     for point in points:
         if point.reason is not None and point.transmit == "periodic":
-            yield f"{point.label} {point.quantizer}: {point.reason}."
+            yield f"{_name(point)}: {point.reason}."
+
+
+def _name(point: Point) -> str:
+    return f"{point.bits} {short_name(point.quantizer)}" if point.quantizer else "float64"
 
 
 def _notes(burden: Burden) -> Iterator[str]:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -14,10 +15,11 @@ from matplotlib.image import imread
 
 from service.cli import execute
 from service.config import load
-from service.lab.burden import Burden, pareto_front
+from service.lab.burden import Burden, measure_burden, pareto_front
 from service.lab.burden_figure import draw_burden
 from service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
 from service.lab.burden_table import HEADER, markdown
+from service.lab.workers import Workers
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
@@ -102,6 +104,27 @@ def test_what_there_is_not_is_refused_in_one_line_before_anything_runs(
     assert captured.out == ""
     assert len(captured.err.splitlines()) == 1
     assert names in captured.err
+
+
+class InThisProcess(Workers):
+    """Does the work itself."""
+
+    def __init__(self) -> None:
+        pass
+
+    def __exit__(self, *exception: object) -> None:
+        pass
+
+    def each(self, work: Any, jobs: Any, progress: Any = None) -> Any:
+        del progress
+        return [work(*job) for job in jobs]
+
+
+def test_where_float64_makes_no_error_there_is_nothing_to_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.lab.burden.Workers", InThisProcess)
+    still = load(overrides=["reference.kind=hold"])
+    with pytest.raises(BurdenError, match=r"^float64 makes no error, sensors perfect"):
+        measure_burden(still, grid(still, ["cont"], sensors=["perfect"]), 0.1)
 
 
 @pytest.fixture(scope="module")
