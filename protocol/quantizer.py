@@ -80,7 +80,7 @@ class Quantizer(ABC):
         """`decode` without its check, for codes that came out of a frame and so cannot be wrong."""
 
     def quantize(self, y: float) -> float:
-        """y^Q, the level nearest to y by the quantizer's definition; (C.15) applies it to each element of a vector."""
+        """y^Q, the level that the quantizer gives y; (C.15) applies it to each element of a vector."""
         return self.decode(self.encode(y))
 
 

@@ -8,7 +8,7 @@ Lemma 1 always are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
@@ -19,8 +19,6 @@ from service.config import Settings
 from service.law import LawSettings
 from service.theorem.certificate import Certificate, Evaluated, bounds_of, certify
 from service.theorem.extremes import BoundlessError
-
-GAINS: Final = ("C1", "C2", "Gamma")
 
 
 class Grounds(NamedTuple):

@@ -68,11 +68,6 @@ class Inequality:
         """Where it does not hold, but for what floats round. Shape (n,)."""
         return self.left > self.right * (1 + 1e-9) + 1e-12
 
-    @property
-    def closest(self) -> float:
-        """The largest left/right: how much of the bound is used; 0 without samples."""
-        return float(np.max(self.left / np.maximum(self.right, 1e-300), initial=0.0, where=self.left > 1e-12))
-
 
 @dataclass(frozen=True)
 class Coordinates:
