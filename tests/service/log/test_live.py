@@ -20,7 +20,7 @@ import pytest
 
 from plant_emulator.endpoint import Endpoint
 from protocol.attitude import Quaternion, angle, distance
-from protocol.messages import Claim, Event, Status, Telemetry
+from protocol.messages import Claim, Event, Status
 from protocol.network import NetworkSettings
 from protocol.role import Role
 from protocol.topics import key
@@ -30,6 +30,7 @@ from service.config import Settings, load
 from service.controller import Controller
 from service.log.decoded import SHAPES, Decoded
 from service.log.live import LiveError, Outlet, serve
+from service.telling import telemetry_of
 from tests.service.log.viewer import PATIENCE_S, Shown, Viewer, orientation
 
 NOW = 1_800_000_000_000_000_000
@@ -110,25 +111,11 @@ class Loop:
             assert command is not None
             self.errors[round(k * loop.period, 6)] = degrees(angle(*controller.attitude_error))
             commanded.put(command)
-            self._controller.publish("telemetry", told(controller))
+            self._controller.publish("telemetry", telemetry_of(controller, "s1"))
             if k % 20 == 0:
                 status = Status(role="plant", state="driven", uptime_s=1.0, ticks=k, rate_hz=200.0, skipped=0)
                 self._plant.publish("status", status)
             measurement, k = endpoint.tick(command, k + 1), k + 1
-
-
-def told(controller: Controller) -> Telemetry:
-    return Telemetry(
-        session="s1",
-        tick=controller.tick_index,
-        counter=controller.counter,
-        attitude_error=controller.attitude_error,
-        rate_error=controller.rate_error,
-        desired=controller.desired,
-        damping_estimate=controller.damping_estimate,
-        voltages=tuple(controller.voltages),
-        sign=controller.sign,
-    )
 
 
 def nearest_deg(shown: Shown, attitudes: list[Quaternion]) -> float:

@@ -14,6 +14,7 @@ from service.controller import Controller
 from service.figures import Figures
 from service.log.review import Session
 from service.log.ticks import Tick
+from service.telling import telemetry_of
 
 PERIOD_NS = 2_000_000
 START_NS = 1_800_000_000_000_000_000
@@ -42,17 +43,7 @@ def run() -> list[tuple[int, bytes, bytes, Telemetry]]:
         assert measurement is not None
         command = controller.tick(measurement, k)
         assert command is not None
-        telemetry = Telemetry(
-            session="loop",
-            tick=k,
-            counter=controller.counter,
-            attitude_error=controller.attitude_error,
-            rate_error=controller.rate_error,
-            desired=controller.desired,
-            damping_estimate=controller.damping_estimate,
-            voltages=tuple(controller.voltages),
-            sign=controller.sign,
-        )
+        telemetry = telemetry_of(controller, "loop")
         ticks.append((k, measurement, command, telemetry))
         measurement = endpoint.tick(command, k + 1)
     return ticks
