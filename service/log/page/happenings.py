@@ -118,6 +118,7 @@ def wire(reports: Sequence[Report]) -> Html:
         [
             *run_column(reports),
             ("Value", False),
+            ("Quantizer", False),
             ("Bits", True),
             ("Limit", True),
             ("At the outermost level [%]", True),
@@ -127,11 +128,13 @@ def wire(reports: Sequence[Report]) -> Html:
     return joined([first, second])
 
 
-def _quantizer(signal: dict[str, Any]) -> tuple[str, str]:
+def _quantizer(signal: dict[str, Any]) -> tuple[str, str, str]:
+    """Kind, bits, limit; a log of before there were kinds has the uniform one."""
     if not signal:
-        return "–", "–"
+        return "–", "–", "–"
     bits, limit = signal.get("bits"), signal.get("limit")
-    return "cont" if bits is None else str(bits), f"±{limit:g}" if isinstance(limit, int | float) else "–"
+    kind, bits = ("–", "cont") if bits is None else (signal.get("kind", "uniform"), str(bits))
+    return kind, bits, f"±{limit:g}" if isinstance(limit, int | float) else "–"
 
 
 def jump(time_s: float, run: int, what: str) -> Html:

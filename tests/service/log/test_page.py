@@ -99,6 +99,22 @@ def test_the_theorems_panels_stand_in_its_own_section_and_nowhere_else() -> None
     assert text.count('data-name="z_norm"') == 1
 
 
+def test_the_wire_is_told_with_each_signals_quantizer() -> None:
+    signals = {
+        "attitude": {"bits": 8, "limit": 1.0},  # of before there were kinds
+        "rate": {"bits": 10, "limit": 2.0, "kind": "hysteresis-uniform"},
+        "voltage": {"bits": None, "limit": 24.0, "kind": "logarithmic-uniform"},
+    }
+    texts = Texts(page([made_report(settings={"wire": signals})])).texts
+
+    def row(head: str) -> list[str]:
+        return texts[texts.index(head) :][1:4]
+
+    assert row("attitude ε") == ["uniform", "8", "±1"]
+    assert row("rate ω") == ["hysteresis-uniform", "10", "±2"]
+    assert row("voltage u") == ["–", "cont", "±24"]
+
+
 def test_what_could_not_be_read_is_told() -> None:
     damage = "a.mcap: cut at byte 1234"
     assert damage in Texts(page([made_report(damages=[damage])])).texts
