@@ -119,11 +119,13 @@ def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
         table.add_row(label, Text(f"— ({why})" if value is None else form(value)))
 
     table.add_row("the theorem", Text(found.verdict, style="" if found.holds else "bold red"))
-    since = f"since {found.transient_s:.3g} s"
+    since = f"since {found.since_s + found.transient_s:.3g} s"
     row(f"largest ‖z‖ {since}", "z_norm", lambda z: f"{z:.4f}{_beside(found.radius, '.4f')}")
     row(f"largest error {since}", "error_deg", lambda e: f"{e:.2f}°{_beside(found.radius_deg, '.2f', '°')}")
     if found.true_z_norm is not None and found.true_error_deg is not None:
         table.add_row("of the true state", f"‖z‖ {found.true_z_norm:.4f}, error {found.true_error_deg:.2f}°")
+    if found.since_s:
+        table.add_row("judged from", f"{found.since_s:g} s, when the reference had been reached")
     if found.until_s is not None:
         table.add_row("judged until", f"{found.until_s:g} s, where gains or reference changed")
     table.add_row("Lemma 1", Text(_lemma(findings, found), style="bold red" if found.broken else ""))

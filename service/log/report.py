@@ -91,6 +91,10 @@ class TheoremFindings(BaseModel):
     radius: float | None = Field(description="√(δ_Q/k), where ‖z‖ ends [1, rad/s]")
     radius_deg: float | None = Field(description="the attitude error that this allows [deg]")
     transient_s: float = Field(description="how long the transient is taken to last [s]")
+    since_s: float = Field(
+        description="judged from then on, on the law's clock: a session that begins far from its reference first goes "
+        "there [s]"
+    )
     until_s: float | None = Field(
         description="judged until gains or reference first changed, on the law's clock [s]; null: to the end"
     )

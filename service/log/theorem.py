@@ -3,15 +3,15 @@
 ‖z‖ and V are those that the controller computed, from quantized signals, at every tick; and the true ones at the ticks
 of which an emulator told the true state. A truth says which tick's measurement was taken of it, so nothing that is
 judged is interpolated. The transient lasts three times the law's slower time constant, by when an error has fallen to
-5 %. All is judged until gains or reference first change, by an operator or because the session begins far from its
-reference: from there on another certificate would hold.
+5 %. All is judged from when the reference is followed, which a session that begins far from it first goes to, until an
+operator first changes gains or reference: before and after, another certificate would hold.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from math import degrees, inf, nan
+from math import ceil, degrees, inf, nan
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -99,9 +99,7 @@ class Trial:
         self._period = period
         self._damping = damping
         self.damping_known = damping is not None
-        # A log that begins within a session may lack what it began with.
-        later = changes[1:] if changes and changes[0].tick == 0 else changes
-        self._until = later[0].tick if later else inf
+        self._since, self._until = _judged_ticks(changes, period)
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=2 * BLOCK)
         self._untold = 0  # truths that do not say of which tick they are
         self._before: Ticks | None = None  # the last block: a truth may come a little late
@@ -109,7 +107,7 @@ class Trial:
         self._tallies: dict[str, Tally] = {}
         self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
-        self._settled = transient(grounds.law) / period  # tick from which the transient is over
+        self._settled = self._since + transient(grounds.law) / period  # tick from which the transient is over
         self._seen: tuple[float, float] | None = None  # largest ‖z‖ and largest attitude error [rad] from then on
         self._true: tuple[float, float] | None = None  # the same of the true state
 
@@ -169,7 +167,7 @@ class Trial:
         q = samples.q * np.where((samples.q * samples.q_Q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
         b = coordinates(q, samples.omega, samples.q_d, inertial, at.sign, at.gain)
         theta_error = np.zeros((1, 3)) if self._damping is None else self._damping - at.damping_estimate
-        counts = at.k < self._until
+        counts = (at.k >= self._since) & (at.k < self._until)
         half_angle = np.arcsin(np.minimum(1.0, np.linalg.norm(b.eps_e, axis=1)))
         if (after := counts & (at.k >= self._settled)).any():
             self._true = _larger(self._true, b.norm[after], 2 * half_angle[after])
@@ -211,6 +209,7 @@ class Trial:
             radius=radius,
             radius_deg=None if radius is None or certificate is None else certificate.radius_deg,
             transient_s=transient(grounds.law),
+            since_s=round(self._since * self._period, 9),
             until_s=None if self._until == inf else round(self._until * self._period, 9),
             z_norm=seen and seen[0],
             z_norm_share=seen[0] / radius if seen and radius else None,
@@ -252,6 +251,17 @@ class Trial:
 def transient(law: LawSettings) -> float:
     """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, and z₂ by J⁻¹C₂ (C.22) [s]."""
     return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
+
+
+def _judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
+    """From which tick on, and until which, a session follows the reference and gains that it began with."""
+    if not changes or changes[0].tick:  # a log that begins within a session lacks what that began with
+        return 0, changes[0].tick if changes else inf
+    since, later = 0, list(changes[1:])
+    if later and later[0].start is not None:  # on the way there, which may be faster than the reference
+        way = later.pop(0)
+        since = way.tick + ceil((way.ease_s + way.within_s) / period)
+    return since, later[0].tick if later else inf
 
 
 def _larger(known: tuple[float, float] | None, norms: Array, angles: Array) -> tuple[float, float]:

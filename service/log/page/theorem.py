@@ -52,6 +52,7 @@ def _said(reports: Sequence[Report], index: int) -> Html:
     found = report.findings.theorem
     assert found is not None
     until = f" Judged until {found.until_s:g} s, where gains or reference changed." if found.until_s is not None else ""
+    since = f" Judged from {found.since_s:g} s, when the reference had been reached." if found.since_s else ""
     mood = "good" if found.holds else "bad"
     return tag(
         "div",
@@ -59,7 +60,7 @@ def _said(reports: Sequence[Report], index: int) -> Html:
         tag("p", tag("span", "✓" if found.holds else "✗", class_="sign", aria_hidden="true"), " ", found.verdict,
             class_=mood),
         tag("p", f"The transient is taken to last {found.transient_s:.3g} s, three times the law's slower "
-            f"time constant.{until} {judged(found)}", class_="quiet"),
+            f"time constant.{since}{until} {judged(found)}", class_="quiet"),
     )  # fmt: skip
 
 

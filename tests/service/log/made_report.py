@@ -116,6 +116,7 @@ def made_theorem(*, broken: int = 0) -> TheoremFindings:
         radius=0.2004,
         radius_deg=23.01,
         transient_s=2.0,
+        since_s=0.0,
         until_s=8.5,
         z_norm=0.0638,
         z_norm_share=0.0638 / 0.2004,

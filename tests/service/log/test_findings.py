@@ -203,8 +203,8 @@ KEYS = {
     "gaps", "gap_count", "saturated", "invalid", "losses", "marks", "theorem", "checks",
 }  # fmt: skip
 THEOREM_KEYS = {
-    "verdict", "holds", "radius", "radius_deg", "transient_s", "until_s", "z_norm", "z_norm_share", "error_deg",
-    "true_z_norm", "true_error_deg", "damping_known", "samples", "outside", "judged", "lemma", "broken",
+    "verdict", "holds", "radius", "radius_deg", "transient_s", "since_s", "until_s", "z_norm", "z_norm_share",
+    "error_deg", "true_z_norm", "true_error_deg", "damping_known", "samples", "outside", "judged", "lemma", "broken",
 }  # fmt: skip
 
 

@@ -78,6 +78,9 @@ def test_the_page_says_what_the_theorem_promises_and_which_inequality_was_broken
     assert {"0.0638", "0.2004", "(C.57)", "97.0"} <= set(texts)
     (judged,) = (text for text in texts if "belong to a tick" in text)
     assert "Judged until 8.5 s" in judged
+    assert "Judged from" not in judged
+    went = made_theorem().model_copy(update={"since_s": 2.1})
+    assert any("Judged from 2.1 s" in text for text in Texts(page([made_report(theorem=went)])).texts)
     assert "At 120 the sensors of the rate err by more than the quantizer, against (C.29)." in judged
     assert judged.endswith("Lemma 1 is judged by the other 380.")
     broken = page([made_report(theorem=made_theorem(broken=7))])

@@ -172,6 +172,25 @@ def test_a_log_that_lacks_what_its_session_began_with_is_judged_until_the_first_
     assert trial(first).findings()[0].until_s is None
 
 
+def test_a_session_that_begins_far_from_its_reference_is_judged_once_it_is_there() -> None:
+    began = Change(session=SESSION, tick=0, gains=Gains(C1=(12.0, 12.0, 12.0)), reference=Hold())
+    way = Change(session=SESSION, tick=3, reference=Hold(), within_s=1.0, start=(0.0, 10.0, 60.0))
+    operators = Change(session=SESSION, tick=12_000, gains=Gains(C1=(5.0, 5.0, 5.0)))
+    one = trial(began, way, operators)
+    for k in (502, 503):
+        one.truth(k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    one.ticks(block(0, 600))
+    found, reasons = one.findings()
+    assert (found.since_s, found.until_s, found.samples) == (1.006, 24.0, 1)
+    assert found.z_norm is None  # the transient begins then, too
+    assert "the transient lasts" in reasons["theorem.z_norm"]
+    settled = round((found.since_s + found.transient_s) / 0.002)
+    one.ticks(block(settled - 10, 10))
+    assert one.findings()[0].z_norm is None
+    one.ticks(block(settled, 10))
+    assert one.findings()[0].z_norm == 0
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [
