@@ -104,6 +104,10 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
             yield f"invalid {name}s", str(count)
     lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
     yield "messages lost", lost or "none that the recorder knows of"
+    if findings.lapses:
+        kinds = {"late": "late", "lost": "lost on the way", "missed": "times ticks missed"}
+        yield "heard otherwise", ", ".join(f"{findings.lapses[kind]} {text}" for kind, text in kinds.items()
+                                           if kind in findings.lapses)  # fmt: skip
     began = findings.started.replace("T", " ").replace("+00:00", " UTC")
     others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
     yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"

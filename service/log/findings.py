@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from protocol.messages import Lapse
 from protocol.verbs import Change
 from service.config import Settings
 from service.figures import Figures
@@ -22,6 +24,7 @@ def findings_of(
     observer: Observer,
     story: Story,
     changes: Sequence[Change],
+    lapses: Sequence[Lapse],
     sessions: int,
 ) -> Findings:
     """Everything that is known of a session.
@@ -33,6 +36,7 @@ def findings_of(
         observer: What was seen of it.
         story: What was told in the whole log.
         changes: What its controller followed from which tick on, in order.
+        lapses: Where it did not compute with the plant's levels.
         sessions: How many sessions the log has.
     """
     vehicle, session = which
@@ -58,6 +62,7 @@ def findings_of(
         saturated=observer.saturated,
         invalid=observer.invalid,
         losses=story.losses(vehicle),
+        lapses=Counter(lapse.kind for lapse in lapses),
         theorem=theorem,
         marks=story.marks(which, changes, settings.loop.period, observer.clock(AROUND_S)),
     )

@@ -20,6 +20,7 @@ UNITS: Final[dict[str, str]] = {
     "trips": "",
     "gap_count": "",
     "losses": "",
+    "lapses": "",
     "invalid": "",
     "damages": "",
     **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},

@@ -135,6 +135,10 @@ class Findings(Figures):
     )
     invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
     losses: dict[str, int] = Field(description="messages that the recorder knows it has lost, by topic")
+    lapses: dict[str, int] = Field(
+        description="where frames are sent on change: measurements that the controller had `late` or not at all "
+        "(`lost`), and times that it `missed` ticks"
+    )
     marks: list[Mark]
     theorem: TheoremFindings | None = None
     checks: list[Check] = Field(default_factory=list)

@@ -291,8 +291,8 @@ def read(
         one.finish()
     longest, story = max(run, key=lambda which: run[which].score.ticks), run.story
     figures = _figures(run[longest], story.statuses.get((longest[0], "plant")), files, story.trips)
-    changes, observer = files.changes.get(longest, ()), run[longest].observer
-    findings = findings_of(figures, longest, settings, observer, story, changes, len(run))
+    told, observer = (files.changes.get(longest, ()), files.lapses.get(longest, ())), run[longest].observer
+    findings = findings_of(figures, longest, settings, observer, story, *told, len(run))
     facts = facts_of(files, story, longest[0])
     return Review(figures, findings, run[longest], longest, name_of(paths), facts)
 

@@ -109,6 +109,7 @@ FIGURES: Final = (
     _Figure("saturated", "rate at its outermost level", "%", _saturated("rate")),
     _Figure("saturated", "voltage at its outermost level", "%", _saturated("voltage")),
     _Figure("invalid", "frames without a valid value", "", lambda f: _whole(sum(f.invalid.values()))),
+    _Figure("lapses", "late, lost or missed, as the controller tells", "", lambda f: _whole(sum(f.lapses.values()))),
     _Figure("losses", "messages the recorder lost", "", lambda f: _whole(sum(f.losses.values()))),
     _Figure("trips", "trips", "", lambda f: _whole(len(f.trips))),
     _Figure("theorem.radius", "‖z‖ that the theorem guarantees in the end", "", _theorem("radius", ".4f")),

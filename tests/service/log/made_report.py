@@ -87,6 +87,7 @@ def made_report(
         saturated={"attitude": 0.0, "rate": 0.013, "voltage": 0.0},
         invalid={"measurement": 0, "command": 2},
         losses={},
+        lapses={},
         marks=list(marks),
         checks=list(checks),
         theorem=theorem,

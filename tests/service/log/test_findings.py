@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.messages import Event, Loss
+from protocol.messages import Event, Lapse, Loss
 from service.cli import execute
 from service.config import load
 from service.log.display import sparkline
@@ -106,6 +106,19 @@ def test_in_lockstep_an_event_stands_between_the_ticks_that_it_came_between(tmp_
     assert mark.time_s == pytest.approx(400 * PERIOD_NS * 1e-9, abs=1e-5)
 
 
+def test_what_the_controller_heard_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:
+    lapses = [
+        Lapse(session="s1", kind="late", tick=100, ticks=1),
+        Lapse(session="s1", kind="missed", tick=200, ticks=3),
+        Lapse(session="s1", kind="late", tick=300, ticks=2),
+        Lapse(session="s2", kind="late", tick=300, ticks=2),  # of another session
+    ]
+    more = [told("lapse", lapse, START_NS + 1_000_000_000) for lapse in lapses]
+    findings = found(retell(whole, tmp_path / "a.mcap", more=more))
+    assert findings.lapses == {"late": 2, "missed": 1}
+    assert Limit.parse("lapses=2").broken(findings) == "lapses is 3, more than 2"
+
+
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
     def loss(key: str, count: int, at_s: float) -> Said:
         at = START_NS + round(at_s * 1e9)
@@ -200,7 +213,7 @@ def test_what_could_not_be_had_breaks_its_limit_and_says_why(whole: Path) -> Non
 KEYS = {
     "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
     "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
-    "gaps", "gap_count", "saturated", "invalid", "losses", "marks", "theorem", "checks",
+    "gaps", "gap_count", "saturated", "invalid", "losses", "lapses", "marks", "theorem", "checks",
 }  # fmt: skip
 THEOREM_KEYS = {
     "verdict", "holds", "radius", "radius_deg", "transient_s", "since_s", "until_s", "z_norm", "z_norm_share",
