@@ -47,15 +47,23 @@ def test_it_measures_at_its_rate_and_the_loop_tracks(hil: Hil) -> None:
 def test_the_first_measurement_of_a_session_has_counter_0_and_the_next_ones_count(hil: Hil) -> None:
     hil.start(settings=PATIENT)
     hil.run(0.5)
-    log, wire = hil.log, hil.settings.wire
-    counters = [
-        read[0]
-        for _, frame in log.messages("measurement")
-        if isinstance(frame, bytes) and (read := wire.measurement.unpack(frame)) is not None
+    log, wire, period_ns = hil.log, hil.settings.wire, hil.settings.loop.period_ns
+    measured = [
+        (at, counter)
+        for at, frame in log.messages("measurement")
+        if isinstance(frame, bytes) and (counter := wire.measurement.counter(frame)) is not None
     ]
-    assert counters[0] == 0
-    steps = [(after - before) % 16 for before, after in itertools.pairwise(counters)]
-    assert steps.count(1) > 0.9 * len(steps)  # the rest are ticks that the plant skipped
+    assert measured[0][1] == 0
+    pairs = list(itertools.pairwise(measured))
+    steps = [(after - before) % 16 for (_, before), (_, after) in pairs]
+    passed = [(after - before) / period_ns for (before, _), (after, _) in pairs]
+    # A plant end that a busy machine keeps waiting skips ticks, a fifth of them has been seen; its counter goes on with
+    # the time all the same. A step is the ticks that have passed, but for how late either frame was: a tick is taken up
+    # to a period late, and worse where a stall or a bridge comes between taking and publishing, which one pair in seven
+    # has shown. A counter that knew nothing of the time would be right in one pair of five.
+    assert steps.count(1) > len(steps) / 2
+    told_right = [abs((step - ticks + 8) % 16 - 8) < 1.5 for step, ticks in zip(steps, passed, strict=True)]
+    assert sum(told_right) > 0.6 * len(steps)
 
 
 def test_without_commands_it_trips_within_the_watchdog_and_says_why(hil: Hil) -> None:
