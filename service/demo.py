@@ -18,9 +18,9 @@ from protocol.messages import Status, Telemetry
 from service.bench import Bench, BenchError, free_rendezvous, private_bus
 from service.config import Settings
 from service.figures import Figures
-from service.log.review import review
-from service.log.rolling import parts
+from service.logs.review import review
 from service.payload import PayloadRate
+from service.recording.rolling import parts
 
 REFRESH_S = 0.1
 

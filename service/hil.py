@@ -26,7 +26,7 @@ from protocol.verbs import Advance, Answer, Ask, Inject, Message
 from service.bench import Bench, RoleName, free_rendezvous, private_bus
 from service.config import Settings, load
 from service.figures import Figures
-from service.log.review import review
+from service.logs.review import review
 
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
 PATIENCE_S: Final = 30.0

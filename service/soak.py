@@ -18,7 +18,7 @@ from protocol import topics
 from protocol.messages import Percentiles, Status
 from service.bench import Bench, BenchError, RoleName, free_rendezvous, private_bus
 from service.config import Settings
-from service.log.rolling import parts
+from service.recording.rolling import parts
 
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 WARM_UP: Final = 0.1

@@ -12,7 +12,7 @@ from service.commands.common import Json, checked, fail, guarded
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from service.log.report import Report
+    from service.logs.report import Report
 
 Html = Annotated[
     Path | None,
@@ -35,7 +35,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Lay several runs over each other: their figures side by side, and what differs in their configurations."""
-    from service.log.limits import Limit
+    from service.logs.limits import Limit
 
     if len(logs) < 2:
         fail("log compare takes two logs or more", 2)
@@ -43,7 +43,7 @@ def compare(
 
     def run() -> list[Report]:
         from service.display import share_bar
-        from service.log.compare import read_runs
+        from service.logs.compare import read_runs
 
         with share_bar("reading", hidden=json) as update:
             reports = read_runs(logs, limits, update)
@@ -52,12 +52,12 @@ def compare(
         return reports
 
     reports = guarded(run)
-    from service.log.compare import Comparison, broken_limits
+    from service.logs.compare import Comparison, broken_limits
 
     if json:
         typer.echo(Comparison.of(reports).model_dump_json(indent=2))
     else:
-        from service.log.side_by_side import comparison_tables
+        from service.logs.side_by_side import comparison_tables
 
         comparison_tables(reports)
     if broken := broken_limits(reports):
@@ -66,7 +66,7 @@ def compare(
 
 def write_html(reports: Sequence[Report], out: Path) -> None:
     """Write the page of some runs and say so. Raises AeroloopError if it cannot be written."""
-    from service.log.page.page import write_page
+    from service.logs.page.page import write_page
 
     write_page(reports, out)
     typer.echo(f"aeroloop: wrote {out}", err=True)

@@ -22,10 +22,10 @@ from service.commands.compare import Html, compare, write_html
 if TYPE_CHECKING:
     from threading import Event
 
-    from service.log.export import Exported
-    from service.log.recover import Recovery
-    from service.log.replay import SessionReplay
-    from service.log.report import Report
+    from service.logs.export import Exported
+    from service.logs.recover import Recovery
+    from service.logs.replay import SessionReplay
+    from service.logs.report import Report
 
 group = typer.Typer(no_args_is_help=True, help="What happened, from logs; and what happens.")
 
@@ -49,20 +49,20 @@ def review(
     json: Json = False,
 ) -> None:
     """Say everything that logs tell of a run, hold its figures to limits, draw the paper's figures."""
-    from service.log.limits import Limit
+    from service.logs.limits import Limit
 
     limits = checked(lambda: [Limit.parse(text) for text in require or []])
 
     def run() -> Report:
         from service.display import share_bar
-        from service.log.review import Kept, read
+        from service.logs.review import Kept, read
 
         kept = Kept()
         with share_bar("reading", hidden=json) as update:
             judged = read(*logs, watch=None if figures is None else kept.watch, progress=update)
         report = judged.report(limits)
         if figures is not None:
-            from service.log.plots import draw_figures, draw_theorem
+            from service.logs.plots import draw_figures, draw_theorem
 
             drawn = draw_figures(judged.session.settings, kept[judged.which], figures)
             for path in [*drawn, *draw_theorem(report, figures)]:
@@ -75,7 +75,7 @@ def review(
     if json:
         typer.echo(findings.model_dump_json(indent=2))
     else:
-        from service.log.display import review_account
+        from service.logs.display import review_account
 
         review_account(findings)
     broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
@@ -99,7 +99,7 @@ def replay(
 
     def run() -> list[SessionReplay]:
         from service.display import share_bar
-        from service.log.replay import replay
+        from service.logs.replay import replay
 
         with share_bar("replaying", hidden=json) as update:
             return replay(logs, overrides or [], update)
@@ -110,7 +110,7 @@ def replay(
 
         typer.echo(dumps([session.model_dump(mode="json") for session in replayed], indent=2))
     else:
-        from service.log.display import replay_table
+        from service.logs.display import replay_table
 
         replay_table(replayed)
     if not overrides and any(session.differing for session in replayed):
@@ -127,7 +127,7 @@ def recover(
 
     def run() -> Recovery:
         from service.display import share_bar
-        from service.log.recover import recover
+        from service.logs.recover import recover
 
         with share_bar("recovering", hidden=json) as update:
             return recover(broken, out, update)
@@ -158,7 +158,7 @@ def live(
         typer.echo(f"{vehicle} at {url} for Foxglove and Lichtblick, until ^C; `{layout}` prints a layout to import")
 
     def run(stop: Event) -> None:
-        from service.log.live import serve
+        from service.logs.live import serve
 
         serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
 
@@ -183,7 +183,7 @@ def export(
 
     def run() -> Exported:
         from service.display import share_bar
-        from service.log.export import export
+        from service.logs.export import export
 
         with share_bar("exporting", hidden=json) as update:
             return export(logs, to, out, session=session, progress=update)

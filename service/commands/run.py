@@ -221,12 +221,12 @@ def recorder(
     options = [f"recorder.path={dumps(str(log))}"] if log is not None else []
     settings, load = reloadable(config, [*(overrides or []), *options])
 
-    from service.log.intake import one_thread
+    from service.recording.intake import one_thread
 
     one_thread()
 
     def run(role: Role) -> None:
-        from service.log.recorder import Recorder
+        from service.recording.recorder import Recorder
         from service.reload import reload_on_hangup
 
         recorder = Recorder(role, settings.recorder)

@@ -54,7 +54,7 @@ def layout(
     """Print a layout for Foxglove or Lichtblick that shows a log, or `log live`: save it, and import the file there."""
     settings = settings_of(config, [*(overrides or []), *([f'vehicle="{vehicle}"'] if vehicle is not None else [])])
 
-    from service.log.layout import layout as describe
+    from service.logs.layout import layout as describe
 
     typer.echo(describe(settings.vehicle, settings.wire.actuators))
 

@@ -15,9 +15,9 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from service.config import load
-from service.log.replay import replay
-from service.log.review import review
-from tests.service.log.made_log import make_log
+from service.logs.replay import replay
+from service.logs.review import review
+from tests.service.logs.made_log import make_log
 
 ROUNDS = 3
 

@@ -26,7 +26,7 @@ from service.config import load
 from service.figures import Figures
 from service.hil import Hil, HilLog
 from service.lab.experiment import run_experiment
-from service.log.review import review
+from service.logs.review import review
 from tests.can.slcan_adapter import SlcanAdapter
 
 AEROLOOP: Final = [sys.executable, "-m", "service.cli"]

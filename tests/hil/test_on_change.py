@@ -17,8 +17,8 @@ from protocol.messages import Event, Loss, Status
 from service.cli import execute
 from service.figures import Figures
 from service.hil import Hil, HilLog
-from service.log.replay import replay
-from service.log.review import Kept, read, review
+from service.logs.replay import replay
+from service.logs.review import Kept, read, review
 from tests.hil.test_faults import PATIENT, SLACK_S, TOLD, WATCHDOG_S, last_command_ns, seconds_driven_after
 from tests.hil.test_operate import done
 from tests.hil.test_processes import FIGURES, aeroloop

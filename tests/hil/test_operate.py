@@ -19,7 +19,7 @@ from protocol.attitude import to_euler
 from protocol.messages import Event, Telemetry, Truth
 from protocol.verbs import Change, Setpoint
 from service.hil import Hil
-from service.log.review import Kept, read
+from service.logs.review import Kept, read
 from tests.hil.test_faults import PATIENT
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]

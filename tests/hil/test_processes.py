@@ -23,9 +23,9 @@ from protocol import topics
 from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
-from service.log.files import ReviewError
-from service.log.mcap_records import CHANNEL, Channel, records
-from service.log.review import review
+from service.logs.files import ReviewError
+from service.logs.mcap_records import CHANNEL, Channel, records
+from service.logs.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
 FIGURES = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command")

@@ -20,10 +20,10 @@ from protocol.messages import Loss, Status
 from service.bench import Bench, free_rendezvous
 from service.config import Settings, load
 from service.hil import Hil
-from service.log.files import LogFiles
-from service.log.mcap_records import CHANNEL, MESSAGE, Channel, Message, records
-from service.log.replay import replay
-from service.log.review import review
+from service.logs.files import LogFiles
+from service.logs.mcap_records import CHANNEL, MESSAGE, Channel, Message, records
+from service.logs.replay import replay
+from service.logs.review import review
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
 
 PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2}

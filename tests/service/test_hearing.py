@@ -17,7 +17,7 @@ from protocol.transmit import SILENCE, Sender
 from protocol.wire import WireSpec
 from service import hearing
 from service.hearing import Heard, Hearing
-from tests.service.log.silent_loop import LOOP, PERIOD_NS, START_NS, Wire, wire_of
+from tests.service.logs.silent_loop import LOOP, PERIOD_NS, START_NS, Wire, wire_of
 
 WIRE = wire_of("on_change", "on_change")
 DELAY_NS = 200_000

@@ -14,12 +14,12 @@ from service.cli import execute as run
 from service.config import ConfigError, Settings, load, load_over, with_bits
 from service.lab.cells import Cell, run_cell
 from service.lab.experiment import run_experiment
-from service.log.export import export
-from service.log.files import LogFiles
-from service.log.replay import SessionReplay, replay
-from service.log.review import read, review
+from service.logs.export import export
+from service.logs.files import LogFiles
+from service.logs.replay import SessionReplay, replay
+from service.logs.review import read, review
 from service.theorem.certificate import Certificate, certify
-from tests.service.log.made_log import AN_OPERATORS_WORDS, lockstep, make_log
+from tests.service.logs.made_log import AN_OPERATORS_WORDS, lockstep, make_log
 
 SIGNALS = ("attitude", "rate", "voltage")
 OTHERS = [kind for kind in get_args(Kind) if kind != "uniform"]

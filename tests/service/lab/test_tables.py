@@ -90,8 +90,8 @@ def test_the_papers_numbers_are_those_of_its_tables() -> None:
 
 def test_figures_of_the_paper_are_drawn_from_a_log_under_their_numbers(tmp_path: Path) -> None:
     from service.demo import run_demo
-    from service.log.plots import draw_figures
-    from service.log.review import Kept, read
+    from service.logs.plots import draw_figures
+    from service.logs.review import Kept, read
 
     for overrides, numbers in (
         (["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"], {"C.4", "C.5", "C.6"}),

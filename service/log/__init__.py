@@ -1,1 +1,0 @@
-"""The log: what records it, what reads it, and what it answers."""

@@ -1,0 +1,1 @@
+"""Logs: their files, the runs in them, replay, review and export."""

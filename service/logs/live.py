@@ -1,0 +1,182 @@
+"""What happens now, for Foxglove and Lichtblick: a WebSocket server of decoded topics.
+
+A process of its own that only listens. Frames and whatever else streams wait in rings of one, written by Zenoh's own
+threads, and are taken at a fixed pace: what comes between is never decoded. foxglove-sdk sends from threads of its own,
+and drops what a slow client does not take, so that it reaches neither the other clients nor the loop.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from threading import Event
+from time import time_ns
+from typing import Final
+
+import foxglove
+import zenoh
+from pydantic import ValidationError
+from zenoh.handlers import RingChannel
+
+from protocol import topics
+from protocol.errors import AeroloopError
+from protocol.links import published_ns
+from protocol.messages import Contract
+from protocol.network import NetworkSettings, join
+from service.logs.decoded import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder, topic_of
+from service.logs.schemas import Shape
+
+log: Final = logging.getLogger("aeroloop")
+
+KEPT: Final = 1024
+"""How many of what happens once may wait for the next turn."""
+CONTRACT_WAIT_S: Final = 5.0
+BACKLOG: Final = 256
+"""Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
+
+
+class LiveError(AeroloopError):
+    """The server cannot be started; one line that says why and what to do."""
+
+
+class Feed:
+    """What crosses the network about a vehicle, decoded.
+
+    Args:
+        session: An open session; it outlives the feed.
+        vehicle: Whose topics.
+    """
+
+    def __init__(self, session: zenoh.Session, vehicle: str) -> None:
+        self._session = session
+        self._vehicle = vehicle
+        self._decoder = Decoder(None)  # the pace at which it is asked bounds the rate
+        self._subscribers = {
+            session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
+            for names, room in ((UNLIMITED, KEPT), (LIMITED, 1))
+            for name in sorted(names)
+        }
+        tokens = topics.key("alive", vehicle)
+        self._tokens = session.liveliness().declare_subscriber(tokens, RingChannel(KEPT), history=True)
+        self._contracts: zenoh.handlers.Handler[zenoh.Reply] | None = None
+        self._ask()
+
+    def take(self) -> Iterator[Decoded]:
+        """What came since the last time: the newest of what streams, and all of what happens once. Never waits."""
+        while (token := self._tokens.try_recv()) is not None:
+            if token.kind == zenoh.SampleKind.PUT:
+                self._ask()
+        self._hear_contracts()
+        for subscriber, room in self._subscribers.items():
+            for _ in range(room):
+                if (sample := subscriber.try_recv()) is None:
+                    break
+                address = topics.read_key(str(sample.key_expr))
+                if address is not None:
+                    yield from self._decoder.take(address, sample.payload.to_bytes(), published_ns(sample, time_ns()))
+
+    def _ask(self) -> None:
+        """Ask every role for its contract; the answers are heard later."""
+        self._contracts = self._session.get(topics.key("contract", self._vehicle), timeout=CONTRACT_WAIT_S)
+
+    def _hear_contracts(self) -> None:
+        try:
+            while self._contracts is not None and (reply := self._contracts.try_recv()) is not None:
+                if reply.ok is not None:
+                    self._decoder.configure(Contract.model_validate_json(reply.ok.payload.to_bytes()))
+        except ValidationError:
+            log.warning("live: a role tells a contract of another version")
+        except zenoh.ZError:  # all have answered
+            self._contracts = None
+
+
+class Outlet:
+    """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
+
+    Args:
+        vehicle: Whose topics are there from the start.
+        address: Where it listens.
+        port: Its port; 0 for any free one.
+
+    Attributes:
+        url: Where clients find it.
+
+    Raises:
+        LiveError: It cannot listen there.
+    """
+
+    def __init__(self, vehicle: str, address: str, port: int) -> None:
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # who comes and goes, and how, is no news
+        self._context = foxglove.Context()
+        self._channels: dict[str, foxglove.Channel] = {}
+        for name, shape in SHAPES.items():
+            self._open(topic_of(vehicle, name), shape)
+        try:
+            self._server = foxglove.start_server(
+                name=f"aeroloop {vehicle}",
+                host=address,
+                port=port,
+                context=self._context,
+                message_backlog_size=BACKLOG,
+            )
+        except RuntimeError as error:
+            reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
+            where = f"{_host(address)}:{port}"
+            raise LiveError(f"cannot listen on {where}: {reason.lower()}; choose by --address and --port") from None
+        self.url = f"ws://{_host(address)}:{self._server.port}"
+
+    def __enter__(self) -> Outlet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.stop()
+        for channel in self._channels.values():
+            channel.close()
+
+    def send(self, message: Decoded) -> None:
+        """Hand a message to whoever wants its topic. Never waits."""
+        channel = self._channels.get(message.topic) or self._open(message.topic, message.shape)
+        channel.log(message.data, log_time=message.at_ns)
+
+    def _open(self, topic: str, shape: Shape) -> foxglove.Channel:
+        schema = foxglove.Schema(name=shape.name, encoding=shape.encoding, data=shape.schema)
+        channel = foxglove.Channel(topic, schema=schema, message_encoding=shape.message_encoding, context=self._context)
+        self._channels[topic] = channel
+        return channel
+
+
+def serve(
+    network: NetworkSettings,
+    vehicle: str,
+    stop: Event,
+    *,
+    address: str,
+    port: int,
+    rate_hz: float,
+    ready: Callable[[str], None],
+) -> None:
+    """Show a vehicle until told to stop.
+
+    Args:
+        network: Where to join.
+        vehicle: Whose topics.
+        stop: Set to end it.
+        address: Where to listen.
+        port: At which port; 0 for any free one.
+        rate_hz: How often what streams is taken, decoded and sent [Hz].
+        ready: Called with the URL once clients can connect.
+
+    Raises:
+        LiveError: The address or port cannot be listened on.
+        NetworkError: The network cannot be joined.
+    """
+    with Outlet(vehicle, address, port) as outlet, join(network) as session:
+        feed = Feed(session, vehicle)
+        ready(outlet.url)
+        while not stop.wait(1 / rate_hz):
+            for message in feed.take():
+                outlet.send(message)
+
+
+def _host(address: str) -> str:
+    return f"[{address}]" if ":" in address else address

@@ -1,0 +1,177 @@
+"""Files that a table is written into: Parquet, CSV, MATLAB.
+
+All have the same columns by the same names. Parquet has each column's unit and description in its field's metadata,
+and the configuration in the file's; a MATLAB file has them in the fields `units`, `descriptions` and `config` of its
+struct; CSV has a header row, and nothing else. Parquet and CSV are written batch by batch; scipy wants all of a MATLAB
+file in memory at once.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from protocol.errors import AeroloopError
+from service.logs.table import Array, Group, Rows
+
+MAT_LIMIT: Final = 2**31 - 1
+"""Bytes that a variable of a MATLAB v5 file may have."""
+
+MAT_NAME: Final = 63
+"""Characters that a field of a MATLAB struct may have."""
+
+_ARROW: Final = {
+    "double": pa.float64(),
+    "int64": pa.int64(),
+    "int8": pa.int8(),
+    "bool": pa.bool_(),
+    "text": pa.string(),
+}
+
+
+class ExportError(AeroloopError):
+    """A log cannot be exported; one line that says why."""
+
+
+class TableFile(ABC):
+    """A table on its way into a file.
+
+    Args:
+        path: Where; what is there is overwritten.
+        groups: The columns it has.
+        facts: What is to be known of it as a whole, such as `config`; JSON in the file.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+
+    @abstractmethod
+    def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None: ...
+
+    @abstractmethod
+    def write(self, rows: Rows) -> None:
+        """Append rows. Raises OSError."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write the end. Raises OSError, or ExportError if the format cannot hold that much."""
+
+
+class ArrowFile(TableFile):
+    """What Arrow writes, a batch at a time; a batch is a row group of a Parquet file."""
+
+    def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None:
+        self._groups = groups
+        self._schema = _schema(groups, facts)
+        self._writer = self._open(path, self._schema)
+
+    @abstractmethod
+    def _open(self, path: Path, schema: pa.Schema) -> Any:
+        """Arrow's writer."""
+
+    def write(self, rows: Rows) -> None:
+        """See `TableFile.write`."""
+        arrays = []
+        for group in self._groups:
+            # A row a column: Arrow takes only what is contiguous without copying it.
+            matrix = np.ascontiguousarray(group.of(rows).T)
+            missing = np.isnan(matrix) if matrix.dtype == np.float64 else None
+            for i, column in enumerate(group.columns):
+                values, gaps = matrix[i], None if missing is None or not missing[i].any() else missing[i]
+                if column.kind in ("bool", "int8"):
+                    values = (values if gaps is None else np.where(gaps, 0, values)).astype(column.kind)
+                arrays.append(pa.array(values, _ARROW[column.kind], mask=gaps))
+        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+
+    def close(self) -> None:
+        """See `TableFile.close`."""
+        self._writer.close()
+
+
+class ParquetFile(ArrowFile):
+    """See the module's docstring."""
+
+    def _open(self, path: Path, schema: pa.Schema) -> Any:
+        # A dictionary of doubles makes the file a third larger and its writing slower, quantized or not.
+        texts = [field.name for field in schema if field.type == pa.string()]
+        return pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
+
+
+class CsvFile(ArrowFile):
+    """By RFC 4180. A number has as many digits as give it again; nothing is where the log has nothing."""
+
+    def _open(self, path: Path, schema: pa.Schema) -> Any:
+        options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
+        return pyarrow.csv.CSVWriter(path, schema, write_options=options)
+
+
+class MatFile(TableFile):
+    """A struct `aeroloop`; each column is a column vector of doubles in it, with NaN where the log has nothing.
+
+    `published_ns` is int64, for a double does not hold it. `vehicle` and `session` are numbers, from 1, into the lists
+    `vehicles` and `sessions`.
+    """
+
+    def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None:
+        self._columns = [column for group in groups for column in group.columns]
+        assert all(len(column.name) <= MAT_NAME for column in self._columns)
+        self._path = path
+        self._groups = groups
+        self._facts = facts
+        self._batches: dict[str, list[Array]] = {column.name: [] for column in self._columns}
+        self._names: dict[str, dict[str, int]] = {c.name: {} for c in self._columns if c.kind == "text"}
+        self._bytes = 0
+
+    def write(self, rows: Rows) -> None:
+        """See `TableFile.write`."""
+        for group in self._groups:
+            matrix = group.of(rows)
+            for i, column in enumerate(group.columns):
+                values = matrix[:, i]
+                if column.kind == "text":
+                    names = self._names[column.name]
+                    values = np.array([names.setdefault(text, len(names) + 1) for text in values])
+                values = values.astype(np.int64 if column.name == "published_ns" else np.float64)
+                self._batches[column.name].append(values)
+                self._bytes += values.nbytes
+
+    def close(self) -> None:
+        """See `TableFile.close`."""
+        import scipy.io  # slow, and not for the others
+
+        if self._bytes > MAT_LIMIT:
+            raise ExportError(
+                f"a MATLAB file holds 2 GiB, and these rows take {self._bytes / 2**30:.1f} GiB; use --to parquet, "
+                "which MATLAB reads by parquetread"
+            )
+        struct: dict[str, Any] = {name: np.concatenate(batches) for name, batches in self._batches.items()}
+        struct |= {f"{name}s": np.array(list(names), dtype=object) for name, names in self._names.items()}
+        struct["units"] = {column.name: column.unit for column in self._columns}
+        struct["descriptions"] = {column.name: column.description for column in self._columns}
+        struct |= {name: json.dumps(fact) for name, fact in self._facts.items() if name not in struct}
+        with self._path.open("wb") as file:
+            scipy.io.savemat(file, {"aeroloop": struct}, long_field_names=True, oned_as="column")
+
+
+FILES: Final[dict[str, type[TableFile]]] = {"parquet": ParquetFile, "csv": CsvFile, "mat": MatFile}
+
+
+def _schema(groups: Sequence[Group], facts: dict[str, Any]) -> pa.Schema:
+    return pa.schema(
+        [
+            pa.field(
+                column.name, _ARROW[column.kind], metadata={"unit": column.unit, "description": column.description}
+            )
+            for group in groups
+            for column in group.columns
+        ],
+        metadata={f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()},
+    )

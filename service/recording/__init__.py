@@ -1,0 +1,1 @@
+"""Recording: the recorder process and the files that it writes."""

@@ -1,0 +1,174 @@
+"""One file of a log: raw messages on a channel per key, decoded ones beside them, and what is needed to read it alone.
+
+Messages gather in a chunk in memory. A chunk that is closed is compressed and goes to the disk whole: what cannot be
+written is taken back, stays in memory and can be tried again, so that a full disk never leaves half a record behind.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+from protocol import topics
+from protocol.host import versions
+from protocol.messages import model_of
+from service.logs.decoded import Decoded
+from service.logs.mcap_records import CHUNK_BYTES
+from service.logs.mcap_writer import McapWriter
+from service.logs.schemas import Shape, json_shape
+from service.recording.intake import Taken
+
+FRAME_ENCODING: Final = "x-aeroloop-frame"
+
+
+class _WholeChunks:
+    """A file that grows by what `commit` can write whole."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb", buffering=0)
+        self._pending = bytearray()
+        self.size = 0
+
+    def write(self, data: bytes) -> int:
+        self._pending += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self.size + len(self._pending)
+
+    def commit(self) -> None:
+        """Write what is pending to the disk itself, or leave the file as it was and raise OSError."""
+        if not self._pending:
+            return
+        try:
+            with memoryview(self._pending) as pending:
+                written = 0
+                while written < len(pending):
+                    written += os.pwrite(self._file.fileno(), pending[written:], self.size + written)
+            os.fdatasync(self._file.fileno())
+        except OSError:
+            with suppress(OSError):
+                self._file.truncate(self.size)
+            raise
+        self.size += len(self._pending)
+        self._pending.clear()
+
+    def stands_at(self, path: Path) -> bool:
+        try:
+            return os.path.samestat(path.stat(), os.fstat(self._file.fileno()))
+        except OSError:
+            return False
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class LogFile:
+    """An MCAP file that is being written.
+
+    Args:
+        path: A new file.
+
+    Attributes:
+        path: The same.
+
+    Raises:
+        OSError: It exists already, or cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._out = _WholeChunks(path)
+        self._channels: dict[str, int] = {}
+        self._shapes: dict[Shape, int] = {}
+        self._writer = McapWriter(self._out, library=f"aeroloop {versions()['aeroloop']}")
+
+    @property
+    def size(self) -> int:
+        """Bytes on the disk."""
+        return self._out.size
+
+    @property
+    def full(self) -> bool:
+        """Whether the chunk has grown as large as one should be."""
+        return self._writer.gathered >= CHUNK_BYTES
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the file is no longer where it was made: somebody has moved or removed it."""
+        return not self._out.stands_at(self.path)
+
+    def add(self, taken: Taken, sequence: int) -> None:
+        """Add a message to the chunk, under its key.
+
+        Args:
+            taken: The message.
+            sequence: Its number on its key, in this run.
+        """
+        channel = self._channels.get(taken.key)
+        if channel is None:
+            channel = self._channels[taken.key] = self._raw_channel(taken.key)
+        self._writer.add_message(channel, taken.arrived_ns, taken.published_ns, taken.payload, sequence)
+
+    def add_decoded(self, decoded: Decoded) -> None:
+        """Add what was made from a message, under a topic of its own; its log time is that message's publication."""
+        channel = self._channels.get(decoded.topic)
+        if channel is None:
+            shape = self._schema(decoded.shape)
+            channel = self._writer.register_channel(decoded.topic, decoded.shape.message_encoding, shape)
+            self._channels[decoded.topic] = channel
+        self._writer.add_message(channel, decoded.at_ns, decoded.at_ns, decoded.data)
+
+    def add_metadata(self, name: str, entries: dict[str, str]) -> None:
+        """Add a metadata record."""
+        self._writer.add_metadata(name, entries)
+
+    def attach_specification(self, at_ns: int) -> None:
+        """Attach the wire's specification, by which frames are read."""
+        text = files("protocol").joinpath("SPEC.md").read_bytes()
+        self._writer.add_attachment(at_ns, "protocol/SPEC.md", "text/markdown", text)
+
+    def commit(self) -> None:
+        """Close the chunk and write it. Raises OSError; what could not be written is written with the next."""
+        self._writer.close_chunk()
+        self._out.commit()
+
+    def end(self) -> None:
+        """Write the last chunk and the index, and close the file. After an OSError it can only be abandoned."""
+        self._writer.finish()
+        self._out.commit()
+        self._out.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is on the disk, without what was not written."""
+        self._out.close()
+
+    def remove(self) -> None:
+        """Close the file and remove it."""
+        self._out.close()
+        with suppress(OSError):
+            self.path.unlink()
+
+    def _raw_channel(self, key: str) -> int:
+        address = topics.read_key(key)
+        carries = address.topic.carries if address else "unknown"
+        shape = _raw_shape(address.topic) if address else None
+        encoding = {"frame": FRAME_ENCODING, "unknown": "application/octet-stream"}.get(carries, "json")
+        return self._writer.register_channel(key, encoding, self._schema(shape) if shape else 0)
+
+    def _schema(self, shape: Shape) -> int:
+        if shape not in self._shapes:
+            self._shapes[shape] = self._writer.register_schema(shape.name, shape.encoding, shape.schema)
+        return self._shapes[shape]
+
+
+def _raw_shape(topic: topics.Topic) -> Shape:
+    if topic.carries == "frame":
+        text = (
+            f"{topic.model} frame: bits as in the attachment protocol/SPEC.md, by the wire spec in the plant's contract"
+        )
+        return Shape(f"aeroloop.{topic.model}", FRAME_ENCODING, text.encode(), FRAME_ENCODING)
+    return json_shape(f"aeroloop.{topic.model}", model_of(topic))

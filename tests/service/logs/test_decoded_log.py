@@ -1,0 +1,49 @@
+"""A log with everything decoded has every raw message as it was, and nothing decoded twice."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from protocol import topics
+from service.config import load
+from service.logs.decoded import Decoder
+from service.logs.export import export
+from service.logs.files import LogFiles
+from service.logs.review import review
+from service.logs.table_files import ExportError
+from tests.service.logs.losing_log import SHORT, make_losing_log, read, write
+from tests.service.logs.made_log import VEHICLE
+
+
+def test_a_log_with_everything_decoded_has_every_raw_message_and_each_frame_decoded(tmp_path: Path) -> None:
+    """Also where the recorder has decoded some already: those are made again, not doubled."""
+    log = make_losing_log(tmp_path, load(overrides=["loop.lockstep=false"]))
+    contract = next(iter(LogFiles([log]).contracts.values()))
+    raw, rng = read(log), random.Random(3)
+    decoder = Decoder(rate_hz=10)
+    decoder.configure(contract)
+    recorded = [(message.topic, message.publish_time, message.data) for message in raw]
+    for message in raw:
+        address = topics.read_key(message.topic)
+        assert address is not None
+        recorded += [(d.topic, d.at_ns, d.data) for d in decoder.take(address, message.data, message.publish_time)]
+    rng.shuffle(recorded)
+    write(tmp_path / "recorded.mcap", recorded, contract.model_dump_json())
+    exported = export([tmp_path / "recorded.mcap"], "mcap", tmp_path / "out.mcap")
+    found = read(tmp_path / "out.mcap")
+    assert exported.rows == len(found)
+    assert sorted((m.topic, m.publish_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
+        (m.topic, m.publish_time, m.data) for m in raw
+    )
+    given = {m for m in read(tmp_path / "recorded.mcap") if m.topic.startswith("aeroloop/")}
+    assert given <= set(found)  # with their sequence and both times
+    for name, key in (("measurement", "measurement"), ("pose", "measurement"), ("command", "command")):
+        times = sorted(m.publish_time for m in raw if m.topic.endswith(f"/{key}"))
+        assert sorted(m.publish_time for m in found if m.topic == f"/{VEHICLE}/{name}") == times
+    assert LogFiles([tmp_path / "out.mcap"]).contracts == LogFiles([log]).contracts
+    assert review(tmp_path / "out.mcap").z_track == review(log).z_track
+    with pytest.raises(ExportError, match="--session"):
+        export([log], "mcap", tmp_path / "other.mcap", session=SHORT)

@@ -1,0 +1,308 @@
+"""What is exported is what was judged: the same ticks and numbers in every kind of file, and nothing invented."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+from collections.abc import Iterator
+from math import isnan, nan, radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+import scipy.io
+
+from protocol.attitude import to_euler
+from protocol.messages import Telemetry
+from protocol.wire import WireSpec
+from service.cli import execute
+from service.config import Settings, from_contract, load
+from service.logs import spool
+from service.logs.export import export
+from service.logs.files import LogFiles
+from service.logs.review import review
+from service.logs.table import Rows, euler_deg, groups, telemetry_fields, tick_fields, truth_fields
+from service.logs.table_files import ExportError, ParquetFile
+from tests.service.logs.losing_log import LOST, PERIOD_NS, SHORT, TICKS, TRUTHS, UNANSWERED, make_losing_log
+from tests.service.logs.made_log import SESSION, START_NS, VEHICLE
+
+
+@pytest.fixture(scope="module")
+def settings() -> Settings:
+    return load(overrides=["loop.lockstep=false"])
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory, settings: Settings) -> Path:
+    return make_losing_log(tmp_path_factory.mktemp("log"), settings)
+
+
+Table = dict[str, list[Any]]
+
+
+@pytest.fixture(scope="module")
+def parquet(log: Path) -> Table:
+    out = log.with_name("table.parquet")
+    export([log], "parquet", out)
+    table: Table = pyarrow.parquet.read_table(out).to_pydict()
+    return table
+
+
+def rows(table: Table) -> Iterator[dict[str, Any]]:
+    for values in zip(*table.values(), strict=True):
+        yield dict(zip(table, values, strict=True))
+
+
+def test_the_rows_sum_up_to_the_figures_of_the_review(log: Path, parquet: Table, settings: Settings) -> None:
+    """Both add the same 352 numbers, so they differ by rounding alone: by 352 times 1.1e-16 of the sum at the most."""
+    figures, period = review(log), settings.loop.period
+    all_rows = list(rows(parquet))
+    z_track = u_total = 0.0
+    for row, after in zip(all_rows, [*all_rows[1:], None], strict=True):
+        held = after["tick"] - row["tick"] if after else 1
+        z_track += sum(row[f"attitude_error_{axis}"] ** 2 for axis in "xyz") * held * period
+    answered = [row for row in all_rows if row["latency_us"] is not None]
+    longest = round(settings.plant.watchdog_s / period)
+    for row, after in zip(answered, [*answered[1:], None], strict=True):
+        held = min(longest, after["tick"] - row["tick"]) if after else 1
+        u_total += (row["voltage_2_V"] ** 2 + row["voltage_3_V"] ** 2) * held * period
+    assert z_track == pytest.approx(figures.z_track, rel=4e-14)
+    assert u_total == pytest.approx(figures.u_total, rel=4e-14)
+    assert max(parquet["error_angle_deg"]) == pytest.approx(figures.max_error_deg, rel=4e-14)
+
+
+def test_a_gap_stays_a_gap(parquet: Table) -> None:
+    ticks = [k for k in range(TICKS) if k not in LOST]
+    assert parquet["tick"] == ticks
+    assert parquet["time_s"] == [k * 0.002 for k in ticks]
+    assert parquet["published_ns"] == [START_NS + k * PERIOD_NS for k in ticks]
+
+
+def test_nothing_was_commanded_where_nothing_answered(parquet: Table) -> None:
+    for row in rows(parquet):
+        answered = row["tick"] not in UNANSWERED
+        assert row["latency_us"] == (300.0 if answered else None)
+        for name in ("voltage_2_V", "voltage_3_V", "saturated_voltage_2", "saturated_voltage_3"):
+            assert (row[name] is not None) == answered
+
+
+def test_truth_is_the_last_that_was_published_by_then(parquet: Table) -> None:
+    known = 0
+    for row in rows(parquet):
+        before = [i for i, at_ns in enumerate(TRUTHS) if at_ns <= row["published_ns"]]
+        if not before:
+            assert [row[name] for name in row if name.startswith("truth_")] == [None] * 13
+            continue
+        known += 1
+        assert row["truth_rate_x_rad_s"] == before[-1]
+        assert row["truth_age_s"] == pytest.approx((row["published_ns"] - TRUTHS[before[-1]]) * 1e-9, abs=1e-12)
+        assert (row["truth_q3"], row["truth_voltage_2_V"], row["truth_voltage_3_V"]) == (0.5, 1.0, -1.0)
+        assert row["truth_roll_deg"] == pytest.approx(90.0)
+    assert known == len(parquet["tick"]) - 21  # the first came a millisecond after tick 20
+
+
+def test_telemetry_stands_at_its_own_tick_and_nowhere_else(log: Path, parquet: Table) -> None:
+    told = {}
+    for _, payload, _ in LogFiles([log]).messages(("telemetry",)):
+        telemetry = Telemetry.model_validate_json(payload)
+        if telemetry.session == SESSION:
+            told[telemetry.tick] = telemetry
+    found = 0
+    for row in rows(parquet):
+        theta = tuple(row[f"damping_estimate_{axis}_Nms_rad"] for axis in "xyz")
+        volts = row["unquantized_voltage_2_V"], row["unquantized_voltage_3_V"]
+        if spoken := told.get(row["tick"]):
+            found += 1
+            assert (theta, volts, row["sign"]) == (spoken.damping_estimate, spoken.voltages, spoken.sign)
+            assert tuple(row[f"attitude_error_{axis}"] for axis in "xyz") == spoken.attitude_error
+        else:
+            assert (theta, volts, row["sign"]) == ((None,) * 3, (None,) * 2, None)
+    assert found == TICKS / 10 - 5  # of which five spoke of ticks that were lost
+
+
+def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, settings: Settings) -> None:
+    wire = settings.wire
+    assert wire.voltage.bits is not None
+    top = 2 ** (wire.voltage.bits - 1) - 1
+    codes = {}
+    for address, payload, published_ns in LogFiles([log]).messages(("command",)):
+        frame = wire.command.unpack(payload)
+        assert frame is not None
+        if address.session == SESSION:
+            codes[(published_ns - START_NS) // PERIOD_NS] = frame[1]
+    for motor in (0, 1):
+        found = dict(zip(parquet["tick"], parquet[f"saturated_voltage_{motor + 2}"], strict=True))
+        assert {k: flag for k, flag in found.items() if flag is not None} == {
+            k: abs(both[motor]) == top for k, both in codes.items()
+        }
+    assert any(parquet["saturated_voltage_3"])  # the first of them are
+    assert not any(parquet["saturated_rate_x"] + parquet["saturated_attitude_x"])
+
+
+def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded(tmp_path: Path) -> None:
+    wire = WireSpec(actuators=3)
+    top = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
+    with spool.Spool(tmp_path) as piles:
+        dtypes = [piles.pile(fields(3)).dtype for fields in (tick_fields, telemetry_fields, truth_fields)]
+    ticks, telemetry, truth = (np.zeros(3, dtype) for dtype in dtypes)
+    ticks["attitude"] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    ticks["rate"][0] = top["rate"], -top["rate"], 0.99 * top["rate"]
+    ticks["voltages"] = (top["voltage"], -top["voltage"], 0.0), (nan, nan, nan), (top["voltage"], 0.0, 0.0)
+    ticks["latency_ns"] = 1, 1, -1
+    rows = Rows(VEHICLE, SESSION, ticks, telemetry, truth)
+    found = {
+        column.name: list(values)
+        for group in groups(wire, 0.002)
+        for column, values in zip(group.columns, group.of(rows).T, strict=True)
+        if column.name.startswith("saturated")
+    }
+    np.testing.assert_equal(
+        found,
+        {
+            "saturated_attitude_x": [1, nan, 0],
+            "saturated_attitude_y": [1, nan, 0],
+            "saturated_attitude_z": [0, nan, 0],
+            "saturated_rate_x": [1, 0, 0],
+            "saturated_rate_y": [1, 0, 0],
+            "saturated_rate_z": [0, 0, 0],
+            "saturated_voltage_1": [1, nan, nan],
+            "saturated_voltage_2": [1, nan, nan],
+            "saturated_voltage_3": [0, nan, nan],
+        },
+    )
+
+
+def test_every_kind_of_file_says_the_same(log: Path, tmp_path: Path, parquet: Table) -> None:
+    """To the last bit, nulls included."""
+    export([log], "csv", tmp_path / "table.csv")
+    export([log], "mat", tmp_path / "table.mat")
+    text = (tmp_path / "table.csv").read_bytes().decode()
+    assert text.count("\r\n") == text.count("\n") == len(parquet["tick"]) + 1  # RFC 4180
+    names, *lines = csv.reader(text.splitlines(), strict=True)
+    matlab = scipy.io.loadmat(tmp_path / "table.mat", simplify_cells=True)["aeroloop"]
+    assert names == list(parquet)
+    assert set(matlab) - set(parquet) == {
+        "vehicles", "sessions", "units", "descriptions", "config", "logs", "recorded_by", "exported_by",
+    }  # fmt: skip
+    for i, name in enumerate(names):
+        assert len(name) <= 63
+        column, expected = [line[i] for line in lines], parquet[name]
+        if name in ("vehicle", "session"):
+            assert column == expected
+            assert [np.atleast_1d(matlab[f"{name}s"])[int(n) - 1] for n in matlab[name]] == expected
+            continue
+        numbers = [nan if value is None else value for value in expected]
+        words = {"": nan, "true": 1, "false": 0}
+        exact = int if name in ("tick", "published_ns") else float
+        read_back = [words[cell] if cell in words else exact(cell) for cell in column]
+        assert [n for n in read_back if n == n] == [n for n in numbers if n == n]
+        assert [isnan(n) for n in read_back] == [isnan(n) for n in numbers]
+        assert matlab[name].dtype == (np.int64 if name == "published_ns" else np.float64)
+        np.testing.assert_array_equal(matlab[name], np.array(numbers, dtype=matlab[name].dtype))
+
+
+def test_every_column_tells_its_unit_and_the_file_its_configuration(
+    log: Path, tmp_path: Path, settings: Settings
+) -> None:
+    export([log], "parquet", tmp_path / "a.parquet")
+    export([log], "mat", tmp_path / "a.mat")
+    schema = pyarrow.parquet.read_schema(tmp_path / "a.parquet")
+    matlab = scipy.io.loadmat(tmp_path / "a.mat", simplify_cells=True)["aeroloop"]
+    endings = {
+        "_rad_s": "rad/s",
+        "_Nms_rad": "N·m·s/rad",
+        "_deg": "deg",
+        "_ns": "ns",
+        "_us": "µs",
+        "_s": "s",
+        "_V": "V",
+    }
+    for field in schema:
+        unit, description = field.metadata[b"unit"].decode(), field.metadata[b"description"].decode()
+        expected = next((unit for ending, unit in endings.items() if field.name.endswith(ending)), None)
+        assert unit == expected if expected else unit in ("", "1"), field.name
+        assert len(description) > 5
+        assert "".join(matlab["units"][field.name]) == unit  # of an empty text scipy makes an empty array
+        assert matlab["descriptions"][field.name] == description
+    facts = {key.decode(): json.loads(value) for key, value in schema.metadata.items() if key.startswith(b"aeroloop.")}
+    assert from_contract(facts["aeroloop.config"]).contract() == settings.contract()
+    assert json.loads(matlab["config"]) == facts["aeroloop.config"]
+    assert facts["aeroloop.sessions"] == [f"{VEHICLE}/{SESSION}"]
+    assert facts["aeroloop.exported_by"]["aeroloop"]
+
+
+def test_roll_pitch_and_yaw_are_the_protocols() -> None:
+    rng = np.random.default_rng(1)
+    q = rng.normal(size=(200, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    q[0] = np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0  # nose up
+    expected = np.array([to_euler(tuple(row)) for row in q])
+    np.testing.assert_allclose(np.radians(euler_deg(q)), expected, rtol=0, atol=1e-12)
+    assert radians(90) == pytest.approx(expected[0, 1])
+
+
+def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Path, tmp_path: Path) -> None:
+    def ticks(session: str | None) -> list[tuple[str, int]]:
+        out = tmp_path / f"{session}.parquet".replace("/", "-")
+        exported = export([log], "parquet", out, session=session)
+        table = pyarrow.parquet.read_table(out, columns=["session", "tick"]).to_pydict()
+        assert exported.rows == len(table["tick"])
+        return list(zip(table["session"], table["tick"], strict=True))
+
+    first = [(SESSION, k) for k in range(TICKS) if k not in LOST]
+    second = [(SHORT, k) for k in range(50)]
+    assert ticks(None) == first
+    assert ticks(SHORT) == ticks(f"{VEHICLE}/{SHORT}") == second
+    assert ticks("all") == first + second
+    with pytest.raises(ExportError, match=f"{VEHICLE}/{SHORT}"):  # says what there is
+        ticks("none")
+
+
+def test_the_table_does_not_depend_on_how_it_is_cut_into_blocks(
+    log: Path, tmp_path: Path, parquet: Table, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for size in (5, 64):
+        monkeypatch.setattr(spool, "BLOCK_ROWS", size)
+        export([log], "parquet", tmp_path / f"{size}.parquet")
+        assert pyarrow.parquet.read_table(tmp_path / f"{size}.parquet").to_pydict() == parquet
+
+
+def test_what_stands_in_the_way_is_told_in_one_line_and_nothing_is_left_behind(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there.csv").write_text("mine")
+    (tmp_path / "text.mcap").write_text("hello")
+    before = sorted(tmp_path.iterdir())
+    for source, to, out, says in (
+        (log, "csv", tmp_path / "there.csv", "exists already"),
+        (log, "csv", tmp_path / "no" / "a.csv", "No such file"),
+        (log, "mcap", tmp_path / "no" / "a.mcap", "No such file"),
+        (tmp_path / "text.mcap", "mat", tmp_path / "a.mat", "text.mcap"),
+        (tmp_path / "text.mcap", "mcap", tmp_path / "a.mcap", "text.mcap"),
+    ):
+        assert execute(["log", "export", str(source), "--to", to, "--out", str(out)]) == 1
+        told = capfd.readouterr()
+        assert told.out == ""
+        assert len(told.err.splitlines()) == 1
+        assert says in told.err
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ParquetFile, "write", full)
+    with pytest.raises(ExportError, match="No space left"):
+        export([log], "parquet", tmp_path / "a.parquet")
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "there.csv").read_text() == "mine"
+
+
+def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for to, name in (("csv", "log.csv"), ("mcap", "log-decoded.mcap")):
+        assert execute(["log", "export", str(log), "--to", to, "--json"]) == 0
+        told = json.loads(capfd.readouterr().out)
+        out = Path(told["out"])
+        assert (out, told["bytes"]) == (log.with_name(name), out.stat().st_size)
+        out.unlink()

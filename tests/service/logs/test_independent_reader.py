@@ -1,0 +1,206 @@
+"""What is written here, a reader that was not written here reads: all of it, from the front and by the index.
+
+The reader is Foxglove's own, in tests/readers. It checks every checksum, and gives up on what is not whole.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from mcap.reader import make_reader
+
+from service.recording import rolling
+from service.logs.export import export
+from service.recording.intake import Taken
+from service.logs.mcap_records import CHANNEL, CHUNK, MESSAGE, Channel, Message, records
+from service.logs.recover import RecoverError, recover
+from service.settings import RecorderSettings
+from tests.service.logs.made_log import make_log
+
+READERS = Path(__file__).parents[2] / "readers"
+INSTALL = "npm install --no-package-lock --prefix tests/readers"
+TICKS = 400
+
+
+class Count(NamedTuple):
+    """Messages of a topic, with the first and the last log time [ns]."""
+
+    messages: int
+    content: int
+    first_ns: int
+    last_ns: int
+
+
+Counts = dict[str, Count]
+Reader = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="session")
+def reader() -> Reader:
+    """Runs the independent reader over some files."""
+    node = shutil.which("node")
+    if node is None or not (READERS / "node_modules").is_dir():
+        reason = f"no independent reader: install Node.js, then run `{INSTALL}`"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+    def run(*paths: Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [node, READERS / "count.mjs", *paths], capture_output=True, text=True, check=False, timeout=60
+        )
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("log") / "whole.mcap"
+    make_log(path, TICKS, chunk_every=50)
+    return path
+
+
+def ours(path: Path) -> Counts:
+    """What our own reader finds."""
+    channels: dict[int, str] = {}
+    counts: Counts = {}
+    for record in records(path):
+        if record.opcode == CHANNEL:
+            channel = Channel.read(record.content)
+            channels[channel.id] = channel.topic
+        elif record.opcode == MESSAGE:
+            message = Message.read(record.content)
+            topic, at_ns = channels[message.channel], message.log_time
+            known = counts.get(topic, Count(0, 0, at_ns, at_ns))
+            counts[topic] = Count(
+                known.messages + 1,
+                known.content + len(message.data),
+                min(known.first_ns, at_ns),
+                max(known.last_ns, at_ns),
+            )
+    return counts
+
+
+def theirs(told: dict[str, Any]) -> Counts:
+    return {
+        topic: Count(count["count"], count["bytes"], int(count["first"]), int(count["last"]))
+        for topic, count in told.items()
+    }
+
+
+def assert_all_read(reader: Reader, *paths: Path) -> None:
+    done = reader(*paths)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    for path in paths:
+        mine = ours(path)
+        assert mine
+        assert theirs(told[str(path)]["stream"]) == mine
+        assert theirs(told[str(path)]["index"]) == mine
+
+
+def with_a_damaged_chunk(whole: Path, out: Path) -> Path:
+    data = bytearray(whole.read_bytes())
+    chunks = []
+    at = 8
+    while at < len(data) - 8:
+        length = int.from_bytes(data[at + 1 : at + 9], "little")
+        if data[at] == CHUNK:
+            chunks.append((at + 9, length))
+        at += 9 + length
+    start, length = chunks[len(chunks) // 2]
+    data[start + length // 2] ^= 0x55
+    out.write_bytes(data)
+    return out
+
+
+def test_a_recorded_log(reader: Reader, whole: Path) -> None:
+    assert_all_read(reader, whole)
+    assert ours(whole)["aeroloop/aero/s1/measurement"].messages == TICKS
+
+
+def test_the_log_of_a_real_run(reader: Reader, tmp_path: Path) -> None:
+    """Three processes over Zenoh, in lockstep, so it takes as long as it takes and nothing is late."""
+    log = tmp_path / "demo.mcap"
+    command = ["demo", "--lockstep", "--duration", "1", "--json", "--log", str(log)]
+    done = subprocess.run(
+        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert_all_read(reader, log)
+    frames = [count.messages for topic, count in ours(log).items() if re.fullmatch("aeroloop/.*/measurement", topic)]
+    assert sum(frames) >= json.loads(done.stdout)["duration_s"] * 500
+
+
+def test_the_files_of_a_rotated_run(
+    reader: Reader, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them alone, and together as many messages as were recorded."""
+    monkeypatch.setattr(rolling, "LOOK_S", 0.0)
+    settings = RecorderSettings(path=tmp_path / "run.mcap", chunk_s=1e-9, max_file_mb=0.01)
+    log = rolling.RollingLog(settings, lambda text, _: pytest.fail(text))
+    with whole.open("rb") as file:
+        for i, (_, channel, message) in enumerate(make_reader(file).iter_messages()):
+            log.add(Taken(channel.topic, message.data, message.publish_time, message.log_time), [])
+            if i % 50 == 49:
+                log.tend()
+    log.close()
+    files = sorted(tmp_path.glob("run*.mcap"))
+    assert len(files) > 3
+    assert_all_read(reader, *files)
+    recorded = ours(whole)
+    together = {topic: sum(ours(path)[topic].messages for path in files if topic in ours(path)) for topic in recorded}
+    assert together == {topic: count.messages for topic, count in recorded.items()}
+
+
+def test_what_was_recovered_of_a_log_cut_anywhere_and_of_a_damaged_one(
+    reader: Reader, whole: Path, tmp_path: Path
+) -> None:
+    data, rng = whole.read_bytes(), random.Random(7)
+    broken = [tmp_path / f"cut-{i}.mcap" for i in range(10)]
+    for i, path in enumerate(broken):  # a tenth each, so that some are short and some almost whole
+        path.write_bytes(data[: (i * len(data) + rng.randrange(len(data))) // 10])
+    broken.append(with_a_damaged_chunk(whole, tmp_path / "damaged.mcap"))
+    recovered = []
+    for path in broken:
+        out = path.with_suffix(".recovered.mcap")
+        try:
+            recover(path, out)
+            recovered.append(out)
+        except RecoverError:
+            continue  # cut before the end of the first chunk
+    assert len(recovered) >= len(broken) - 3
+    assert_all_read(reader, *recovered)
+
+
+def test_an_exported_log(reader: Reader, whole: Path, tmp_path: Path) -> None:
+    export([whole], "mcap", tmp_path / "decoded.mcap")
+    assert_all_read(reader, tmp_path / "decoded.mcap")
+
+
+def test_the_reader_turns_away_what_is_not_whole(reader: Reader, whole: Path, tmp_path: Path) -> None:
+    """Otherwise the tests above would say nothing."""
+    damaged = with_a_damaged_chunk(whole, tmp_path / "damaged.mcap")
+    (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[:-20])
+    for path in (damaged, tmp_path / "cut.mcap"):
+        done = reader(path)
+        assert done.returncode == 1
+        assert str(path) in done.stderr
+        assert done.stdout == ""
+
+
+def test_its_versions_are_exact_and_it_names_no_registry() -> None:
+    package = json.loads((READERS / "package.json").read_text())
+    for versions in (package["dependencies"], package["overrides"]):
+        assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in versions.values())
+    assert "//" not in (READERS / "package.json").read_text()

@@ -1,0 +1,109 @@
+"""What is whole in a broken log is recovered, told, and read by a reader that is not ours."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from mcap.reader import make_reader
+
+from service.logs.recover import RecoverError, recover
+from service.logs.review import review
+from tests.service.logs.made_log import make_log
+
+TICKS = 400
+
+
+class Read(NamedTuple):
+    """A message as the mcap package's reader, by the index, has it."""
+
+    topic: str
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+def read(path: Path) -> list[Read]:
+    with path.open("rb") as file:
+        return [
+            Read(channel.topic, message.sequence, message.log_time, message.publish_time, message.data)
+            for _, channel, message in make_reader(file).iter_messages(log_time_order=False)
+        ]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("log") / "whole.mcap"
+    make_log(path, TICKS, chunk_every=50)
+    return path
+
+
+def test_a_whole_log_is_recovered_whole(whole: Path, tmp_path: Path) -> None:
+    recovery = recover(whole, tmp_path / "out.mcap")
+    assert recovery.lost == []
+    assert read(tmp_path / "out.mcap") == read(whole)
+    assert review(tmp_path / "out.mcap").z_track == review(whole).z_track
+
+
+def test_a_log_cut_at_any_byte_gives_every_whole_chunk_before_it_to_an_independent_reader(
+    whole: Path, tmp_path: Path
+) -> None:
+    data, everything = whole.read_bytes(), read(whole)
+    rng = random.Random(2)
+    broken = tmp_path / "broken.mcap"
+    lengths = []
+    for n, size in enumerate(sorted(rng.randrange(len(data)) for _ in range(300))):
+        broken.write_bytes(data[:size])
+        out = tmp_path / f"{n}.mcap"
+        try:
+            recovery = recover(broken, out)
+        except RecoverError:
+            assert not out.exists()
+            lengths.append(0)
+            continue
+        got = read(out)
+        assert got == everything[: len(got)]
+        assert recovery.messages == len(got)
+        assert recovery.lost or got == everything  # cut behind the last message, within the index
+        lengths.append(len(got))
+    assert lengths == sorted(lengths)  # the later the cut, the more
+    assert lengths[-1] > 0.8 * len(everything)
+    assert len(set(lengths)) >= TICKS // 50  # chunk by chunk
+
+
+@pytest.mark.parametrize("which", range(8))
+def test_a_damaged_chunk_costs_its_own_messages_and_no_others(whole: Path, tmp_path: Path, which: int) -> None:
+    """Also the first one, where the channels stand: the file's end repeats them."""
+    data, everything = bytearray(whole.read_bytes()), read(whole)
+    chunks = []
+    at = 8
+    while at < len(data) - 8:
+        opcode, length = data[at], int.from_bytes(data[at + 1 : at + 9], "little")
+        if opcode == 0x06:
+            chunks.append((at + 9, length))
+        at += 9 + length
+    start, length = chunks[which]
+    data[start + length // 2] ^= 0x55
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(data)
+    recovery = recover(broken, tmp_path / "out.mcap")
+    assert len(recovery.lost) == 1
+    got = read(tmp_path / "out.mcap")
+    assert set(got) < set(everything)
+    lost = [message for message in everything if message not in set(got)]
+    assert len(lost) < 1.5 * len(everything) / len(chunks)
+    first = everything.index(lost[0])
+    assert everything[first : first + len(lost)] == lost  # in one piece
+
+
+def test_what_is_no_log_or_stands_in_the_way_is_told_in_one_line(whole: Path, tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("hello")
+    for broken, out in ((tmp_path / "text.mcap", tmp_path / "a"), (tmp_path / "none.mcap", tmp_path / "b")):
+        with pytest.raises(RecoverError) as refused:
+            recover(broken, out)
+        assert len(str(refused.value).splitlines()) == 1
+    with pytest.raises(RecoverError, match="exists already"):
+        recover(whole, whole)

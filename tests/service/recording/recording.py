@@ -1,0 +1,164 @@
+"""A recording without network and clock: a session's messages, a RollingLog fed with them, a disk that fails when told.
+
+The fixtures are in conftest.py.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from mcap.reader import make_reader
+
+from protocol import topics
+from protocol.messages import Contract
+from service.logs.decoded import Decoded, Decoder
+from service.recording import log_file as writer
+from service.recording import rolling
+from service.recording.intake import Taken
+from service.recording.rolling import RollingLog
+from service.settings import RecorderSettings
+
+TICK_S = 0.002
+EVERYTHING = 1 << 60
+
+
+class Story(NamedTuple):
+    """A session's messages as they came, and its contract."""
+
+    key: str
+    contract: bytes
+    messages: list[Taken]
+
+
+class Clock:
+    """What `time.monotonic()` says, in s."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.logs: list[RollingLog] = []  # that run by it
+
+
+class Disk:
+    """Where files are written, which fails when told to.
+
+    Attributes:
+        room: Bytes that a file can hold.
+        at_once: Bytes that one call writes at the most.
+        broken: An error that every write gives; 0: none.
+        new_files: An error that a new file gives; 0: none.
+        changes: Called before each write with where in its file it goes, to change any of these.
+        writes: How often something was to be written.
+    """
+
+    def __init__(self) -> None:
+        self.room = self.at_once = EVERYTHING
+        self.broken = self.new_files = self.writes = 0
+        self.changes: Callable[[int], None] = lambda _: None
+
+    def write(self, fd: int, data: memoryview, offset: int) -> int:
+        self.writes += 1
+        self.changes(offset)
+        if self.broken:
+            raise OSError(self.broken, os.strerror(self.broken))
+        size = min(len(data), self.at_once, self.room - offset)
+        if size <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self._write(fd, data[:size], offset)
+
+    def install(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._write = os.pwrite
+        make = writer.LogFile
+
+        def made(path: Path) -> writer.LogFile:
+            if self.new_files:
+                raise OSError(self.new_files, os.strerror(self.new_files))
+            return make(path)
+
+        monkeypatch.setattr(os, "pwrite", self.write)
+        monkeypatch.setattr(os, "fdatasync", lambda _: None)
+        monkeypatch.setattr(rolling, "LogFile", made)
+
+
+class Recording:
+    """A RollingLog, fed as the recorder feeds it: what the disk refuses waits, and a message takes a millisecond.
+
+    Attributes:
+        told: What it told, and whether it was bad news.
+    """
+
+    def __init__(self, clock: Clock, story: Story, **settings: object) -> None:
+        self.told: list[tuple[str, bool]] = []
+        self._clock = clock
+        self.waiting: list[Taken] = []
+        self.log = RollingLog(RecorderSettings.model_validate(settings), lambda *told: self.told.append(told))
+        clock.logs.append(self.log)
+        self.log.add_contract(story.key, story.contract)
+        self._decoder = Decoder(25.0)
+        self._decoder.configure(Contract.model_validate_json(story.contract))
+
+    def take(self, messages: list[Taken]) -> None:
+        for taken in messages:
+            self.waiting.append(taken)
+            while self.waiting and self.log.writable:
+                self._add(self.waiting.pop(0))
+            self._clock.now += TICK_S / 2
+            self.log.tend()
+
+    def _add(self, taken: Taken) -> None:
+        address = topics.read_key(taken.key)
+        assert address is not None
+        if address.topic.name == "change":
+            self.log.add_change(taken)
+        decoded: list[Decoded] = self._decoder.take(address, taken.payload, taken.published_ns)
+        self.log.add(taken, decoded)
+
+    def wait(self, seconds: float) -> None:
+        """Nothing comes for so long."""
+        self._clock.now += seconds
+        self.take([])
+        self.log.tend()
+        while self.waiting and self.log.writable:
+            self._add(self.waiting.pop(0))
+
+    def told_bad(self) -> list[str]:
+        return [text for text, bad in self.told if bad]
+
+
+def in_order(folder: Path) -> list[Path]:
+    """The files of a run, by their numbers."""
+    return sorted(folder.glob("*.mcap"), key=lambda path: (len(path.stem), path.stem))
+
+
+def raw(path: Path) -> Iterator[tuple[str, int, int, int, bytes]]:
+    """Raw messages by mcap's own reader, which wants the index; checksums checked."""
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            if not channel.topic.startswith("/"):
+                yield channel.topic, message.sequence, message.log_time, message.publish_time, message.data
+
+
+def decoded_count(paths: list[Path]) -> int:
+    count = 0
+    for path in paths:
+        with path.open("rb") as file:
+            count += sum(channel.topic.startswith("/") for _, channel, _ in make_reader(file).iter_messages())
+    return count
+
+
+def numbered(messages: list[Taken]) -> list[tuple[str, int, int, int, bytes]]:
+    """Messages as they must stand in the log: numbered by key from 1, over all files, in order of their log times."""
+    sequences: dict[str, int] = {}
+    found = []
+    for taken in messages:
+        sequences[taken.key] = sequences.get(taken.key, 0) + 1
+        found.append((taken.key, sequences[taken.key], taken.arrived_ns, taken.published_ns, taken.payload))
+    return sorted(found, key=lambda one: one[2])
+
+
+def every_message(paths: list[Path]) -> list[tuple[str, int, int, int, bytes]]:
+    return sorted((one for path in paths for one in raw(path)), key=lambda one: one[2])

@@ -1,0 +1,268 @@
+"""A log on a disk that is full, broken or gone: in the end every message stands once, and it was told of once."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from service.logs.mcap_records import (
+    CHANNEL,
+    MESSAGE,
+    Damage,
+    records,
+)
+from service.logs.recover import recover
+from service.logs.replay import replay
+from service.recording import rolling
+from service.recording.rolling import RecorderError
+from tests.service.recording.recording import (
+    EVERYTHING,
+    Clock,
+    Disk,
+    Recording,
+    Story,
+    decoded_count,
+    every_message,
+    in_order,
+    numbered,
+    raw,
+)
+
+TICKS = 600
+
+
+def test_a_full_disk_loses_nothing_wherever_it_was_full(tmp_path: Path, story: Story, clock: Clock, disk: Disk) -> None:
+    """At every size that the file can come to: within the first chunk's head, its data, its index, between two."""
+    messages = story.messages[:120]
+    expected = numbered(messages)
+
+    def record(name: str, room: int) -> Recording:
+        disk.room = EVERYTHING
+        recording = Recording(clock, story, path=tmp_path / name, chunk_s=0.03)
+        disk.room = room
+        recording.take(messages)
+        disk.room = EVERYTHING
+        recording.wait(rolling.RETRY_S)
+        recording.log.close()
+        return recording
+
+    record("whole.mcap", EVERYTHING)
+    decoded, whole = decoded_count([tmp_path / "whole.mcap"]), (tmp_path / "whole.mcap").stat().st_size
+    header = _header_size(tmp_path / "whole.mcap")
+    refused = 0
+    for room in range(header, whole, (whole - header) // 61):
+        recording = record(f"{room}.mcap", room)
+        assert recording.waiting == []
+        path = tmp_path / f"{room}.mcap"
+        assert list(raw(path)) == expected, f"full at {room}"
+        assert decoded_count([path]) == decoded
+        assert recording.log.written == len(messages)
+        if recording.told:  # else the last bytes, of the index, came when there was room again
+            refused += 1
+            assert [bad for _, bad in recording.told] == [True, False]
+            assert os.strerror(errno.ENOSPC) in recording.told[0][0]
+            assert recording.told[1][0] == f"recording again to {path}"
+    assert refused > 20
+    assert not list(tmp_path.glob("*-0*.mcap")), "all went into one file each"
+
+
+def _header_size(path: Path) -> int:
+    """Where the first chunk begins."""
+    return next(record.offset for record in records(path) if record.opcode in (MESSAGE, CHANNEL))
+
+
+def test_what_is_on_a_full_disk_can_be_read_as_it_is(tmp_path: Path, story: Story, clock: Clock, disk: Disk) -> None:
+    """No half of a chunk stays behind, and the room that it took is given back."""
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
+    disk.room = 40_000
+    recording.take(story.messages[:400])
+    assert not recording.log.writable
+    damages: list[Damage] = []
+    assert MESSAGE in [record.opcode for record in records(tmp_path / "a.mcap", damages)]
+    assert [damage.what for damage in damages] == ["the file ends here, without its index"]
+    disk.room = EVERYTHING
+    recording.wait(rolling.RETRY_S)
+    recording.log.close()
+
+
+def test_a_disk_that_writes_a_little_at_a_time_is_written_to_the_end(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    disk.at_once = 1000
+    recording = Recording(clock, story, path=tmp_path / "a.mcap")
+    recording.take(story.messages[:200])
+    recording.log.close()
+    assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:200])
+
+
+def test_while_a_disk_is_full_it_is_tried_once_a_second_and_told_of_once(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
+    disk.room = 0
+    recording.take(story.messages[:100])
+    assert not recording.log.writable
+    before = disk.writes
+    for _ in range(100):
+        recording.wait(0.1)
+    assert 9 <= disk.writes - before <= 10
+    assert len(recording.told) == 1
+    disk.room = EVERYTHING
+    recording.wait(1.0)
+    recording.log.close()
+
+
+@pytest.mark.parametrize(
+    "first", [None, (errno.EIO, errno.ENOSPC), (errno.EIO, 0, errno.ENOSPC)], ids=["it", "its head", "its messages"]
+)
+def test_a_broken_disk_is_left_for_a_new_file_and_nothing_is_lost_or_doubled(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk, first: tuple[int, ...] | None
+) -> None:
+    """Even if at first there is no room for the new file: what came to nothing is removed."""
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
+    recording.take(story.messages[:330])
+    disk.broken = errno.EIO
+    recording.take(story.messages[330:500])
+    recording.wait(2.0)
+    assert not recording.log.writable
+    if first:
+        _errors(disk, *first)
+        recording.wait(1.0)
+        assert not recording.log.writable
+        assert [path.name for path in in_order(tmp_path)] == ["a.mcap"]
+    _errors(disk, errno.EIO, 0)  # the old file's, and then none
+    recording.wait(1.0)
+    recording.take(story.messages[500:])
+    recording.log.close()
+    old, new = in_order(tmp_path)
+    recover(old, tmp_path / "recovered")
+    assert every_message([tmp_path / "recovered", new]) == numbered(story.messages)
+    (session,) = replay([old, new])
+    assert (session.commands, session.differing) == (TICKS, 0)
+
+
+def _errors(disk: Disk, *errors: int) -> None:
+    """What the next writes give, and all that follow as the last one does."""
+    coming = list(errors)
+
+    def changes(_: int) -> None:
+        disk.broken = coming.pop(0) if len(coming) > 1 else coming[0]
+
+    disk.changes = changes
+
+
+def test_a_file_that_is_moved_or_removed_is_told_of_and_another_begun(
+    tmp_path: Path, story: Story, clock: Clock
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
+    recording.take(story.messages[:100])
+    (tmp_path / "a.mcap").rename(tmp_path / "moved")
+    recording.wait(rolling.LOOK_S)
+    recording.take(story.messages[100:200])
+    (tmp_path / "a-0001.mcap").unlink()
+    recording.wait(rolling.LOOK_S)
+    recording.take(story.messages[200:300])
+    recording.log.close()
+    assert recording.told_bad() == [
+        f"{tmp_path / name} was moved or removed while it was written" for name in ("a.mcap", "a-0001.mcap")
+    ]
+    expected = numbered(story.messages[:300])
+    assert list(raw(tmp_path / "moved")) == expected[:100]
+    assert list(raw(tmp_path / "a-0002.mcap")) == expected[200:]
+
+
+def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=2.0)
+    recording.take(story.messages[:100])
+    disk.new_files = errno.EACCES
+    recording.wait(2.5)
+    recording.take(story.messages[100:200])
+    recording.wait(1.5)  # time enough to look again, but not to try again
+    assert recording.told_bad() == [
+        f"no new file can be begun ({os.strerror(errno.EACCES)}), so {tmp_path / 'a.mcap'} goes on"
+    ]
+    disk.new_files = 0
+    recording.wait(1.0)
+    recording.take(story.messages[200:300])
+    recording.log.close()
+    expected = numbered(story.messages[:300])
+    assert list(raw(tmp_path / "a.mcap")) == expected[:200]
+    assert list(raw(tmp_path / "a-0001.mcap")) == expected[200:]
+
+
+def test_a_new_file_that_finds_the_disk_full_leaves_nothing_behind(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=2.0)
+    recording.take(story.messages[:600])
+    size = (tmp_path / "a.mcap").stat().st_size
+
+    def changes(offset: int) -> None:
+        disk.room = EVERYTHING if offset >= size else 1000  # there is none for the head of another
+
+    disk.changes = changes
+    recording.wait(2.5)
+    assert [path.name for path in in_order(tmp_path)] == ["a.mcap"]
+    assert recording.log.writable
+    recording.log.close()
+    assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:600])
+
+
+# The end
+
+
+def test_the_end_on_a_full_disk_is_told_in_one_line_and_what_was_written_can_be_recovered(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1)
+    recording.take(story.messages[:250])
+    size = (tmp_path / "a.mcap").stat().st_size
+    disk.room = size
+    recording.take(story.messages[250:270])
+    recording.log.try_again()
+    with pytest.raises(RecorderError) as refused:
+        recording.log.close(waiting=3)
+    written = recover(tmp_path / "a.mcap", tmp_path / "recovered")
+    kept = every_message([tmp_path / "recovered"])
+    assert written.messages == len(kept) + decoded_count([tmp_path / "recovered"])
+    assert kept == numbered(story.messages[:270])[: len(kept)]
+    assert str(refused.value) == (
+        f"{270 - len(kept) + 3} messages and the index of {tmp_path / 'a.mcap'} could not be written: "
+        f"{os.strerror(errno.ENOSPC)}; what came before is whole, and `aeroloop log recover` gives it an index"
+    )
+    assert 0 < len(kept) < 270
+
+
+def test_the_last_messages_are_written_even_where_the_index_has_no_room(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    whole = Recording(clock, story, path=tmp_path / "whole.mcap", chunk_s=0.1)
+    whole.take(story.messages[:250])
+    whole.log.close()
+    disk.room = (tmp_path / "whole.mcap").stat().st_size - 200  # the index is larger
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1)
+    recording.take(story.messages[:250])
+    with pytest.raises(RecorderError, match=r"^the index of "):
+        recording.log.close()
+    disk.room = EVERYTHING
+    recover(tmp_path / "a.mcap", tmp_path / "recovered")
+    assert every_message([tmp_path / "recovered"]) == numbered(story.messages[:250])
+
+
+def test_a_disk_that_has_room_again_is_tried_before_the_end(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    """A recorder that is stopped need not wait for the next try."""
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
+    disk.room = 0
+    recording.take(story.messages[:100])
+    disk.room = EVERYTHING
+    recording.log.try_again()
+    recording.wait(0.0)
+    recording.log.close(len(recording.waiting))
+    assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:100])

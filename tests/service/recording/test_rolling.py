@@ -1,0 +1,272 @@
+"""A run in several files: every message once, every file enough by itself, the oldest forgotten, none written over."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from service.logs.mcap_records import (
+    CHANGE_METADATA,
+    CHANNEL,
+    CHUNK_BYTES,
+    CONTRACT_METADATA,
+    MESSAGE,
+    RECORDER_METADATA,
+    Channel,
+    Message,
+    footer,
+    records,
+)
+from service.logs.replay import replay
+from service.logs.review import review
+from service.recording import rolling
+from service.recording.rolling import RecorderError
+from tests.service.logs.made_log import AN_OPERATORS_WORDS
+from tests.service.recording.recording import (
+    TICK_S,
+    Clock,
+    Disk,
+    Recording,
+    Story,
+    every_message,
+    in_order,
+    numbered,
+    raw,
+)
+
+TICKS = 600
+
+ROTATIONS = {"by size": {"max_file_mb": 0.045}, "by time": {"max_file_s": 0.4}}
+
+
+@pytest.fixture(params=ROTATIONS)
+def rotated(
+    request: pytest.FixtureRequest, tmp_path: Path, story: Story, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A folder with the session in several files."""
+    monkeypatch.setattr(rolling, "LOOK_S", 0.01)
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1, **ROTATIONS[request.param])
+    recording.take(story.messages)
+    recording.log.close()
+    assert recording.told == []
+    return tmp_path
+
+
+# Rotation
+
+
+def test_over_all_files_every_message_stands_once_and_their_numbers_go_on(rotated: Path, story: Story) -> None:
+    files = in_order(rotated)
+    assert len(files) >= 3
+    assert [path.name for path in files] == ["a.mcap", *(f"a-{part:04}.mcap" for part in range(1, len(files)))]
+    assert all(any(raw(path)) for path in files)
+    assert every_message(files) == numbered(story.messages)
+
+
+def test_no_file_is_larger_or_older_than_told_by_more_than_a_chunk(
+    tmp_path: Path, story: Story, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rolling, "LOOK_S", 0.01)
+    for name, settings in ROTATIONS.items():
+        folder = tmp_path / name
+        recording = Recording(clock, story, path=folder / "a.mcap", chunk_s=0.1, **settings)
+        recording.take(story.messages)
+        recording.log.close()
+        if name == "by size":
+            data = [_without_index(path) for path in in_order(folder)[:-1]]
+            assert all(45_000 <= size < 45_000 + 12_000 for size in data), "a chunk of 100 ms has up to 12 kB"
+        else:
+            starts = [next(raw(path))[3] for path in in_order(folder)]
+            assert all(0.35e9 < b - a < 0.55e9 for a, b in pairwise(starts))
+
+
+def _without_index(path: Path) -> int:
+    with path.open("rb") as file:
+        end = footer(file, path.stat().st_size)
+    assert end is not None
+    return end.summary_start
+
+
+def test_every_file_has_all_that_it_takes_to_read_it_alone(rotated: Path, story: Story) -> None:
+    """Of what the controller follows, all that it was told since the session began and before the file did."""
+    changes = [taken for taken in story.messages if taken.key.endswith("/change")]
+    assert len(changes) == 1 + len(AN_OPERATORS_WORDS)
+    for path in in_order(rotated):
+        begins = min(one[2] for one in raw(path))
+        with path.open("rb") as file:
+            reader = make_reader(file)
+            found = [(one.name, dict(one.metadata)) for one in reader.iter_metadata()]
+            attachments = {one.name: one.data for one in reader.iter_attachments()}
+        assert attachments == {"protocol/SPEC.md": Path("protocol/SPEC.md").read_bytes()}
+        told = [entries["json"].encode() for name, entries in found if name == CHANGE_METADATA]
+        assert told == [taken.payload for taken in changes if taken.arrived_ns < begins]
+        assert [entries for name, entries in found if name == CONTRACT_METADATA] == [
+            {"key": story.key, "json": story.contract.decode()}
+        ]
+        (said,) = [entries["json"] for name, entries in found if name == RECORDER_METADATA]
+        assert f'"run": "a", "part": "{path.stem}"' in said
+
+
+def test_a_rotated_run_is_replayed_to_the_last_byte_and_so_is_a_file_of_its_middle_alone(rotated: Path) -> None:
+    (whole,) = replay([rotated])
+    assert (whole.first_tick, whole.commands, whole.differing) == (0, TICKS, 0)
+    for path in in_order(rotated):
+        (part,) = replay([path])
+        assert part.commands > 10, path.name
+        assert part.differing == 0, path.name
+
+
+def test_a_rotated_run_has_the_figures_of_the_same_run_in_one_file(
+    rotated: Path, story: Story, clock: Clock, tmp_path: Path
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "one" / "one.mcap")
+    recording.take(story.messages)
+    recording.log.close()
+    assert len(in_order(tmp_path / "one")) == 1
+    apart, together = review(rotated), review(tmp_path / "one")
+    assert apart.model_copy(update={"log": None}) == together.model_copy(update={"log": None})
+    middle = review(in_order(rotated)[1])
+    assert middle.z_track is not None
+    assert middle.damages == []
+
+
+def test_a_new_session_is_the_only_one_of_which_the_next_file_tells(tmp_path: Path, story: Story, clock: Clock) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.01, max_file_s=1e6)
+    first = next(taken for taken in story.messages if taken.key.endswith("/change"))
+    second = first._replace(payload=first.payload.replace(b'"s1"', b'"s2"'))
+    assert second != first
+    recording.take([first, second])
+    recording.wait(1e6)
+    recording.log.close()
+    with in_order(tmp_path)[1].open("rb") as file:
+        changes = [one.metadata["json"] for one in make_reader(file).iter_metadata() if one.name == CHANGE_METADATA]
+    assert changes == [second.payload.decode()]
+
+
+def test_no_log_is_written_over(tmp_path: Path, story: Story, clock: Clock) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"mine")
+    for _ in range(2):
+        recording = Recording(clock, story, path=tmp_path / "a.mcap")
+        recording.take(story.messages[:50])
+        recording.log.close()
+    assert (tmp_path / "a.mcap").read_bytes() == b"mine"
+    assert every_message([tmp_path / "a-0001.mcap"]) == numbered(story.messages[:50])
+    assert every_message([tmp_path / "a-0002.mcap"]) == numbered(story.messages[:50])
+
+
+def test_where_no_log_can_be_made_it_is_told_in_one_line(tmp_path: Path, story: Story, clock: Clock) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(RecorderError) as refused:
+        Recording(clock, story, path=tmp_path / "file" / "a.mcap")
+    assert str(tmp_path / "file" / "a.mcap") in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+# What a crash costs
+
+
+def test_a_crash_costs_what_came_since_the_last_chunk_was_closed(tmp_path: Path, story: Story, clock: Clock) -> None:
+    """Whatever stands in the file at any moment is older than `chunk_s`: nothing was closed here."""
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.25)
+    for i in range(0, 1000, 50):
+        recording.take(story.messages[i : i + 50])
+        done = i + 50
+        on_disk = sum(not topic.startswith("/") for topic in _topics_of_messages(tmp_path / "a.mcap"))
+        assert done - on_disk <= 0.25 / (TICK_S / 2) + 1
+    recording.log.close()
+
+
+def test_a_chunk_is_closed_when_it_is_large_though_it_is_not_yet_due(
+    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=60)
+    small = next(taken for taken in story.messages if taken.key.endswith("/command"))
+    recording.take([small])  # the very first is written at once
+    before = disk.writes
+    recording.take([small._replace(payload=os.urandom(1000)) for _ in range(1000)])
+    assert (tmp_path / "a.mcap").stat().st_size > 1e6 - CHUNK_BYTES
+    assert disk.writes - before == 1000 * (1000 + 31) // CHUNK_BYTES
+    recording.log.close()
+
+
+def _topics_of_messages(path: Path) -> list[str]:
+    channels: dict[int, str] = {}
+    found = []
+    for record in records(path):
+        if record.opcode == CHANNEL:
+            channel = Channel.read(record.content)
+            channels[channel.id] = channel.topic
+        elif record.opcode == MESSAGE:
+            found.append(channels[Message.read(record.content).channel])
+    return found
+
+
+# Retention
+
+
+def test_the_oldest_of_ones_own_go_and_nobody_elses(
+    tmp_path: Path, story: Story, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rolling, "LOOK_S", 0.01)
+    others = {
+        "b.mcap": b"of another name",
+        "a-20261121.mcap": b"called as ours could be, and is not",
+        "a-0500.mcap": b"",
+        "a-0001.txt": b"no log",
+    }
+    for name, content in others.items():
+        (tmp_path / name).write_bytes(content)
+    another = Recording(clock, story, path=tmp_path / "another.mcap")
+    another.log.close()
+    (tmp_path / "another.mcap").rename(tmp_path / "a-0400.mcap")
+    ours = Recording(clock, story, path=tmp_path / "a.mcap")
+    ours.log.close()
+    (tmp_path / "a.mcap").rename(tmp_path / "a-kept.mcap")  # somebody puts it aside
+    others |= {name: (tmp_path / name).read_bytes() for name in ("a-0400.mcap", "a-kept.mcap")}
+    for path in tmp_path.iterdir():
+        os.utime(path, (0, 0))  # older than any of ours
+
+    recording = Recording(
+        clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=0.1, keep_gb=400e-6
+    )  # some five files
+    for i, taken in enumerate(story.messages):
+        recording.take([taken])
+        os.utime(recording.log.path, (1000 + i, 1000 + i))  # by the test's clock
+    recording.log.close()
+
+    assert {name: (tmp_path / name).read_bytes() for name in others} == others
+    own = [path for path in in_order(tmp_path) if path.name not in others]
+    numbers = [int(path.stem.removeprefix("a-")) for path in own]
+    assert numbers == list(range(numbers[0], numbers[0] + len(own)))
+    assert numbers[0] > 1, "the first ones are gone"
+    assert own[-1] == recording.log.path
+    sizes = [path.stat().st_size for path in own]
+    assert sum(sizes[:-1]) < 400e3 < sum(sizes) + max(sizes), "no more than needed"
+    removed = [text for text, _ in recording.told if text.startswith("removed")]
+    assert len(removed) == numbers[0]
+    kept = every_message(own)
+    assert kept == numbered(story.messages)[-len(kept) :]
+
+
+def test_the_file_that_is_written_stays_however_little_may_be_kept(tmp_path: Path, story: Story, clock: Clock) -> None:
+    recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=2.0, keep_gb=1e-9)
+    recording.take(story.messages[:100])
+    recording.wait(3.0)
+    recording.take(story.messages[100:200])
+    recording.log.close()
+    assert [path.name for path in in_order(tmp_path)] == ["a-0001.mcap"]
+    assert every_message(in_order(tmp_path)) == numbered(story.messages[:200])[100:]
+
+
+def test_logs_named_by_the_time_are_kept_together_over_runs(tmp_path: Path, story: Story, clock: Clock) -> None:
+    for name in ("aeroloop-20200101-000000", "demo-1"):
+        recording = Recording(clock, story, path=tmp_path / f"{name}.mcap")
+        recording.log.close()
+    recording = Recording(clock, story, directory=tmp_path, keep_gb=1e-9)
+    recording.log.close()
+    assert not (tmp_path / "aeroloop-20200101-000000.mcap").exists()
+    assert (tmp_path / "demo-1.mcap").exists()
