@@ -291,13 +291,13 @@ class CanLink(Link):
             size = self._receives.size
             if data == SILENCE and self._may_be_silent:
                 self.heard_ns = now
-                self._mailbox.put(data, time.time_ns())
+                self._mailbox.put(data)
                 return
             if len(data) < size or any(data[size:]) or (len(data) != size and size <= CLASSIC_BYTES):
                 self.refused += 1
                 return
             self.heard_ns = now
-            self._mailbox.put(data[:size], time.time_ns())
+            self._mailbox.put(data[:size])
         elif identifier == self._heard_id:
             heartbeat = Heartbeat.unpack(data, now)
             if heartbeat is None:

@@ -49,6 +49,9 @@ class LoopSettings(BaseModel):
     )
     priority: int = Field(default=10, ge=1, le=99, description="SCHED_FIFO priority")
     cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
+    trace_s: float = Field(
+        default=0.1, ge=0.01, le=10, description="publish what was done tick by tick this often, for the log [s]"
+    )
 
     @property
     def period_ns(self) -> int:

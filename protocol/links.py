@@ -21,47 +21,10 @@ class Arrival(NamedTuple):
     Attributes:
         frame: Its bytes.
         at_ns: When it arrived, on `time.monotonic_ns()`.
-        published_ns: When it was published, on its sender's wall clock [ns].
-        number: How many its sender had sent before it in this session; None if it does not number them.
     """
 
     frame: bytes
     at_ns: int
-    published_ns: int
-    number: int | None = None
-
-
-def published_ns(sample: zenoh.Sample, arrived_ns: int) -> int:
-    """Wall-clock time of publication [ns]; that of arrival if the sender does not stamp its messages."""
-    if sample.timestamp is None:
-        return arrived_ns
-    return sample.timestamp.get_time_as_ntp64().as_nanos()
-
-
-class Numbered:
-    """A publisher whose messages bear its number and theirs, so that a recorder can tell what it never got.
-
-    Args:
-        publisher: Who publishes.
-        numbers: Whether to number them; it costs 21 bytes each.
-    """
-
-    def __init__(self, publisher: zenoh.Publisher, *, numbers: bool = True) -> None:
-        self._publisher = publisher
-        self._source = publisher.id if numbers else None
-        self._next = 0
-
-    def put(self, payload: bytes) -> None:
-        """Publish a message. One that is dropped on the way out has its number all the same."""
-        if self._source is None:
-            self._publisher.put(payload)
-        else:
-            self._publisher.put(payload, source_info=zenoh.SourceInfo(self._source, self._next))
-            self._next = (self._next + 1) & 0xFFFF_FFFF
-
-    def undeclare(self) -> None:
-        """Publish no more."""
-        self._publisher.undeclare()
 
 
 class Link(ABC):
@@ -101,9 +64,9 @@ class Mailbox:
         self._changed = changed or Condition()
         self._arrivals: deque[Arrival] = deque(maxlen=depth)
 
-    def put(self, frame: bytes, published_ns: int = 0, number: int | None = None) -> None:
+    def put(self, frame: bytes) -> None:
         """Put a frame in the slot, in place of the oldest if it is full."""
-        arrival = Arrival(frame, time.monotonic_ns(), published_ns, number)
+        arrival = Arrival(frame, time.monotonic_ns())
         with self._changed:
             self._arrivals.append(arrival)
             self._changed.notify()
@@ -135,7 +98,6 @@ class ZenohLink(Link):
         receive_key: Where frames come from.
         mailbox: Where frames wait; one of its own if None.
         lossless: Block when a peer does not keep up, instead of dropping. For lockstep, where each frame is waited for.
-        numbers: Whether frames are numbered for the recorder.
     """
 
     def __init__(
@@ -146,24 +108,18 @@ class ZenohLink(Link):
         *,
         lossless: bool = False,
         mailbox: Mailbox | None = None,
-        numbers: bool = True,
     ) -> None:
         self._mailbox = mailbox or Mailbox()
         self._subscriber = session.declare_subscriber(
             receive_key,
-            lambda sample: self._mailbox.put(
-                sample.payload.to_bytes(),
-                published_ns(sample, time.time_ns()),
-                sample.source_info.source_sn if sample.source_info is not None else None,
-            ),
+            lambda sample: self._mailbox.put(sample.payload.to_bytes()),
         )
-        publisher = session.declare_publisher(
+        self._publisher = session.declare_publisher(
             send_key,
             priority=zenoh.Priority.REAL_TIME,
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
             express=True,
         )
-        self._publisher = Numbered(publisher, numbers=numbers)
         self._open = True
 
     def send(self, frame: bytes) -> None:

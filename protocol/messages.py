@@ -15,7 +15,7 @@ from protocol.topics import TOPICS, Topic
 from protocol.verbs import Message
 from protocol.wire import WireSpec
 
-PROTOCOL_VERSION: Final = 1
+PROTOCOL_VERSION: Final = 2
 
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
@@ -69,6 +69,7 @@ class Release(Message):
 class Contract(Message):
     """Who a role is and how it was configured: all that a reader of the log needs to read it."""
 
+    protocol: int = Field(description="version of SPEC.md that the role speaks; 1 did not say")
     role: str
     vehicle: str
     host: str
@@ -145,6 +146,7 @@ class Status(Message):
     received: int = Field(default=0, description="frames (recorder: messages) taken in since start")
     sent: int = Field(default=0, description="frames sent since start")
     refused: int = Field(default=0, description="malformed frames since start")
+    stale: int = Field(default=0, description="frames since start that came too late to be acted upon")
     saturated: int = Field(default=0, description="values beyond a quantizer's range since start")
     latency_us: Percentiles | None = Field(
         default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
@@ -152,7 +154,7 @@ class Status(Message):
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
     age_us: Percentiles | None = Field(
         default=None,
-        description="controller: age of a measurement when it is used, last 10 s; between hosts, as their clocks agree",
+        description="controller: how much later than the fastest a measurement was received, last 10 s [µs]",
     )
     timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
@@ -190,22 +192,7 @@ class Event(Message):
     kind: EventKind
     text: str = Field(description="one line for a person: what, why, and since when if that is known")
     session: str | None = None
-
-
-class Lapse(Message):
-    """Where a controller that hears silence on a clock did not compute a tick with the levels that were the plant's.
-
-    With these, the frames and the changes, a log of such a session can be computed again.
-    """
-
-    session: str
-    kind: Literal["late", "lost", "missed"] = Field(
-        description="late: the measurement of this tick was first used some ticks later; lost: of the frames between "
-        "that of this tick and the one so many ticks later none came; missed: so many ticks from this one on were not "
-        "computed"
-    )
-    tick: int
-    ticks: int = Field(ge=1, description="how many ticks")
+    tick: int | None = Field(default=None, description="the session's tick at which it happened, if it was at one")
 
 
 class Loss(Message):
@@ -214,10 +201,9 @@ class Loss(Message):
     key: str
     count: int = Field(ge=1, description="how many are missing")
     reason: Literal["network", "queue", "disk"] = Field(
-        description="network: their sender numbered them and they never came; queue: they came faster than they could "
-        "be written; disk: the log could not be written"
+        description="network: published, and neither received nor recovered; queue: received faster than they could be "
+        "written; disk: the log could not be written"
     )
-    until_ns: int = Field(description="time of publication of the first message after them, ns since 1970")
 
 
 def model_of(topic: Topic) -> type[Message]:

@@ -54,11 +54,6 @@ class NetworkSettings(BaseModel):
     gossip: bool = Field(
         default=True, description="learn of further processes from those one is linked to, and link to them directly"
     )
-    timestamps: bool = Field(
-        default=True,
-        description="stamp every message with its time of publication and its sender's number, for the log; "
-        "47 bytes each",
-    )
     lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is given up after this [ms]")
 
 
@@ -72,12 +67,11 @@ def _zenoh_config(settings: NetworkSettings, listen: list[str], connect: list[st
             "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
-        "timestamping": {"enabled": {"peer": settings.timestamps}},
         "transport": {
             # Useless at seven bytes, and it leaves files behind when a process is killed.
             "shared_memory": {"enabled": False},
-            # Zenoh's own lengths are 1 for most priorities: a sending thread kept waiting for 2 ms then drops frames
-            # that a log should have. What comes late is refused where it matters, by its time of publication.
+            # Zenoh's own lengths are 1 for most priorities: a sending thread kept waiting for 2 ms then drops frames.
+            # What comes late is refused where it matters, by the tick that it answers.
             "link": {"tx": {"lease": settings.lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
             "unicast": {"open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
         },

@@ -26,15 +26,18 @@ from protocol import topics
 from protocol.clock import Throttle
 from protocol.errors import AeroloopError
 from protocol.host import host_facts, versions
-from protocol.links import Numbered
-from protocol.messages import Contract, Event, EventKind, Status
+from protocol.messages import PROTOCOL_VERSION, Contract, Event, EventKind, Status
 from protocol.network import NetworkSettings, join
+from protocol.publication import CachedPublisher
 from protocol.verbs import Answer, Message
 
 log: Final = logging.getLogger("aeroloop")
 
 
 M = TypeVar("M", bound=Message)
+_SELDOM_PER_S: Final = 8.0
+"""Messages a second of a topic that is not declared beforehand: statuses, events."""
+
 Action = Callable[[], object]
 """Something to do between two ticks."""
 
@@ -58,9 +61,6 @@ class Role:
         config: Its effective configuration, for the contract.
         name: Name of its liveliness token; the role's name if None.
 
-    Attributes:
-        numbers: Whether what it publishes is numbered.
-
     Raises:
         NetworkError: The network cannot be joined.
     """
@@ -74,8 +74,7 @@ class Role:
         self.stop = threading.Event()
         self.zenoh = join(network)
         self._status = b""
-        self._publishers: dict[str, Numbered] = {}
-        self.numbers = network.timestamps
+        self._publishers: dict[str, CachedPublisher] = {}
         self._inbox: deque[Action] = deque()
         self._throttle = Throttle()
         self._started = time.monotonic()
@@ -125,6 +124,7 @@ class Role:
     def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
         """Answer questions for the contract with this configuration, and what is promised of it, from now on."""
         self._contract = Contract(
+            protocol=PROTOCOL_VERSION,
             role=self.role,
             vehicle=self.vehicle,
             host=socket.gethostname(),
@@ -133,6 +133,7 @@ class Role:
             config=config,
             certificate=certificate,
         ).encode()
+        self.publish_bytes("contract", self._contract)
 
     @property
     def uptime_s(self) -> float:
@@ -202,27 +203,38 @@ class Role:
 
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", self.vehicle), seen, history=True)
 
+    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
+        """Declare a topic's publisher before it is needed: a cache for so many messages a second takes a while."""
+        carries = topics.TOPICS[topic].carries
+        self._publishers[topic] = CachedPublisher(
+            self.zenoh,
+            topics.key(topic, self.vehicle, role=self.role),
+            per_s,
+            lossless=lossless,
+            encoding=zenoh.Encoding.APPLICATION_JSON if carries == "json" else zenoh.Encoding.ZENOH_BYTES,
+        )
+
     def publish(self, topic: str, message: Message) -> None:
         """Publish a message on one of the table's JSON topics."""
-        publisher = self._publishers.get(topic)
-        if publisher is None:
-            declared = self.zenoh.declare_publisher(
-                topics.key(topic, self.vehicle, role=self.role), encoding=zenoh.Encoding.APPLICATION_JSON
-            )
-            publisher = self._publishers[topic] = Numbered(declared, numbers=self.numbers)
-        publisher.put(message.encode())
+        self.publish_bytes(topic, message.encode())
 
-    def event(self, kind: EventKind, text: str, session: str | None = None) -> None:
-        """Tell, on the network and on stderr, something that happened."""
+    def publish_bytes(self, topic: str, payload: bytes) -> None:
+        """Publish on one of the table's topics of JSON or traces."""
+        if topic not in self._publishers:
+            self.declare(topic, _SELDOM_PER_S)
+        self._publishers[topic].put(payload)
+
+    def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Publish and log something that happened, at a session's tick if it was at one."""
         log.log(logging.WARNING if kind in ("tripped", "lost", "fault") else logging.INFO, "%s: %s", self.role, text)
-        self.publish("event", Event(role=self.role, kind=kind, text=text, session=session))
+        self.publish("event", Event(role=self.role, kind=kind, text=text, session=session, tick=tick))
 
-    def warn(self, about: str, kind: EventKind, text: str, session: str | None = None) -> None:
-        """Tell of something that may go on for long: at most once in ten seconds for each thing it is about."""
+    def warn(self, about: str, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Publish something that may go on for long: at most once in ten seconds for each thing it is about."""
         held_back = self._throttle.let_pass(about)
         if held_back is not None:
             more = f" ({held_back} more like it in the last {self._throttle.period_s:g} s)" if held_back else ""
-            self.event(kind, text + more, session)
+            self.event(kind, text + more, session, tick)
 
     def status(self, status: Status) -> None:
         """Tell how the role is doing, now and to whoever asks before the next time."""

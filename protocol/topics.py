@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 ROOT: Final = "aeroloop"
-EVERYTHING: Final = f"{ROOT}/**"
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """What a vehicle may be called: one chunk of a Zenoh key, and safe in a file name."""
 
@@ -24,8 +23,8 @@ class Topic:
     Attributes:
         name: What the rest of the program calls it.
         key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
-        carries: `frame` (bits, see frames.py), `json` (a model of messages.py), `query` (asked and answered),
-            `token` (liveliness, no payload).
+        carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model of messages.py),
+            `query` (request and reply), `token` (liveliness, no payload).
         sender: Which end speaks.
         rate: How often.
         model: The class in messages.py, or the frame's name.
@@ -33,7 +32,7 @@ class Topic:
 
     name: str
     key: str
-    carries: Literal["frame", "json", "query", "token"]
+    carries: Literal["frame", "trace", "json", "query", "token"]
     sender: str
     rate: str
     model: str
@@ -52,12 +51,11 @@ TOPICS: Final = {
         Topic("track", "track", "query", "operator", "when needed", "Track"),
         Topic("inject", "inject", "query", "operator", "when needed", "Inject"),
         Topic("advance", "advance", "query", "operator", "when needed", "Advance"),
-        Topic("contract", "contract/{role}", "query", "every role", "when asked", "Contract"),
+        Topic("contract", "contract/{role}", "json", "every role", "at start and on change", "Contract"),
         Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", "Measurement"),
         Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),
         Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", "Telemetry"),
-        Topic("change", "change", "json", "controller", "when something changes", "Change"),
-        Topic("lapse", "lapse", "json", "controller", "when a measurement comes late", "Lapse"),
+        Topic("trace", "trace/{role}", "trace", "plant, controller", "trace_s", "Trace"),
         Topic("reference", "reference", "json", "operator", "as it streams", "Setpoint"),
         Topic("truth", "truth", "json", "plant", "truth_rate", "Truth"),
         Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", "Status"),
@@ -66,6 +64,12 @@ TOPICS: Final = {
         Topic("alive", "alive/{role}", "token", "every role", "while it lives", ""),
     )
 }
+
+RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries in ("trace", "json"))
+"""Topics that are published from a cache: a subscriber that joins late recovers what it missed."""
+
+FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
+"""Topics of the loop itself."""
 
 _PATTERNS: Final = [
     (

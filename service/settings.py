@@ -25,7 +25,7 @@ class ControllerSettings(BaseModel):
     auto_arm: bool = Field(
         default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
     )
-    telemetry_rate_hz: float = Field(default=50.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
+    telemetry_rate_hz: float = Field(default=25.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
     max_reference_rate: float = Field(
         default=1.0, gt=0, le=100, description="fastest turn that an operator's reference may ask for [rad/s]"
     )
