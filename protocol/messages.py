@@ -76,6 +76,10 @@ class Contract(Message):
     versions: dict[str, str]
     facts: dict[str, str] = Field(default_factory=dict, description="the machine, and what of it bears on time")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
+    freshness_s: float | None = Field(
+        default=None,
+        description="2^counter_bits periods: a frame that is later than this may be taken for a newer one [s]",
+    )
     certificate: dict[str, Any] | None = Field(
         default=None,
         description="controller: what the theorem promises of it, as `aeroloop lab certify --json` says it",
