@@ -15,7 +15,7 @@ from protocol.topics import TOPICS, Topic
 from protocol.verbs import Message
 from protocol.wire import WireSpec
 
-PROTOCOL_VERSION: Final = 1
+PROTOCOL_VERSION: Final = 2
 
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
