@@ -5,7 +5,7 @@ columns, which compress to two thirds of the records' size:
 
     header (112 bytes) · columns, one after another · tail (JSON)
 
-`SPEC.md`, section 5, defines every byte, with golden vectors. Both writers are sans-I/O: the owner passes times and
+`SPEC.md`, section 10, defines every byte, with golden vectors. Both writers are sans-I/O: the owner passes times and
 publishes what `take` returns. Times in rows are whole microseconds after the header's `monotonic_ns`, on the end's own
 monotonic clock; nothing here compares the clocks of two hosts.
 """
