@@ -93,8 +93,9 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
         ways = ["set can.fd = true", f"{signals} to {widest} at the most"]
         if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
             ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
+        ways_out = ", or ".join(ways)
         raise CanError(
-            f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}: {', or '.join(ways)}"
+            f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}: {ways_out}"
         )
 
 
