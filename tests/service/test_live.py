@@ -6,7 +6,7 @@ through the callbacks that were declared. Time stands still unless the test move
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
 from math import acos, atan2, degrees, hypot, radians, sin
 from typing import Any, Final, TypeVar
@@ -99,12 +99,6 @@ class Network:
         self.queryables: dict[str, Callable[[Any], None]] = {}
         self.subscribers: dict[str, Callable[[Any], None]] = {}
 
-    def publisher(self, session: object, key: str, per_s: float, *, lossless: bool, encoding: object) -> Publisher:
-        """Something to put on a key, in place of a CachedPublisher."""
-        del per_s, lossless, encoding
-        assert session is self
-        return Publisher(self, key)
-
     def declare_queryable(self, key: str, callback: Callable[[Any], None], *, complete: bool) -> None:
         """Keep the callback."""
         assert complete
@@ -130,6 +124,14 @@ class Publisher:
     def put(self, payload: bytes) -> None:
         """Keep the bytes."""
         self.network.put.append((self.key, payload))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def publishers() -> Iterator[None]:
+    """What a role publishes stays on the network of the test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(role, "CachedPublisher", lambda network, key, *_, **__: Publisher(network, key))
+        yield
 
 
 class FakeTime:
@@ -159,7 +161,6 @@ class Loop:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(role, "join", lambda _: self.network)
-            patch.setattr(role, "CachedPublisher", self.network.publisher)
             self.role = Role("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
         self.assurance = Assurance(self.role, wire or WIRE, LAW, reference, settings)

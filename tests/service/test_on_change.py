@@ -14,7 +14,7 @@ from protocol.transmit import SILENCE, Policy, Transmit
 from protocol.verbs import Sinusoid
 from protocol.wire import WireSpec
 from service.config import ConfigError, Settings, load, with_bits
-from service.controller import Controller
+from service.controller import Controller, ControllerState
 from service.figures import Figures
 from service.lab.experiment import run_experiment
 from service.law import LawSettings
@@ -131,6 +131,25 @@ def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_ho
     assert late.refused == 2
     assert late.tick_index == 1  # nothing was computed
     assert late.tick(SILENCE, 2) == told.tick(measurement(2, 0.3), 2)
+
+
+@pytest.mark.parametrize("at", [0, 1, 5, 9, 23])
+def test_a_restored_controller_goes_on_with_the_levels_it_held_and_what_it_sent(at: int) -> None:
+    """Also after a late frame, and between two heartbeats: no byte and no silence differs."""
+
+    def run(law: Controller, ticks: range) -> list[bytes | None]:
+        said = []
+        for k in ticks:
+            if k == 9:
+                assert law.hold(measurement(8, 0.3))
+            said.append(law.tick(measurement(k, 0.2) if k in (0, 20) else SILENCE, k))
+        return said
+
+    law, restored = controller(), controller()
+    run(law, range(at))
+    restored.restore(ControllerState.model_validate_json(law.state.model_dump_json()))
+    assert run(restored, range(at, 60)) == run(law, range(at, 60))
+    assert restored.state == law.state
 
 
 # What cannot work is refused
