@@ -158,7 +158,7 @@ class Status(Message):
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
     age_us: Percentiles | None = Field(
         default=None,
-        description="controller: how much later than the fastest a measurement was received, last 10 s [µs]",
+        description="controller: from a measurement received to the command that answers it sent, last 10 s [µs]",
     )
     timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")

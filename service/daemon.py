@@ -161,7 +161,9 @@ class Daemon:
             if command or (command is not None and lockstep):
                 link.send(command)
             k = now.tick
-            self._record(now, command, time.monotonic_ns())
+            sent_ns = time.monotonic_ns()
+            self._age.add(sent_ns - now.at_ns)
+            self._record(now, command, sent_ns)
             self._account(command, now)
             if timing:
                 timing.done()
@@ -205,7 +207,6 @@ class Daemon:
         self._ticks += 1
         if now.frame != SILENCE:
             self._received += 1
-            self._age.add(now.late_ns)
         self._skipped += now.missed
         if now.missed >= STALL_TICKS:
             self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self._claimant.session, measured)

@@ -1,7 +1,7 @@
 """Wall clocks that are wrong, step, or run fast at either end: loop, watchdog, log, review and replay are as without.
 
-libfaketime gives one process another clock. Where its steps and offsets are tried, the monotonic clock is left alone, as
-a wrong NTP server leaves it; a clock that runs fast is one that counts faster in all its readings.
+libfaketime gives one process another clock. Offsets and steps leave the monotonic clock alone, as a wrong NTP server
+does; a clock that runs fast is one that counts faster in all its readings.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 
 from service.bench import Bench, free_rendezvous
 from service.config import load
-from tests.hil.test_processes import aeroloop, eventually
+from tests.hil.test_processes import eventually
 from tests.hil.test_recorder import PATIENT, Statuses, assert_whole
 
 LIBRARIES = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
@@ -81,7 +81,7 @@ def test_a_clock_that_steps_by_an_hour_in_mid_run_changes_nothing(tmp_path: Path
     run(tmp_path, {role: {**stepping, **WALL_ALONE}}, said)
 
 
-def test_the_watchdog_trips_as_soon_whatever_the_plants_clock_reads(tmp_path: Path) -> None:
+def test_the_watchdog_trips_as_soon_whatever_the_plants_clock_reads() -> None:
     """A killed controller is gone within the watchdog's 100 ms and what two busy cores add."""
     settings = load(overrides=[f"network.rendezvous={free_rendezvous()}", "controller.auto_arm=true"])
     with Bench(settings) as bench:
@@ -91,4 +91,3 @@ def test_the_watchdog_trips_as_soon_whatever_the_plants_clock_reads(tmp_path: Pa
         eventually("driving", lambda: statuses.state("plant") == "driven")
         bench.stop("controller", how=9)  # type: ignore[arg-type]  # SIGKILL
         eventually("the trip", lambda: statuses.state("plant") == "tripped", 5.0)
-    assert aeroloop is not None
