@@ -168,7 +168,7 @@ class LogFile:
 
 def _raw_shape(topic: topics.Topic) -> Shape:
     if topic.carries == "trace":
-        text = "batch of a trace: section `trace` of the attachment protocol/SPEC.md; frames by the plant's contract"
+        text = "batch of a trace: section 10 (The trace) of the attachment protocol/SPEC.md; frames by the plant's contract"
         return Shape("aeroloop.Trace", TRACE_ENCODING, text.encode(), TRACE_ENCODING)
     if topic.carries == "frame":
         text = (
