@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 from foxglove.messages import FrameTransform, Log, LogLevel, Pose, PoseInFrame, Quaternion, SceneUpdate, Vector3
 from pydantic import ValidationError
 
@@ -30,6 +28,8 @@ from service.logs.schemas import json_shape, protobuf_shape
 
 LIMITED: Final = frozenset({"telemetry", "truth", "reference"})
 """Messages that stream, and so are held to the rate; as the rows of traces are."""
+
+_FRAME: Final = Sent.FRAME.value
 
 UNLIMITED: Final = frozenset({"status", "event", "loss"})
 """Messages that always pass."""
@@ -159,11 +159,8 @@ class Decoder:
         read = self._readers.get(address.topic.name)
         if read is None:
             return []
-        if self._slot_ns and address.topic.name in LIMITED:
-            source, slot = (address.topic.name, address.vehicle), published_ns // self._slot_ns
-            if self._slots.get(source) == slot:
-                return []
-            self._slots[source] = slot
+        if address.topic.name in LIMITED and not self._due(address.topic.name, address.vehicle, published_ns):
+            return []
         try:
             return read(address, payload, published_ns)
         except (ValidationError, _MalformedError):
@@ -183,31 +180,29 @@ class Decoder:
 
     def rows(self, vehicle: str, batch: Batch) -> list[Decoded]:
         """What the rows of a trace give: the plant's its measurements, the controller's its commands."""
-        wire, header, columns = self._wires.get(vehicle), batch.header, batch.columns
-        if wire is None or not header.rows:
+        wire, columns, base_ns = self._wires.get(vehicle), batch.columns, batch.header.wall_ns
+        if wire is None:
             return []
-        name = "measurement" if header.end == "plant" else "command"
-        times = columns["sent"].astype(np.int64) * 1000 + header.wall_ns
-        shown = np.flatnonzero((columns["sent_as"] == Sent.FRAME) & (times >= 0))
-        found = []
-        for row in self._due((name, vehicle), times, shown):
-            try:
-                found += self._frames[name](vehicle, wire, columns[name][row].tobytes(), int(times[row]))
-            except _MalformedError:
-                self.malformed += 1
+        name = "measurement" if batch.header.end == "plant" else "command"
+        show, frames, found = self._frames[name], columns[name], []
+        for row, (sent_as, sent) in enumerate(zip(columns["sent_as"].tolist(), columns["sent"].tolist(), strict=True)):
+            at_ns = base_ns + sent * 1000
+            if sent_as == _FRAME and at_ns >= 0 and self._due(name, vehicle, at_ns):
+                try:
+                    found += show(vehicle, wire, frames[row].tobytes(), at_ns)
+                except _MalformedError:
+                    self.malformed += 1
         return found
 
-    def _due(
-        self, source: tuple[str, str], times: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.int64]:
-        """The first of the rows in each slot of time."""
-        if not self._slot_ns or not rows.size:
-            return rows
-        slots = times[rows] // self._slot_ns
-        due = np.diff(slots, prepend=self._slots.get(source, -1)) != 0
-        self._slots[source] = int(slots[-1])
-        picked: npt.NDArray[np.int64] = rows[due]
-        return picked
+    def _due(self, name: str, vehicle: str, at_ns: int) -> bool:
+        """Whether it is the first of its source in its slot of time."""
+        if not self._slot_ns:
+            return True
+        source, slot = (name, vehicle), at_ns // self._slot_ns
+        if self._slots.get(source) == slot:
+            return False
+        self._slots[source] = slot
+        return True
 
     def _trace(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         del at_ns  # its rows have their own times
