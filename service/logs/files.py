@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from mcap.records import Channel, Message, Metadata
 from pydantic import ValidationError
 
 from plant_emulator.settings import PlantSettings
@@ -17,21 +17,14 @@ from protocol.messages import Contract, Lapse
 from protocol.topics import Address
 from protocol.verbs import Change
 from service.config import Settings, from_contract
-from service.logs.mcap_index import skim
-from service.logs.mcap_records import (
+from service.logs.mcap_file import (
     CHANGE_METADATA,
-    CHANNEL,
     CONTRACT_METADATA,
-    MESSAGE,
-    METADATA,
-    Channel,
     Damage,
-    Message,
     NotMcapError,
     messages,
-    metadata,
     records,
-    summary,
+    skim,
 )
 
 METADATA_PREFIX: Final = "aeroloop."
@@ -75,6 +68,11 @@ class LogFiles:
         self._told: set[tuple[str, bytes]] = set()  # changes and lapses, as vehicle and JSON
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
+        if not self.contracts:  # one that is damaged may have a copy; where none can be read, it is not damage
+            for path, damages in self.damages.items():
+                for damage in damages:
+                    if CONTRACT_METADATA in damage.what:
+                        raise ReviewError(f"{path} is not a log of this version: {damage.what}")
         for changes in self.changes.values():
             changes.sort(key=lambda change: change.tick)
         self._size = sum(path.stat().st_size for path in self.paths)
@@ -133,7 +131,8 @@ class LogFiles:
         read = 0
         for path in self.paths:
             damages: list[Damage] = []
-            yield from messages(path, wanted, damages, _share_of(progress, read, self._size))
+            for message in messages(path, wanted, damages, _share_of(progress, read, self._size)):
+                yield message.answer, message.data, message.publish_time
             read += path.stat().st_size
             if damages:
                 self.damages[path] = damages
@@ -148,29 +147,20 @@ class LogFiles:
         told: dict[int, Address] = {}
         damages: list[Damage] = []
         try:
-            for record in skim(path, _is_told) or chain(summary(path), records(path, damages)):
-                if record.opcode == MESSAGE:
-                    if told or not first:
-                        message = Message.read(record.content)
-                        first = first or message.publish_time
-                        if message.channel in told:
-                            self._tells(told[message.channel], message.data)
-                elif record.opcode == CHANNEL:
-                    channel = Channel.read(record.content)
-                    key = topics.read_key(channel.topic)
+            for record in skim(path, _is_told) or records(path, damages):
+                if isinstance(record, Message):
+                    first = first or record.publish_time
+                    if record.channel_id in told:
+                        self._tells(told[record.channel_id], record.data)
+                elif isinstance(record, Channel):
+                    key = topics.read_key(record.topic)
                     if key is not None and key.topic.name in _TOLD:
-                        told[channel.id] = key
-                elif record.opcode == METADATA:
-                    name, entries = metadata(record.content)
-                    if name == CONTRACT_METADATA:
-                        contract = Contract.model_validate_json(entries["json"])
-                        self.contracts[contract.role] = contract
-                    elif name == CHANGE_METADATA:
-                        if key := topics.read_key(entries["key"]):
-                            self._tells(key, entries["json"].encode())
-                    elif name.startswith(METADATA_PREFIX) and "json" in entries:
-                        said = json.loads(entries["json"])
-                        self.metadata[name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
+                        told[record.id] = key
+                elif isinstance(record, Metadata):
+                    try:
+                        self._metadata(record.name, record.metadata)
+                    except (ValidationError, ValueError, KeyError) as error:
+                        damages.append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
         except NotMcapError as error:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
@@ -180,6 +170,17 @@ class LogFiles:
         if damages:
             self.damages[path] = damages
         return first
+
+    def _metadata(self, name: str, entries: dict[str, str]) -> None:
+        if name == CONTRACT_METADATA:
+            contract = Contract.model_validate_json(entries["json"])
+            self.contracts[contract.role] = contract
+        elif name == CHANGE_METADATA:
+            if key := topics.read_key(entries["key"]):
+                self._tells(key, entries["json"].encode())
+        elif name.startswith(METADATA_PREFIX) and "json" in entries:
+            said = json.loads(entries["json"])
+            self.metadata[name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
 
     def _tells(self, key: Address, text: bytes) -> None:
         """Add a change or a lapse; the files of a rotated run tell the same change again."""

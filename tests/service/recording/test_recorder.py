@@ -22,7 +22,7 @@ from protocol.role import Role
 from protocol.trace import read_batch
 from protocol.verbs import Change
 from service.config import load
-from service.logs.mcap_records import CHANGE_METADATA, CONTRACT_METADATA
+from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
 from service.recording import backlog, rolling
 from service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
 from service.recording.recorder import Recorder
