@@ -14,10 +14,12 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Vector
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState, TripCause
 from protocol.wire import SignalSpec, WireSpec
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 WIRE = WireSpec()
 CONTINUOUS = WireSpec().with_bits(None, None)

@@ -22,7 +22,7 @@ from plant_emulator.plant import Measurement, Plant
 from protocol import clock
 from protocol.attitude import IDENTITY
 from protocol.clock import Throttle
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import (
     CONTROLLER_TABLE,
@@ -35,6 +35,8 @@ from protocol.states import (
     TripCause,
 )
 from protocol.wire import WireSpec
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 # The tables
 

@@ -14,7 +14,7 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.settings import IDEAL_AERO, PlantSettings
 from protocol.attitude import Quaternion, Vector, sent_vector
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant
 from protocol.verbs import Sinusoid
 from protocol.wire import WireSpec
@@ -23,6 +23,8 @@ from service.law import LawSettings
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD = 0.002
 PERIOD_NS = 2_000_000

@@ -11,13 +11,15 @@ from collections.abc import Iterable, Mapping
 import pytest
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.links import Arrival
 from protocol.transmit import SILENCE, Sender
 from protocol.wire import WireSpec
 from service import hearing
 from service.hearing import Heard, Hearing
 from tests.service.logs.silent_loop import LOOP, PERIOD_NS, START_NS, Wire, wire_of
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 WIRE = wire_of("on_change", "on_change")
 DELAY_NS = 200_000
@@ -78,7 +80,7 @@ def until(k: int) -> int:
 
 def heartbeats(last: int, codes: Mapping[int, int] | None = None) -> list[Arrival]:
     """Arrivals of a plant whose code becomes what `codes` say at their ticks."""
-    sender, code, sent = Sender("on_change", 15), 0, []
+    sender, code, sent = Sender("on_change", 15, COUNTERS), 0, []
     for k in range(last + 1):
         code = (codes or {}).get(k, code)
         if sender.due(k, (code,)):

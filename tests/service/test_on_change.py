@@ -9,7 +9,7 @@ import pytest
 
 import service.examples
 from protocol.attitude import sent_vector
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.transmit import SILENCE, Policy, Transmit
 from protocol.verbs import Sinusoid
 from protocol.wire import WireSpec
@@ -18,6 +18,8 @@ from service.controller import Controller
 from service.figures import Figures
 from service.lab.experiment import run_experiment
 from service.law import LawSettings
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD = 0.002
 DURATION = 1.5
