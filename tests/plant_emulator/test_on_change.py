@@ -89,9 +89,9 @@ def test_a_plant_at_rest_sends_heartbeats_only_and_a_change_at_once(lockstep: bo
             sent[k] = BOTH.measurement.unpack(frame)
     assert sent == {
         15: (15, (0,) * 6),
-        30: (14, (0,) * 6),
-        40: (8, (0, 0, 0, 64, 0, 0)),
-        55: (7, (0, 0, 0, 64, 0, 0)),
+        30: (30, (0,) * 6),
+        40: (40, (0, 0, 0, 64, 0, 0)),
+        55: (55, (0, 0, 0, 64, 0, 0)),
     }
 
 

@@ -305,7 +305,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
             self.tick(WIRE.command.pack((self.answered - self.first) % COUNTERS, pair), ticks)
         elif what == "malformed":
             self.refused += self.session is not None
-            self.tick((b"", b"\x00", b"\x57\xe1\x00")[ago % 3], ticks)
+            self.tick((b"", b"\x00", b"\x57\xe1\x01")[ago % 3], ticks)
         else:
             self.tick(None, ticks)
 

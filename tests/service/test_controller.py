@@ -103,10 +103,14 @@ def test_nothing_in_gives_nothing_out() -> None:
 
 @pytest.mark.parametrize("wire", [QUANTIZED, CONTINUOUS], ids=["8/6 bits", "cont"])
 def test_malformed_bytes_are_counted_and_give_nothing_out(wire: WireSpec) -> None:
+    quantized, wire = (
+        wire is QUANTIZED,
+        WireSpec.model_validate({**wire.model_dump(), "counter_bits": 4}),
+    )  # has padding
     controller, untouched = _controller(wire), _controller(wire)
     frame = _frame(wire, 7, _yawed(0.3), (0.1, 0.2, 0.3))
     # 8 bits: the padding's last bit is set; cont: a bit of the gap after the counter is
-    padding = frame[:-1] + bytes([frame[-1] | 1]) if wire is QUANTIZED else bytes([frame[0] | 1]) + frame[1:]
+    padding = frame[:-1] + bytes([frame[-1] | 1]) if quantized else bytes([frame[0] | 1]) + frame[1:]
     for k, junk in enumerate((b"", frame[:-1], frame + b"\0", padding)):
         assert controller.tick(junk, k) is None
         assert controller.refused == k + 1
