@@ -273,9 +273,10 @@ def test_a_score_of_many_is_the_score_of_each_to_the_last_bit(cut: int) -> None:
     assert many._largest == one._largest
 
 
+@pytest.mark.parametrize("counter_bits", [4, 8, 10])
 @pytest.mark.parametrize("widths", [[8] * 6, [6, 6], [10] * 3 + [16] * 3, [2, 3, 5], [None, None], [None, 7, None, 16]])
-def test_frames_are_read_many_at_once_as_each(widths: list[int | None]) -> None:
-    kind, rng = FrameFormat(widths), np.random.default_rng(0)
+def test_frames_are_read_many_at_once_as_each(widths: list[int | None], counter_bits: int) -> None:
+    kind, rng = FrameFormat(widths, counter_bits), np.random.default_rng(0)
     rows = [
         [
             rng.normal() if width is None else int(rng.integers(-(2 ** (width - 1)), 2 ** (width - 1)))
