@@ -14,10 +14,12 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Vector
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState, TripCause
 from protocol.wire import SignalSpec, WireSpec
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 WIRE = WireSpec()
 CONTINUOUS = WireSpec().with_bits(None, None)
@@ -104,7 +106,7 @@ def test_a_claim_is_granted_and_the_next_tick_measures_with_counter_0() -> None:
         assert endpoint.tick(None, k) is None  # nobody listens
     assert endpoint.claim(_claim()) == Grant(session="of-a")
     assert (endpoint.state, endpoint.session, endpoint.holder) == (PlantState.GRANTED, "of-a", "a")
-    for k in range(4, 4 + 2 * COUNTERS):
+    for k in range(4, 14 + COUNTERS):
         assert _read(endpoint.tick(None, k))[0] == (k - 4) % COUNTERS == endpoint.counter
     assert _told(endpoint) == ["claimed"]
     assert "a" in endpoint.notices[0].text
@@ -116,7 +118,7 @@ def test_a_claim_is_granted_and_the_next_tick_measures_with_counter_0() -> None:
     [
         ({"period_ns": 1_000_000}, "period_ns: 2000000, not 1000000"),
         ({"lockstep": True}, "lockstep: False, not True"),
-        ({"protocol": 99}, "protocol: 1, not 99"),
+        ({"protocol": 99}, "protocol: 2, not 99"),
         ({"wire": WIRE.model_copy(update={"rate": SignalSpec(bits=10, limit=1.0)})}, "rate.bits: 8, not 10"),
         (
             {"wire": WIRE.model_copy(update={"voltage": SignalSpec(bits=6, limit=18.0)})},
