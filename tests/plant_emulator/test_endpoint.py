@@ -14,12 +14,12 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY, Vector
-from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState, TripCause
 from protocol.wire import SignalSpec, WireSpec
 
 WIRE = WireSpec()
+COUNTERS = WIRE.measurement.counters
 CONTINUOUS = WireSpec().with_bits(None, None)
 PERIOD_NS = 2_000_000
 WATCHDOG_TICKS = 50
