@@ -12,14 +12,11 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement
 from protocol.attitude import IDENTITY, Vector
-from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant
 from protocol.states import PlantState, TripCause
 from protocol.transmit import SILENCE, Policy, Transmit
 from protocol.wire import WireSpec
-from tests.plant_emulator.test_endpoint import OFF, PERIOD_NS, WATCHDOG_TICKS, Notebook
-
-COUNTERS = 1 << DEFAULT_COUNTER_BITS
+from tests.plant_emulator.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, Notebook
 
 HEARTBEAT = 15
 """Ticks: 30 ms of 2 ms."""
