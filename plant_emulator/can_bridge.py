@@ -17,7 +17,6 @@ from plant_emulator.settings import PlantSettings
 from plant_emulator.tenancy import Tenancy
 from protocol.can_link import HEARTBEAT_S, SILENT_S, CanLink, CanSettings, Heartbeat, fingerprint
 from protocol.clock import FIRST_COMMAND_S, LoopSettings, prepare_process
-from protocol.frames import COUNTERS
 from protocol.role import Role
 from protocol.states import PlantState, PlantTrigger, TripCause
 from protocol.transmit import SILENCE
@@ -61,7 +60,7 @@ class Relay(Tenancy):
         if self.session is None:
             return None
         if self._is_silence(frame, "measurement"):
-            self.counter = (self.counter + 1) % COUNTERS
+            self.counter = (self.counter + 1) % self.wire.measurement.counters
             return frame if self._begun else None
         read = self.wire.measurement.unpack(frame)
         if read is None:

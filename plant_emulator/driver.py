@@ -16,7 +16,6 @@ from plant_emulator.front import Front
 from plant_emulator.plant import Plant
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
-from protocol.frames import COUNTERS
 from protocol.links import Arrival
 from protocol.states import TripCause
 from protocol.transmit import SILENCE
@@ -128,7 +127,11 @@ class Driver:
         for sent in self._outgoing(frame):
             echo = self.endpoint.wire.measurement.counter(sent)
             # What has no counter is for who reads it, in lockstep, of the tick after the last.
-            follows = (self._counter + 1) % COUNTERS if self._loop.lockstep else self.endpoint.counter
+            follows = (
+                (self._counter + 1) % self.endpoint.wire.measurement.counters
+                if self._loop.lockstep
+                else self.endpoint.counter
+            )
             self._counter = follows if echo is None else echo
             if sent == SILENCE:
                 echo = self._counter

@@ -15,7 +15,6 @@ from plant_emulator.plant import Measurement, Plant
 from plant_emulator.tenancy import Tenancy
 from protocol.attitude import sent_vector
 from protocol.clock import FIRST_COMMAND_S, WATCHDOG_S
-from protocol.frames import COUNTERS
 from protocol.states import PlantState, PlantTrigger, TripCause
 from protocol.transmit import SILENCE, Sender
 from protocol.wire import WireSpec
@@ -61,11 +60,13 @@ class Endpoint(Tenancy):
         self._level = wire.voltage.quantizer().level
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
         transmit = wire.transmit
-        self._sender = Sender(transmit.measurement, transmit.heartbeat_ticks(period_ns))
+        self._counters = wire.measurement.counters
+        heartbeat = transmit.heartbeat_ticks(period_ns, self._counters)
+        self._sender = Sender(transmit.measurement, heartbeat, self._counters)
         self._hears_silence = lockstep and transmit.command == "on_change"
         # Who hears silence on a clock learns that values are valid again from the next frame that reaches it in time.
         clocked = transmit.measurement == "on_change" and not lockstep
-        self._forgiven = transmit.heartbeat_ticks(period_ns) if clocked else 0
+        self._forgiven = heartbeat if clocked else 0
         self._off = (0.0,) * wire.actuators
         self._voltages: tuple[float, ...] = self._off
         self.protect(watchdog_s, guard)
@@ -74,7 +75,7 @@ class Endpoint(Tenancy):
         self._session_tick = 0  # tick of the session's first measurement
         self._unmeasured_yet = False
         self._fresh_tick = 0  # tick of the last fresh command, or of the grant
-        self._unmeasured = [False] * COUNTERS  # whether the last measurement of each counter had no valid value
+        self._unmeasured = [False] * self._counters  # whether the last measurement of each counter had no valid value
         self._said: tuple[float, ...] = ()  # codes of the last fresh command
         self._echo = -1  # its echo
         self._answered = -1  # and the tick of the measurement that it answered
@@ -137,7 +138,7 @@ class Endpoint(Tenancy):
     @property
     def counter(self) -> int:
         """Counter of the last measurement."""
-        return self.session_tick % COUNTERS
+        return self.session_tick % self._counters
 
     def _encoded(self, seen: Measurement) -> list[float]:
         attitude, rate = seen
@@ -151,21 +152,21 @@ class Endpoint(Tenancy):
         if self.session is None:
             return
         if frame == SILENCE and self._hears_silence and self._said:
-            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % COUNTERS, self._said)
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._said)
         else:
             read = self.wire.command.unpack(frame)
         if read is None:
             self.refused += 1
             return
         echo, codes = read
-        # The echo is a tick modulo 16: the latest measurement with that counter. Newer than the last one answered is
-        # fresh. An echo that never changes is a sender that repeats itself, however long ago it began.
-        answered = self._tick - (self.counter - echo) % COUNTERS
+        # The echo is a tick modulo the counter's range: the latest measurement with that counter. Newer than the last
+        # one answered is fresh. An echo that never changes is a sender that repeats itself, however long ago it began.
+        answered = self._tick - (self.counter - echo) % self._counters
         if echo == self._echo or answered <= self._answered or answered < self._session_tick:
             return
         voltages = tuple(self._level(code) for code in codes)
         if not isfinite(sum(voltages)):
-            if any(self._unmeasured[(echo - ago) % COUNTERS] for ago in range(self._forgiven + 1)):
+            if any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1)):
                 voltages = self._off  # the right answer; how long it may go on is the guard's to say
             else:
                 self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
@@ -196,7 +197,7 @@ class Endpoint(Tenancy):
             quantizer.reset()
         self._voltages = self._off
         self._session_tick = self._fresh_tick = self._tick + 1
-        self._unmeasured = [False] * COUNTERS
+        self._unmeasured = [False] * self._counters
         self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
         self._said, self._echo, self._answered = (), -1, -1
         self._sender.forget()

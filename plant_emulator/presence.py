@@ -16,7 +16,6 @@ from plant_emulator.front import Front
 from plant_emulator.tenancy import Tenancy
 from protocol import topics
 from protocol.clock import LoopSettings, RollingHistogram
-from protocol.frames import COUNTERS
 from protocol.links import Arrival, Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
 from protocol.role import Role
@@ -52,7 +51,7 @@ class Presence(Front):
         self._changed = changed
         self.late = 0
         self._latency = RollingHistogram()
-        self._sent_at = [0] * COUNTERS
+        self._sent_at = [0] * endpoint.wire.measurement.counters
         self._sparse = endpoint.wire.transmit.measurement == "on_change"
         self._sent = self._received = 0
         self._told_state = endpoint.state
@@ -87,8 +86,8 @@ class Presence(Front):
         if self._link is None:
             return
         if self._sparse:
-            for ahead in range(1, COUNTERS // 2):
-                self._sent_at[(counter + ahead) % COUNTERS] = 0  # of these nothing was sent yet
+            for ahead in range(1, len(self._sent_at) // 2):
+                self._sent_at[(counter + ahead) % len(self._sent_at)] = 0  # of these nothing was sent yet
         self._sent_at[counter] = time.monotonic_ns() if frame else 0
         if frame or self._loop.lockstep:
             self._link.send(frame)

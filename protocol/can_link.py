@@ -23,7 +23,7 @@ import can
 from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.errors import AeroloopError
-from protocol.frames import FrameFormat
+from protocol.frames import MIN_COUNTER_BITS, FrameFormat
 from protocol.links import Arrival, Link, Mailbox
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.states import PlantState, TripCause
@@ -68,6 +68,11 @@ class CanSettings(BaseModel):
     channel: str = Field(default="239.74.163.2", description="the interface's: can0, /dev/ttyACM0, a multicast group…")
     node: int = Field(default=1, ge=1, le=MAX_NODE, description="number of the plant on the bus")
     fd: bool = Field(default=False, description="CAN FD, which frames of more than 8 bytes need")
+    short_counter: bool = Field(
+        default=False,
+        description="accept a counter that is too short to tell every late frame from a fresh one; a classic CAN frame "
+        "of 10-bit signals needs counter_bits = 4",
+    )
     options: dict[str, Any] = Field(default={}, description="for the interface, such as bitrate = 1000000")
 
 
@@ -81,11 +86,16 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
         if frame.size <= longest:
             continue
         widest = max(
-            bits for bits in range(MIN_BITS, MAX_BITS + 1) if FrameFormat([bits] * len(frame.widths)).size <= longest
+            bits
+            for bits in range(MIN_BITS, MAX_BITS + 1)
+            if FrameFormat([bits] * len(frame.widths), wire.counter_bits).size <= longest
         )
+        ways = ["set can.fd = true", f"{signals} to {widest} at the most"]
+        if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
+            ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
+        ways_out = ", or ".join(ways)
         raise CanError(
-            f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}: set can.fd = true, "
-            f"or {signals} to {widest} at the most"
+            f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}: {ways_out}"
         )
 
 

@@ -32,7 +32,7 @@ from protocol.can_link import (
     PLANT_HEARTBEAT_ID,
     number_of,
 )
-from protocol.frames import COUNTER_BITS, FrameFormat
+from protocol.frames import FrameFormat
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.messages import PROTOCOL_VERSION
 from protocol.quantizer import UniformQuantizer
@@ -77,17 +77,18 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         raise ValueError(f"a period of {period_ns} ns is not between 1 ns and {_MAX_CYCLE_MS} ms")
     rate = f"one every {period_ns} ns ({1e9 / period_ns:.6g} Hz; the cycle time is in whole ms, rounded up)"
     idle = "Every bit that belongs to no signal must be 0."
-    counter = _unsigned("counter", 0, COUNTER_BITS, "Tick of the plant modulo 16; 0 in a session's first measurement.")
+    bits = wire.counter_bits
+    counted = f"Tick of the plant modulo {1 << bits}; 0 in a session's first measurement."
     measurement = _message(
         "Measurement",
         MEASUREMENT_ID + node,
         _PLANT,
         wire.measurement.size,
-        [counter, *_codes(wire.measurement, _measured(wire))],
+        [_unsigned("counter", 0, bits, counted), *_codes(wire.measurement, _measured(wire))],
         cycle_ms,
         f"What the plant measures: {rate}. {idle}",
     )
-    echo = _unsigned("echo", 0, COUNTER_BITS, "Counter of the measurement that this command answers.")
+    echo = _unsigned("echo", 0, bits, "Counter of the measurement that this command answers.")
     command = _message(
         "Command",
         COMMAND_ID + node,
@@ -163,7 +164,7 @@ def _heartbeat(name: str, identifier: int, sender: str, number: Signal) -> Messa
 
 def _codes(layout: FrameFormat, quantities: Iterable[_Quantity]) -> Iterator[Signal]:
     """The signals that follow a frame's counter."""
-    at = 2 * COUNTER_BITS if None in layout.widths else COUNTER_BITS  # four zero bits precede doubles
+    at = layout.first_bit
     for quantity, width in zip(quantities, layout.widths, strict=True):
         yield _signal(quantity, at)
         at += 64 if width is None else width

@@ -1,64 +1,70 @@
 """Frames: level indices ↔ bytes, and which tick a frame is of.
 
-Sans-I/O. A frame is a 4-bit counter and R-bit codes, most significant bit first, with zero bits up to the byte:
+Sans-I/O. A frame is a counter and R-bit codes, most significant bit first, with zero bits up to the byte:
 
-    measurement  counter:4 · ε₁ ε₂ ε₃ : R_ε each · ω₁ ω₂ ω₃ : R_ω each
-    command      echo:4    · u … : R_u each             (echo: the counter of the measurement it answers)
+    measurement  counter · ε₁ ε₂ ε₃ : R_ε each · ω₁ ω₂ ω₃ : R_ω each
+    command      echo    · u … : R_u each             (echo: the counter of the measurement it answers)
 
-A signal without quantization travels as big-endian doubles; in a frame that holds any, four zero bits follow the
-counter. What arrives malformed is refused whole, with None and never an exception;
-what a caller passes wrongly raises ValueError.
+A signal without quantization travels as big-endian doubles; in a frame that holds any, zero bits fill the counter's
+last byte. What arrives malformed is refused whole, with None and never an exception; what a caller passes wrongly
+raises ValueError.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isinf
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from bitstruct.c import compile as compile_bits
 
-if TYPE_CHECKING:
-    from protocol.wire import WireSpec
-
-COUNTER_BITS: Final = 4
-COUNTERS: Final = 1 << COUNTER_BITS
-"""The counter runs 0…15 and round again."""
+MIN_COUNTER_BITS: Final = 4
+MAX_COUNTER_BITS: Final = 16
+DEFAULT_COUNTER_BITS: Final = 8
 
 
 class FrameFormat:
     """One kind of frame: a counter and `widths` codes; a width of None is a float64.
 
+    Args:
+        widths: Bits of each code.
+        counter_bits: Bits of the counter, 4…16.
+
     Attributes:
+        counter_bits: As given.
+        counters: How many values the counter has; it runs 0…counters − 1 and round again.
         bits: Bits that carry something: counter and codes.
         first_bit: Where the first code begins.
         size: Bytes of a frame, padding included.
     """
 
-    def __init__(self, widths: Sequence[int | None]) -> None:
-        floats = any(width is None for width in widths)
-        gap = 4 if floats else 0
-        self.bits = COUNTER_BITS + sum(64 if width is None else width for width in widths)
-        self.first_bit = COUNTER_BITS + gap
+    def __init__(self, widths: Sequence[int | None], counter_bits: int) -> None:
+        self.widths = tuple(widths)
+        self.counter_bits = counter_bits
+        self.counters = 1 << counter_bits
+        self._floats = [i for i, width in enumerate(widths) if width is None]
+        gap = -counter_bits % 8 if self._floats else 0
+        self.first_bit = counter_bits + gap
+        self.bits = counter_bits + sum(64 if width is None else width for width in widths)
         self.size = -(-(self.bits + gap) // 8)
         tail = 8 * self.size - self.bits - gap
         self._padding = (1 << tail) - 1  # of the last byte
         fields = ["f64" if width is None else f"s{width}" for width in widths]
         self._format = compile_bits(
-            "".join([f"u{COUNTER_BITS}", *([f"u{gap}"] if gap else []), *fields, *([f"u{tail}"] if tail else [])])
+            "".join([f"u{counter_bits}", *([f"u{gap}"] if gap else []), *fields, *([f"u{tail}"] if tail else [])])
         )
         self._gap = (0,) if gap else ()
         self._tail = (0,) if tail else ()
         self._first = 2 if gap else 1
         self._last = self._first + len(widths)
-        self._floats = [i for i, width in enumerate(widths) if width is None]
-        self.widths = tuple(widths)
+        self._counter_bytes = -(-counter_bits // 8)
+        self._below = 8 * self._counter_bytes - counter_bits  # bits below the counter in its last byte
 
     def pack(self, counter: int, codes: Sequence[float]) -> bytes:
         """Bytes of a frame.
 
         Args:
-            counter: 0…15.
+            counter: 0…counters − 1.
             codes: One a signal: ints within R-bit two's complement, or floats where the signal is not quantized.
 
         Raises:
@@ -82,7 +88,7 @@ class FrameFormat:
             return None if read is None else read[0]
         if len(frame) != self.size or frame[-1] & self._padding:
             return None
-        return frame[0] >> (8 - COUNTER_BITS)
+        return int.from_bytes(frame[: self._counter_bytes], "big") >> self._below
 
     def unpack(self, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
         """Counter and codes of a frame, or None if it is malformed: wrong length, non-zero padding, infinite float."""
@@ -99,14 +105,20 @@ class FrameFormat:
 
 
 class TickCounter:
-    """The tick of each measurement, from its four bits and the time it was published.
+    """The tick of each received measurement, from its counter and its time of arrival on the receiver's own clock.
 
-    The plant's grid is absolute and its frames go out on time or late, never early. So the earliest publications mark
-    the grid, and a counter stands for the one tick that has it from 12 before to 3 after where the grid is now: a frame
-    may be held up by 12 ticks, and one judged wrongly does not mislead the next.
+    The plant's grid is absolute, and frames arrive late, never early. So the earliest arrivals mark the grid, and a
+    counter stands for the one tick that has it from 3/4 of the counter's range before to 1/4 after where the grid is
+    now (4 bits: from 12 ticks before to 3 after). A frame may be held up by that long, and one frame that is placed
+    wrongly does not mislead the next.
+
+    Two clocks drift apart. The mark may therefore move to later times by 2 % of the elapsed periods: twice what a clock
+    that runs 1 % fast takes, so that the mark follows either clock's error and still recovers from an early mark. A
+    stream that is late as a whole is taken for its grid at the same pace.
 
     Args:
         period_ns: Period of the plant's grid [ns].
+        counters: How many values the counter has.
         lockstep: Whether nothing is ever skipped, so that no time is needed.
         tick: Tick of the last measurement before the first one given; −1 at a session's start.
 
@@ -114,51 +126,45 @@ class TickCounter:
         tick: Tick of the last measurement that was newer than all before it.
     """
 
-    LATE: Final = 12
+    DRIFT: Final = 50
+    """The mark may move by one period in so many."""
 
-    def __init__(self, period_ns: int, *, lockstep: bool, tick: int = -1) -> None:
+    def __init__(self, period_ns: int, counters: int, *, lockstep: bool, tick: int = -1) -> None:
         self._period_ns = period_ns
+        self._counters = counters
+        self._early = counters // 4 - 1
         self._lockstep = lockstep
-        self._origin_ns: int | None = None  # when tick 0 was due, on the plant's wall clock
+        self._origin_ns: int | None = None  # arrival of tick 0, had it been as fast as the fastest; None in lockstep
         self.tick = tick
 
-    def advance(self, counter: int, published_ns: int) -> int | None:
+    def advance(self, counter: int, at_ns: int) -> int | None:
         """The tick of a measurement; None if it is not newer than the last one.
 
         Args:
-            counter: Its counter, 0…15.
-            published_ns: When it was published, on the plant's wall clock [ns].
+            counter: Its counter.
+            at_ns: When it arrived, on the receiver's monotonic clock [ns].
         """
-        if self._lockstep or self._origin_ns is None:
-            tick = self.tick + 1 + (counter - self.tick - 1) % COUNTERS
-            self._origin_ns = published_ns - tick * self._period_ns
+        if self._origin_ns is None:
+            tick = self.tick + 1 + (counter - self.tick - 1) % self._counters
+            if not self._lockstep:
+                self._origin_ns = at_ns - tick * self._period_ns
         else:
-            latest = round((published_ns - self._origin_ns) / self._period_ns) + COUNTERS - 1 - self.LATE
-            tick = latest - (latest - counter) % COUNTERS
+            latest = round((at_ns - self._origin_ns) / self._period_ns) + self._early
+            tick = latest - (latest - counter) % self._counters
             if tick <= self.tick:
                 return None
-            # A clock that is set, or runs slower than the grid, must not leave the mark behind for good.
-            drift_ns = (tick - self.tick) * self._period_ns // 10_000
-            self._origin_ns = min(self._origin_ns + drift_ns, published_ns - tick * self._period_ns)
+            drift_ns = (tick - self.tick) * self._period_ns // self.DRIFT
+            self._origin_ns = min(self._origin_ns + drift_ns, at_ns - tick * self._period_ns)
         self.tick = tick
         return tick
 
+    def late_ns(self, tick: int, at_ns: int) -> int:
+        """How much later than the fastest frames a tick's frame arrived [ns]; 0 in lockstep and before any frame.
 
-def pack_measurement(spec: WireSpec, counter: int, codes: Sequence[float]) -> bytes:
-    """A measurement frame of codes (ε₁ ε₂ ε₃ ω₁ ω₂ ω₃). Raises ValueError for what does not fit."""
-    return spec.measurement.pack(counter, codes)
-
-
-def unpack_measurement(spec: WireSpec, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
-    """(counter, codes) of a measurement frame, or None if it is malformed."""
-    return spec.measurement.unpack(frame)
-
-
-def pack_command(spec: WireSpec, counter: int, codes: Sequence[float]) -> bytes:
-    """A command frame of codes u that answers measurement `counter`. Raises ValueError for what does not fit."""
-    return spec.command.pack(counter, codes)
-
-
-def unpack_command(spec: WireSpec, frame: bytes) -> tuple[int, tuple[float, ...]] | None:
-    """(echo, codes) of a command frame, or None if it is malformed."""
-    return spec.command.unpack(frame)
+        Args:
+            tick: Its tick.
+            at_ns: When it arrived, on the receiver's monotonic clock [ns].
+        """
+        if self._origin_ns is None:
+            return 0
+        return max(0, at_ns - self._origin_ns - tick * self._period_ns)

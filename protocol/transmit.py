@@ -1,9 +1,9 @@
 """When a frame is sent: every tick, or only when a level changes (Remark 3), with a heartbeat.
 
 What is quantized changes in steps, so a frame that says the same as the last one need not be sent: the other end holds
-the last levels, and nothing is lost. A heartbeat, at least every 15 ticks, tells that the sender still lives and keeps
-its 4-bit counter unmistakable. Where each frame is waited for, in lockstep, silence cannot be heard: there an empty
-frame stands for it, `SILENCE`, which says as much and is no frame.
+the last levels, and nothing is lost. A heartbeat, after less than half the counter's range, shows that the sender
+lives and keeps its counter unmistakable. Where each frame is waited for, in lockstep, silence cannot be received: there
+an empty frame stands for it, `SILENCE`, which says as much and is no frame.
 """
 
 from __future__ import annotations
@@ -16,9 +16,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 SILENCE: Final = b""
 """Stands for a frame that is not sent because it would say what the last one said."""
-
-MOST_TICKS: Final = 15
-"""A counter of four bits tells ticks apart that are no further from each other."""
 
 Policy = Literal["periodic", "on_change"]
 
@@ -35,7 +32,7 @@ class Transmit(BaseModel):
         gt=0,
         le=1,
         allow_inf_nan=False,
-        description="on_change: send at least this often, and at least every 15 ticks [s]",
+        description="on_change: send at least this often, and before half the counter's range has passed [s]",
     )
 
     @model_validator(mode="before")
@@ -43,13 +40,14 @@ class Transmit(BaseModel):
     def _one_word(cls, value: Any) -> Any:
         return {"measurement": value, "command": value} if isinstance(value, str) else value
 
-    def heartbeat_ticks(self, period_ns: int) -> int:
-        """The most ticks from one frame to the next, 1…15.
+    def heartbeat_ticks(self, period_ns: int, counters: int) -> int:
+        """The most ticks from one frame to the next, 1…counters/2 − 1.
 
         Args:
             period_ns: Period of a tick [ns].
+            counters: How many values the counter of frames has.
         """
-        return max(1, min(MOST_TICKS, round(self.heartbeat_s * 1e9) // period_ns))
+        return max(1, min(counters // 2 - 1, round(self.heartbeat_s * 1e9) // period_ns))
 
 
 class Sender:
@@ -58,11 +56,13 @@ class Sender:
     Args:
         policy: When frames are sent.
         heartbeat: The most ticks from one frame to the next.
+        counters: How many values the counter of frames has.
     """
 
-    def __init__(self, policy: Policy, heartbeat: int) -> None:
+    def __init__(self, policy: Policy, heartbeat: int, counters: int) -> None:
         self._always = policy == "periodic"
         self._heartbeat = heartbeat
+        self._counters = counters
         self._said: Sequence[float] | None = None
         self._at: int | None = None
 
@@ -80,7 +80,7 @@ class Sender:
             return False
         # With ticks missed, its counter may be that of the last frame, and it be taken for that one's repetition: then
         # the next tick has to say it again.
-        self._said = None if since is not None and since % (MOST_TICKS + 1) == 0 else codes
+        self._said = None if since is not None and since % self._counters == 0 else codes
         self._at = k
         return True
 

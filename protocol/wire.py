@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from protocol.frames import FrameFormat
+from protocol.frames import DEFAULT_COUNTER_BITS, MAX_COUNTER_BITS, MIN_COUNTER_BITS, FrameFormat
 from protocol.hysteresis import HysteresisQuantizer
 from protocol.logarithmic import LogarithmicQuantizer
 from protocol.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
@@ -105,16 +105,30 @@ class WireSpec(BaseModel):
     voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
     actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
     transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
+    counter_bits: int = Field(
+        default=DEFAULT_COUNTER_BITS,
+        ge=MIN_COUNTER_BITS,
+        le=MAX_COUNTER_BITS,
+        description="bits of the counter in each frame; one that is 2^bits periods late may be taken for a newer one",
+    )
 
     @cached_property
     def measurement(self) -> FrameFormat:
         """Format of a measurement frame: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃."""
-        return FrameFormat([self.attitude.bits] * 3 + [self.rate.bits] * 3)
+        return FrameFormat([self.attitude.bits] * 3 + [self.rate.bits] * 3, self.counter_bits)
 
     @cached_property
     def command(self) -> FrameFormat:
         """Format of a command frame: u₂ u₃, or u₁ u₂ u₃."""
-        return FrameFormat([self.voltage.bits] * self.actuators)
+        return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
+
+    def freshness_ns(self, period_ns: int) -> int:
+        """How late a frame may be before it may be taken for a newer one: 2^counter_bits periods [ns].
+
+        Args:
+            period_ns: Period of a tick [ns].
+        """
+        return period_ns << self.counter_bits
 
     def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
         """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont.".
@@ -128,12 +142,13 @@ class WireSpec(BaseModel):
             voltage=self.voltage.with_bits(inp),
             actuators=self.actuators,
             transmit=self.transmit,
+            counter_bits=self.counter_bits,
         )
 
     def agreed(self) -> dict[str, Any]:
-        """What two ends tell each other of it, as JSON: what they use, so that one that knows no more understands it.
+        """What two ends must agree on, as JSON: what they use, so that an end that knows no more understands it.
 
-        A uniform signal tells nothing of other kinds, and frames that are sent as ever nothing of when.
+        A uniform signal has nothing of other kinds; `transmit` is left out unless some of it is not by default.
         """
         told = self.model_dump(mode="json")
         for name in ("attitude", "rate", "voltage"):

@@ -26,6 +26,7 @@ from protocol import topics
 from protocol.can_link import CanSettings
 from protocol.clock import LoopSettings
 from protocol.errors import AeroloopError
+from protocol.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from protocol.network import NetworkSettings
 from protocol.quantizer import MAX_BITS, MIN_BITS
 from protocol.verbs import Reference, Sinusoid
@@ -76,7 +77,7 @@ class Settings(BaseSettings):
     def _heartbeat_keeps_both_ends_alive(self) -> Settings:
         """One frame may be lost. A loop so slow that every tick has a frame is as it is without `on_change`."""
         transmit, loop = self.wire.transmit, self.loop
-        ticks = transmit.heartbeat_ticks(loop.period_ns)
+        ticks = transmit.heartbeat_ticks(loop.period_ns, self.wire.measurement.counters)
         every_s = ticks * loop.period
         for sends, name, patience_s in (
             ("command", "plant.watchdog_s", self.plant.watchdog_s),
@@ -89,6 +90,29 @@ class Settings(BaseSettings):
                     f"{name}, which is {patience_s * 1e3:g} ms"
                 )
         return self
+
+    @model_validator(mode="after")
+    def _counter_tells_late_frames_from_fresh_ones(self) -> Settings:
+        """Its range is twice the time after which an end acts on missing frames, so that a late one is seen as late."""
+        wire, period_ns, on_can = self.wire, self.loop.period_ns, self.plant.via == "can"
+        patience_s, name = max(
+            (self.plant.watchdog_s, "plant.watchdog_s"), (self.controller.stale_s, "controller.stale_s")
+        )
+        needed_ns = 2 * round(patience_s * 1e9)
+        if self.loop.lockstep or wire.freshness_ns(period_ns) >= needed_ns or (on_can and self.can.short_counter):
+            return self
+        enough = [b for b in range(MIN_COUNTER_BITS, MAX_COUNTER_BITS + 1) if period_ns << b >= needed_ns]
+        ways = [
+            f"set it to {enough[0]}"
+            if enough
+            else f"even {MAX_COUNTER_BITS} bits are too few; shorten {name}, or lower loop.rate_hz"
+        ]
+        if on_can:
+            ways.append("can.short_counter = true accepts it")
+        raise ValueError(
+            f"wire.counter_bits = {wire.counter_bits} counts {wire.freshness_ns(period_ns) * 1e-6:g} ms, less than "
+            f"twice {name}, which is {patience_s * 1e3:g} ms: {', or '.join(ways)}"
+        )
 
     def contract(self) -> dict[str, Any]:
         """The effective configuration, for a role's contract."""

@@ -11,7 +11,6 @@ from array import array
 from collections.abc import Callable, Sequence
 
 from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
-from protocol.frames import COUNTERS
 from protocol.symbolic import Compiled
 from protocol.transmit import SILENCE, Sender
 from protocol.verbs import Change, Gains, Reference
@@ -65,7 +64,9 @@ class Controller:
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
         self._encode = [q.encode for q in self._voltage]
         self._no_command = [q.invalid for q in self._voltage]
-        self._sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(round(period * 1e9)))
+        self._counters = wire.measurement.counters
+        heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), self._counters)
+        self._sender = Sender(wire.transmit.command, heartbeat, self._counters)
         self._hears_silence = wire.transmit.measurement == "on_change"
         self._held: Sequence[float] | None = None  # codes of the last measurement
         self._read, self._write = wire.measurement.unpack, wire.command.pack
@@ -88,7 +89,7 @@ class Controller:
         if frame is None:
             return None
         if frame == SILENCE and self._hears_silence and self._held is not None:
-            return self.answer(k % COUNTERS, self._held, k)
+            return self.answer(k % self._counters, self._held, k)
         read = self._read(frame)
         if read is None:
             self.refused += 1

@@ -114,7 +114,7 @@ class Hearing:
         self._link = link
         self._counter = wire.measurement.counter
         self._grid = TickGrid(loop.period_ns) if own_grid else None
-        self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep)
+        self._ticks = TickCounter(loop.period_ns, wire.measurement.counters, lockstep=loop.lockstep)
         transmit = wire.transmit
         self._lockstep = loop.lockstep
         self._hears_silence = transmit.measurement == "on_change" and not loop.lockstep

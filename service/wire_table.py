@@ -41,7 +41,7 @@ def wire_table(wire: WireSpec) -> None:
         console.print(note, highlight=False)
     frames: tuple[tuple[str, FrameFormat], ...] = (("measurement", wire.measurement), ("command", wire.command))
     for label, kind in frames:
-        console.print(f"{label}: {kind.bits} bits in {kind.size} bytes")
+        console.print(f"{label}: {kind.bits} bits in {kind.size} bytes, {kind.counter_bits} of them the counter")
 
 
 def _steps(quantizer: Quantizer, unit: str) -> tuple[str, str | None]:

@@ -13,8 +13,7 @@ from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.clock import LoopSettings
-from protocol.transmit import Policy, Transmit
+from protocol.transmit import Policy
 from service.config import Settings
 from service.figures import Figures
 from service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings
@@ -95,6 +94,7 @@ class Burden(BaseModel):
     duration_s: float = Field(description="length of each experiment [s]")
     rate_hz: float = Field(description="ticks a second [Hz]")
     heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
+    counter_bits: int = Field(description="bits of the counter in each frame")
     sensors: dict[str, str] = Field(description="what each name stands for")
     points: list[Point]
 
@@ -146,7 +146,8 @@ def measure_burden(
     return Burden(
         duration_s=duration_s,
         rate_hz=settings.loop.rate_hz,
-        heartbeat_s=_heartbeat(settings.wire.transmit, settings.loop) * settings.loop.period,
+        heartbeat_s=_heartbeat(settings) * settings.loop.period,
+        counter_bits=settings.wire.counter_bits,
         sensors={name: SENSORS[name].text for name in dict.fromkeys(cell.sensors for cell in cells)},
         points=[p for name in dict.fromkeys(cell.sensors for cell in cells) for p in _beside_float64(points, name)],
     )
@@ -173,12 +174,12 @@ def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observa
     except LoopEndedError as error:
         return Observation(None, {}, {}, str(error))
     wire, period = settings.wire, settings.loop.period
-    heartbeat = _heartbeat(wire.transmit, settings.loop)
+    heartbeat, counters = _heartbeat(settings), wire.measurement.counters
     seen, said = codes_of(measurements, wire.measurement), codes_of(commands, wire.command)
     rates: dict[Policy, tuple[Traffic, Traffic]] = {}
     zenoh: dict[Policy, LinkBytes] = {}
     for policy in POLICIES:
-        out, inp = sent_ticks(seen, policy, heartbeat), sent_ticks(said, policy, heartbeat)
+        out, inp = (sent_ticks(codes, policy, heartbeat, counters) for codes in (seen, said))
         rates[policy] = traffic(seen, wire.measurement, out, period), traffic(said, wire.command, inp, period)
         if counted:
             zenoh[policy] = count_bytes(settings.network, [measurements[k] for k in out], [commands[k] for k in inp])
@@ -191,8 +192,8 @@ def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
 
 
-def _heartbeat(transmit: Transmit, loop: LoopSettings) -> int:
-    return transmit.heartbeat_ticks(loop.period_ns)
+def _heartbeat(settings: Settings) -> int:
+    return settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns, settings.wire.measurement.counters)
 
 
 def _points(cell: Cell, found: Observation) -> list[Point]:

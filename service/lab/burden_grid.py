@@ -123,6 +123,7 @@ def cell_settings(settings: Settings, cell: Cell) -> Settings:
             voltage=_quantized(wire.voltage, inp, voltage),
             actuators=wire.actuators,
             transmit=Transmit(heartbeat_s=wire.transmit.heartbeat_s),
+            counter_bits=wire.counter_bits,
         )
         sensors = plant.sensors.model_copy(update=SENSORS[cell.sensors].changes)
         measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})

@@ -49,15 +49,16 @@ def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> list[Codes]:
     return [one[1] for one in read if one is not None]
 
 
-def sent_ticks(codes: Sequence[Codes], policy: Policy, heartbeat: int) -> list[int]:
+def sent_ticks(codes: Sequence[Codes], policy: Policy, heartbeat: int, counters: int) -> list[int]:
     """The ticks at which a policy sends.
 
     Args:
         codes: What there is to say at every tick from 0 on.
         policy: When frames are sent.
         heartbeat: The most ticks from one frame to the next.
+        counters: How many values the counter of frames has.
     """
-    sender = Sender(policy, heartbeat)
+    sender = Sender(policy, heartbeat, counters)
     return [k for k, said in enumerate(codes) if sender.due(k, said)]
 
 

@@ -1,9 +1,9 @@
 """Bytes that frames take on a Zenoh link, counted where they pass.
 
 Two sessions, configured as the roles' are, speak through a relay on loopback, and the relay counts what TCP carries:
-the payload and all that Zenoh puts around it (lengths, key, quality of service and, if so configured, time of
-publication and number), without the headers of TCP and IP. What joins the two is not counted. A link keeps itself alive
-with 3 bytes, four times a lease, in a direction that says nothing else; frames leave no time for that.
+the payload and all that Zenoh puts around it (lengths, key, quality of service), without the headers of TCP and IP.
+What joins the two is not counted. A link keeps itself alive with 3 bytes, four times a lease, in a direction that says
+nothing else; frames leave no time for that.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from types import TracebackType
 from typing import Final, NamedTuple, Self
 
@@ -29,6 +30,7 @@ _SESSION: Final = "1ab0ra70"
 _PATIENCE_S: Final = 20.0
 _POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
+_BARE: Final = {"timestamps": False}
 
 
 class CountError(AeroloopError):
@@ -101,21 +103,6 @@ class Relay:
             near.shutdown(socket.SHUT_WR)
 
 
-class _Tally(Mailbox):
-    """Counts frames, and says when so many have come."""
-
-    def __init__(self, expected: int) -> None:
-        super().__init__()
-        self._missing = expected
-        self.complete = threading.Event()
-
-    def put(self, frame: bytes, published_ns: int = 0, number: int | None = None) -> None:
-        super().put(frame, published_ns, number)
-        self._missing -= 1
-        if self._missing == 0:
-            self.complete.set()
-
-
 def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], commands: Sequence[bytes]) -> LinkBytes:
     """Send frames over a Zenoh link, first all of one direction, then all of the other, and count their bytes.
 
@@ -123,7 +110,7 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
     sent. They are sent as in lockstep, blocking rather than dropped; that is one bit of a byte that is there anyway.
 
     Args:
-        network: Whether messages are stamped and numbered, and all else that is not an address.
+        network: All that is not an address.
         measurements: The frames of one direction, in their order.
         commands: The frames of the other.
 
@@ -132,18 +119,16 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
         NetworkError: A session cannot be opened.
     """
     port = _free_port()
-    here = {"rendezvous": "", "gossip": False}  # two need none, and it would be counted
+    here = {"rendezvous": "", "gossip": False, **_BARE}  # two need neither, and they would be counted
     plant_side = network.model_copy(update={**here, "listen": [f"tcp/127.0.0.1:{port}"], "connect": []})
     with Relay(port) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})
         with join(other_side) as controller:
-            to_controller, to_plant = _Tally(len(measurements)), _Tally(len(commands))
+            to_controller, to_plant = (Mailbox(depth=max(1, len(frames))) for frames in (measurements, commands))
             keys = [topics.key(name, _VEHICLE, session=_SESSION) for name in ("measurement", "command")]
-            numbers = network.timestamps
-            plant_end = ZenohLink(plant, keys[0], keys[1], lossless=True, mailbox=to_plant, numbers=numbers)
-            controller_end = ZenohLink(
-                controller, keys[1], keys[0], lossless=True, mailbox=to_controller, numbers=numbers
-            )
+            link = partial(ZenohLink, lossless=True, numbers=False)
+            plant_end = link(plant, keys[0], keys[1], mailbox=to_plant)
+            controller_end = link(controller, keys[1], keys[0], mailbox=to_controller)
             _meet(plant, controller)
             before = relay.back
             _send(plant_end, measurements, to_controller)
@@ -153,11 +138,12 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
             return LinkBytes(measured, relay.there - before)
 
 
-def _send(link: ZenohLink, frames: Sequence[bytes], other: _Tally) -> None:
+def _send(link: ZenohLink, frames: Sequence[bytes], other: Mailbox) -> None:
     for frame in frames:
         link.send(frame)
-    if frames and not other.complete.wait(_PATIENCE_S):
-        raise CountError(f"a Zenoh link over loopback did not carry {len(frames)} frames within {_PATIENCE_S:g} s")
+    for _ in frames:
+        if other.wait(_PATIENCE_S) is None:
+            raise CountError(f"a Zenoh link over loopback did not carry {len(frames)} frames")
 
 
 def _meet(plant: zenoh.Session, controller: zenoh.Session) -> None:

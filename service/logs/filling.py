@@ -14,7 +14,7 @@ from math import floor
 from typing import Final, NamedTuple
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTER_BITS, COUNTERS, FrameFormat, TickCounter
+from protocol.frames import FrameFormat, TickCounter
 from protocol.messages import Lapse
 from protocol.transmit import SILENCE
 
@@ -52,13 +52,14 @@ class Filler:
     """
 
     def __init__(self, kind: FrameFormat, loop: LoopSettings, *, on_grid: bool) -> None:
+        self._kind = kind
         self._counter = kind.counter
         self._period_ns = loop.period_ns
         self._lockstep = loop.lockstep
         self._on_grid = on_grid and not loop.lockstep
         self._last: Read | None = None
         self._grid_ns = 0  # when the tick of the last frame was due, by the earliest publications
-        self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep)  # as the controller has it
+        self._ticks = TickCounter(loop.period_ns, kind.counters, lockstep=loop.lockstep)  # as the controller has it
 
     def reads(self, frame: bytes, published_ns: int) -> list[Read] | None:
         """The frame with those before it that were not sent, in order; None if it is malformed.
@@ -70,7 +71,7 @@ class Filler:
         last = self._last
         if frame == SILENCE:  # in lockstep
             if last is not None:
-                self._last = _silent(last, last.counter + 1, published_ns)
+                self._last = _silent(self._kind, last, last.counter + 1, published_ns)
             return [] if self._last is None else [self._last]
         counter = self._counter(frame)
         if counter is None:
@@ -91,24 +92,25 @@ class Filler:
         else:
             times = [published_ns - ticks + i for i in range(1, ticks)]
         self._last = Read(counter, frame, published_ns, self._grid_ns if self._on_grid else published_ns)
-        return [*(_silent(last, last.counter + i, at_ns) for i, at_ns in enumerate(times, 1)), self._last]
+        return [*(_silent(self._kind, last, last.counter + i, at_ns) for i, at_ns in enumerate(times, 1)), self._last]
 
     def _ticks_since(self, last: Read, counter: int, published_ns: int) -> int:
         """How many ticks a frame is after the last: as many as its counter and its time, if it is late, allow."""
-        steps = (counter - last.counter - 1) % COUNTERS + 1
+        steps = (counter - last.counter - 1) % self._kind.counters + 1
         elapsed = (published_ns - self._grid_ns) / self._period_ns
-        early = COUNTERS - 1 - TickCounter.LATE
-        return max(steps, steps + floor((elapsed + early - steps) / COUNTERS) * COUNTERS)
+        early = self._kind.counters // 4 - 1
+        return max(steps, steps + floor((elapsed + early - steps) / self._kind.counters) * self._kind.counters)
 
 
-def _silent(last: Read, counter: int, at_ns: int) -> Read:
-    return Read(counter % COUNTERS, _as_of(last, counter), at_ns, at_ns, sent=False)
+def _silent(kind: FrameFormat, last: Read, counter: int, at_ns: int) -> Read:
+    return Read(counter % kind.counters, _as_of(kind, last, counter), at_ns, at_ns, sent=False)
 
 
-def _as_of(read: Read, counter: int) -> bytes:
-    """The frame with another counter, modulo 16."""
-    below = 8 - COUNTER_BITS
-    return bytes([counter % COUNTERS << below | read.frame[0] & (1 << below) - 1]) + read.frame[1:]
+def _as_of(kind: FrameFormat, read: Read, counter: int) -> bytes:
+    """The frame with another counter."""
+    said = kind.unpack(read.frame)
+    assert said is not None
+    return kind.pack(counter % kind.counters, said[1])
 
 
 class Lapses:
@@ -116,9 +118,11 @@ class Lapses:
 
     Args:
         lapses: What it told.
+        kind: What the measurements are.
     """
 
-    def __init__(self, lapses: Sequence[Lapse]) -> None:
+    def __init__(self, lapses: Sequence[Lapse], kind: FrameFormat) -> None:
+        self._kind = kind
         self._lapses = deque(sorted(lapses, key=lambda lapse: lapse.tick))
         self._missed_before = 0  # ticks before this one
         self._lost = -1, -1  # of the frames between these ticks none came
@@ -150,4 +154,4 @@ class Lapses:
             self._coming.clear()
         if k < self._missed_before:
             return None
-        return measurement if self._used is None else measurement._replace(frame=_as_of(self._used, k))
+        return measurement if self._used is None else measurement._replace(frame=_as_of(self._kind, self._used, k))

@@ -17,7 +17,7 @@ from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTERS, TickCounter
+from protocol.frames import TickCounter
 from protocol.messages import Lapse, Telemetry
 from protocol.topics import Address
 from protocol.wire import WireSpec
@@ -53,13 +53,14 @@ class Pairing(ABC):
 
     def __init__(self, wire: WireSpec, loop: LoopSettings, lapses: Sequence[Lapse] = ()) -> None:
         self._wire = wire
+        self._counters = wire.measurement.counters
         self._measurement_counter, self._command_counter = wire.measurement.counter, wire.command.counter
         transmit = wire.transmit
         self._fill_measurements = (
             Filler(wire.measurement, loop, on_grid=True) if transmit.measurement == "on_change" else None
         )
         self._fill_commands = Filler(wire.command, loop, on_grid=False) if transmit.command == "on_change" else None
-        self._lapses = Lapses(lapses) if lapses else None
+        self._lapses = Lapses(lapses, wire.measurement) if lapses else None
         self._loop = loop
         self._measured: deque[Read] = deque(maxlen=MAX_WAITING)  # not answered yet
         self._commands: deque[Read] = deque(maxlen=MAX_WAITING)  # commands whose measurement may still be to come
@@ -172,9 +173,9 @@ class Pairing(ABC):
 
         Such a command has no time of its own, but it is of the first tick with its echo after the one answered last.
         """
-        wanted, passed, before = (echo - self._last_counter - 1) % COUNTERS + 1, 0, self._last_counter
+        wanted, passed, before = (echo - self._last_counter - 1) % self._counters + 1, 0, self._last_counter
         for found, read in enumerate(self._measured):
-            passed += (read.counter - before - 1) % COUNTERS + 1
+            passed += (read.counter - before - 1) % self._counters + 1
             if passed >= wanted:
                 return found if passed == wanted else -1
             before = read.counter
@@ -189,9 +190,9 @@ class Pairing(ABC):
                 if pairs[i].measurement.since_ns < published_ns and pairs[i].measurement.counter == telemetry.counter:
                     first = telemetry.tick
                     for pair in reversed(pairs[:i]):
-                        first = _before(first, pair.measurement.counter)
+                        first = _before(first, pair.measurement.counter, self._counters)
                     loop = self._loop
-                    self._ticks = TickCounter(loop.period_ns, lockstep=loop.lockstep, tick=max(0, first) - 1)
+                    self._ticks = TickCounter(loop.period_ns, self._counters, lockstep=loop.lockstep, tick=max(0, first) - 1)
                     self._pairs.clear()
                     for pair in pairs:
                         self._place(self._ticks, *pair)
@@ -207,7 +208,7 @@ class Pairing(ABC):
         if before:
             tick, over = k, []
             for read in reversed(before):
-                tick = _before(tick, read.counter)
+                tick = _before(tick, read.counter, self._counters)
                 if tick <= last:
                     break
                 over.append((tick, read))
@@ -222,9 +223,9 @@ class Pairing(ABC):
             self.answered(k, used, command)
 
 
-def _before(tick: int, counter: int) -> int:
+def _before(tick: int, counter: int, counters: int) -> int:
     """The last tick before this one that has a counter."""
-    return tick - ((tick - counter) % COUNTERS or COUNTERS)
+    return tick - ((tick - counter) % counters or counters)
 
 
 @contextmanager
