@@ -88,6 +88,15 @@ class Sender:
         """A session begins: whatever comes is to be sent."""
         self._said = self._at = None
 
+    @property
+    def memory(self) -> tuple[Sequence[float] | None, int | None]:
+        """Codes and tick of the last frame, which is all that a sender remembers; None for what it does not."""
+        return self._said, self._at
+
+    def resume(self, codes: Sequence[float] | None, k: int | None) -> None:
+        """Go on with the memory of another sender."""
+        self._said, self._at = codes if codes is None else list(codes), k
+
 
 def _same(codes: Sequence[float], said: Sequence[float]) -> bool:
     """Whether two frames have the same bits: 0.0 and −0.0 are equal and have not."""

@@ -9,14 +9,54 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Sequence
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
 
 from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion
+from protocol.quantizer import Quantizer
 from protocol.symbolic import Compiled
 from protocol.transmit import SILENCE, Sender
 from protocol.verbs import Change, Gains, Reference
 from protocol.wire import WireSpec
 from service.law import LawSettings, law_function
-from service.reference import Motion, Plan
+from service.reference import Motion
+
+Codes = tuple[float, ...]
+
+
+class ControllerState(BaseModel):
+    """All that goes from tick to tick, besides reference and gains. As JSON it keeps every bit of its floats.
+
+    Attributes:
+        attitude: q^Q of the last measurement [1].
+        sign: ±1, the equilibrium that is approached; 0 before the first measurement (Assumption 3).
+        damping_estimate: θ̂ [N·m·s/rad].
+        held: Codes of the last measurement, for silence; None before the first. Shape (6,).
+        voltage_codes: Codes of the last voltages that had a valid value, for quantizers with a memory; None before the
+            first. Shape (actuators,).
+        sent_codes: Codes of the last command sent; None where commands are periodic, before the first, and where the
+            next command is sent whatever it says. Shape (actuators,).
+        sent_tick: Its tick.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    attitude: Quaternion = IDENTITY
+    sign: Literal[-1, 0, 1] = 0
+    damping_estimate: Vector
+    held: Codes | None = None
+    voltage_codes: Codes | None = None
+    sent_codes: Codes | None = None
+    sent_tick: int | None = None
+
+
+def resume(quantizers: Sequence[Quantizer], codes: Sequence[float] | None) -> None:
+    """Have quantizers go on as after these codes, one each; as before the first if None."""
+    for i, quantizer in enumerate(quantizers):
+        quantizer.reset()
+        if codes is not None:
+            quantizer.resume(codes[i])
 
 
 class Controller:
@@ -54,24 +94,25 @@ class Controller:
         inputs, outputs = self._law.inputs, self._law.outputs
         desired = {name: inputs[name] for name in ("q_d", "omega_d", "omega_d_dot")}
         self.motion = Motion(reference, shared=desired)
-        self._q, self._omega, self._sign = inputs["q"], inputs["omega"], inputs["s"]
+        self._eps, self._omega, self._sign = inputs["eps"], inputs["omega"], inputs["s"]
+        self._last, self._q = inputs["last"], outputs["q"]
         self._theta, self._theta_next = inputs["theta"], outputs["theta_next"]
         self._u, self._eta_e, self._eps_e = outputs["u"], outputs["eta_e"], outputs["eps_e"]
-        self._theta[:] = memoryview(array("d", law.damping_estimate))
         self.set_gains(Gains(C1=law.C1, C2=law.C2, Gamma=law.Gamma))
-        self._attitude: Quaternion = IDENTITY
         self._first_motor = 3 - wire.actuators
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
         self._encode = [q.encode for q in self._voltage]
-        self._no_command = [q.invalid for q in self._voltage]
+        self._no_command: list[float] = [q.invalid for q in self._voltage]
         self._counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), self._counters)
         self._sender = Sender(wire.transmit.command, heartbeat, self._counters)
         self._hears_silence = wire.transmit.measurement == "on_change"
-        self._held: Sequence[float] | None = None  # codes of the last measurement
+        self._held: Sequence[float] | None  # codes of the last measurement
+        self._voltage_codes: Sequence[float] | None
         self._read, self._write = wire.measurement.unpack, wire.command.pack
         self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
         self._rate_level: Callable[[float], float] = wire.rate.quantizer().level
+        self.restore(ControllerState(damping_estimate=law.damping_estimate))
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Answer a measurement.
@@ -110,9 +151,9 @@ class Controller:
         """The command frame that answers a measurement with this counter and these codes; see `tick`."""
         voltages = self.compute(counter, codes, k)
         if voltages is None:
-            said: list[float] = self._no_command
+            said = self._no_command
         else:
-            said = [encode(u) for encode, u in zip(self._encode, voltages, strict=True)]
+            said = self._voltage_codes = [encode(u) for encode, u in zip(self._encode, voltages, strict=True)]
         return self._write(counter, said) if self._sender.due(k, said) else SILENCE
 
     def compute(self, counter: int, codes: Sequence[float], k: int) -> list[float] | None:
@@ -123,14 +164,13 @@ class Controller:
         if (total := x + y + z + wx + wy + wz) != total:  # NaN: no valid value
             self.invalid += 1
             return None
-        self._attitude = received_quaternion(x, y, z, self._attitude)
-        self._q[0], self._q[1], self._q[2], self._q[3] = self._attitude
+        self._eps[0], self._eps[1], self._eps[2] = x, y, z
         self._omega[0], self._omega[1], self._omega[2] = wx, wy, wz
         self.motion.at(k * self.period)
-        if self.tick_index < 0:
+        if not self._sign[0]:
             self._choose_sign()
         self._law()
-        self._theta[:] = self._theta_next
+        self._last[:], self._theta[:] = self._q, self._theta_next
         self.tick_index, self.counter = k, counter
         voltages: list[float] = self._u.tolist()[self._first_motor :]  # type: ignore[assignment]  # doubles
         if (total := sum(voltages)) != total:
@@ -158,18 +198,35 @@ class Controller:
         """Follow a change as it was told; the next tick must be its first, or later."""
         if change.gains is not None:
             self.set_gains(change.gains)
-        if change.reference is not None:
-            plan, t = Plan.of(change.reference), change.tick * self.period
-            self.motion.follow(plan, t, change.within_s, ease_s=change.ease_s, start=change.start)
+        self.motion.change(change, self.period)
 
-    def resume(self, frame: bytes, k: int, sign: int, damping_estimate: Vector, attitude_error: Vector) -> None:
-        """Take up a session in its middle: the state after tick k, as telemetry told it, with its measurement."""
-        self.tick(frame, k)
-        self._sign[0] = float(sign)
-        self._theta[:] = memoryview(array("d", damping_estimate))
-        if sum(a * b for a, b in zip(self.attitude_error, attitude_error, strict=True)) < 0:  # it followed −q
-            w, x, y, z = self._attitude
-            self._attitude = -w, -x, -y, -z
+    @property
+    def state(self) -> ControllerState:
+        """All that the next tick goes by, besides reference and gains."""
+        said, at = self._sender.memory
+        held, encoded = self._held, self._voltage_codes
+        return ControllerState(
+            attitude=self.attitude,
+            sign=self.sign,  # type: ignore[arg-type]  # one of the three
+            damping_estimate=self.damping_estimate,
+            held=None if held is None else tuple(held),
+            voltage_codes=None if encoded is None else tuple(encoded),
+            sent_codes=None if said is None else tuple(said),
+            sent_tick=at,
+        )
+
+    def restore(self, state: ControllerState) -> None:
+        """Go on, bit for bit, as the controller that had this state, given the same reference and gains."""
+        self._last[:] = memoryview(array("d", state.attitude))
+        self._sign[0] = state.sign
+        self._theta[:] = memoryview(array("d", state.damping_estimate))
+        widths = self.wire.measurement.widths
+        self._held = state.held and [
+            code if width is None else int(code) for code, width in zip(state.held, widths, strict=True)
+        ]
+        self._voltage_codes = state.voltage_codes
+        resume(self._voltage, state.voltage_codes)
+        self._sender.resume(state.sent_codes, state.sent_tick)
 
     @property
     def gains(self) -> Gains:
@@ -190,7 +247,7 @@ class Controller:
     @property
     def attitude(self) -> Quaternion:
         """q^Q of the last measurement [1]."""
-        return self._attitude
+        return tuple(self._last)  # type: ignore[return-value]  # four elements
 
     @property
     def rate(self) -> Vector:

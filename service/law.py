@@ -24,13 +24,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import hypot
-from typing import Annotated
+from typing import Annotated, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from protocol.attitude import R, S
+from protocol.symbolic import along_rows, in_columns
 from protocol.verbs import Gain
 
 
@@ -160,8 +161,38 @@ def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
     return tau - ca.if_else(ca.logic_and(outside > 0, outward > 0), weight * outward, 0) * Gamma @ theta
 
 
-def law_function(p: LawSettings, period: float) -> ca.Function:
-    """The law as the loop evaluates it: one tick, with θ̂ carried over a period by Euler's rule.
+def received(eps: ca.SX, last: ca.SX) -> ca.SX:
+    """q^Q of ε as received: `protocol.attitude.received_quaternion`, as an expression. Shape (4,).
+
+    Args:
+        eps: ε. Shape (3,).
+        last: The q^Q before. Shape (4,).
+    """
+    square = ca.dot(eps, eps)
+    inside = square <= 1
+    eta = ca.if_else(inside, ca.sqrt(1 - square), 0)  # (C.11)
+    q = ca.vertcat(eta, eps / ca.if_else(inside, 1, ca.sqrt(square)))  # Remark 2
+    return q * ca.if_else(ca.dot(q, last) < 0, -1, 1)
+
+
+class Steps(NamedTuple):
+    """A tick of the law in four parts, so that only two of them go from tick to tick.
+
+    Attributes:
+        attitude: last, eps ↦ q. From tick to tick: `last` is the q before.
+        adaptation: q, omega, q_d, omega_d, s, C1, C2, Gamma ↦ tau.
+        estimate: theta, tau, Gamma ↦ theta_next. From tick to tick.
+        command: q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2 ↦ u, eta_e, eps_e, omega_e.
+    """
+
+    attitude: ca.Function
+    adaptation: ca.Function
+    estimate: ca.Function
+    command: ca.Function
+
+
+def law_steps(p: LawSettings, period: float) -> Steps:
+    """The law's parts, with θ̂ carried over a period by Euler's rule.
 
     Args:
         p: Parameters; the gains are inputs.
@@ -171,13 +202,74 @@ def law_function(p: LawSettings, period: float) -> ca.Function:
         ValueError: B cannot be inverted.
     """
     law = build_law(p)
-    theta_next = law.theta + period * law.theta_dot
+    last, eps, tau = ca.SX.sym("last", 4), ca.SX.sym("eps", 3), ca.SX.sym("tau", 3)
+    theta_next = law.theta + period * projection(tau, law.theta, ca.diag(law.Gamma), p.damping_bound)  # (C.38)
     # Euler's step leaves the ball along its tangent; the projection of Remark 5 holds in continuous time only.
     theta_next *= ca.fmin(1, p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
+    errors = law.q, law.omega, law.q_d, law.omega_d
+    return Steps(
+        ca.Function("attitude", [last, eps], [received(eps, last)]),
+        ca.Function("adaptation", [*errors, law.s, law.C1, law.C2, law.Gamma], [law.tau]),
+        ca.Function("estimate", [law.theta, tau, law.Gamma], [theta_next]),
+        ca.Function(
+            "command",
+            [*errors, law.omega_d_dot, law.theta, law.s, law.C1, law.C2],
+            [law.u, law.eta_e, law.eps_e, law.omega_e],
+        ),
+    )
+
+
+_SIZES: Final = {"eps": 3, "omega": 3, "q_d": 4, "omega_d": 3, "omega_d_dot": 3, "s": 1, "C1": 3, "C2": 3, "Gamma": 3}
+
+
+def law_function(p: LawSettings, period: float) -> ca.Function:
+    """The law as the loop evaluates it: one tick. Raises as `law_steps` does.
+
+    Inputs: last, theta, and eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma. `last` is the q before, which the
+    next q is nearest to. Outputs: q, u, theta_next, eta_e, eps_e, omega_e.
+    """
+    steps = law_steps(p, period)
+    last, theta = ca.SX.sym("last", 4), ca.SX.sym("theta", 3)
+    given = {name: ca.SX.sym(name, size) for name, size in _SIZES.items()}
+    eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma = given.values()
+    q = steps.attitude(last, eps)
+    theta_next = steps.estimate(theta, steps.adaptation(q, omega, q_d, omega_d, s, C1, C2, Gamma), Gamma)
+    u, *errors = steps.command(q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2)
     return ca.Function(
         "law",
-        [law.q, law.omega, law.q_d, law.omega_d, law.omega_d_dot, law.theta, law.s, law.C1, law.C2, law.Gamma],
-        [law.u, theta_next, law.eta_e, law.eps_e, law.omega_e],
-        ["q", "omega", "q_d", "omega_d", "omega_d_dot", "theta", "s", "C1", "C2", "Gamma"],
-        ["u", "theta_next", "eta_e", "eps_e", "omega_e"],
+        [last, theta, *given.values()],
+        [q, u, theta_next, *errors],
+        ["last", "theta", *given],
+        ["q", "u", "theta_next", "eta_e", "eps_e", "omega_e"],
+        {"cse": True},  # two parts need the errors
+    )
+
+
+def law_of_many(p: LawSettings, period: float, rows: int) -> ca.Function:
+    """The law as a reader of logs evaluates it: many ticks in a row. Raises as `law_steps` does.
+
+    Args:
+        p: Parameters; the gains are inputs.
+        period: Time between ticks [s].
+        rows: How many ticks; a multiple of `protocol.symbolic.UNROLLED`.
+
+    Returns:
+        A function with the inputs and outputs of `law_function`. `last` and `theta` are those before the first tick;
+        everything else has a row a tick, shape (rows, …). One output more: theta_before, the θ̂ that each u is made of.
+    """
+    steps = law_steps(p, period)
+    last, first = ca.MX.sym("last", 4), ca.MX.sym("theta", 3)
+    given = {name: ca.MX.sym(name, rows, size) for name, size in _SIZES.items()}
+    eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma = given.values()
+    q = along_rows(steps.attitude, last, eps)
+    tau = in_columns(steps.adaptation, rows)(q, omega, q_d, omega_d, s, C1, C2, Gamma)
+    theta_next = along_rows(steps.estimate, first, tau, Gamma)
+    theta = ca.vertcat(first.T, theta_next[:-1, :])
+    u, *errors = in_columns(steps.command, rows)(q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2)
+    return ca.Function(
+        "law_of_many",
+        [last, first, *given.values()],
+        [q, u, theta_next, *errors, theta],
+        ["last", "theta", *given],
+        ["q", "u", "theta_next", "eta_e", "eps_e", "omega_e", "theta_before"],
     )

@@ -22,7 +22,7 @@ from protocol import attitude
 from protocol.attitude import Quaternion, Vector
 from protocol.errors import AeroloopError
 from protocol.symbolic import Buffer, Compiled
-from protocol.verbs import Hold, Points, Reference, Sinusoid
+from protocol.verbs import Change, Hold, Points, Reference, Sinusoid
 
 Floats = NDArray[np.float64]
 
@@ -306,6 +306,12 @@ class Motion:
             replace(plan, **{name: getattr(plan, name)[:way] for name in plan.__annotations__}).check(limits)
         self.plan = plan
         self._load(plan.piece(t))
+
+    def change(self, change: Change, period: float) -> None:
+        """Follow the reference of a change, if it has one, from its tick on; period in s."""
+        if change.reference is not None:
+            t = change.tick * period
+            self.follow(Plan.of(change.reference), t, change.within_s, ease_s=change.ease_s, start=change.start)
 
     def attitude(self, t: float) -> Quaternion:
         """q_d at time t [s]."""

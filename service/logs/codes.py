@@ -1,4 +1,4 @@
-"""Frames, codes and levels, thousands at once: protocol/frames.py and quantizer.py as numpy does them, to the last bit.
+"""Frames, codes and levels, thousands at once, to the last bit what protocol/frames.py and quantizer.py make of each.
 
 Codes stand in rows of doubles, which hold those of 16 bits and those that are not quantized alike.
 """
@@ -6,9 +6,12 @@ Codes stand in rows of doubles, which hold those of 16 bits and those that are n
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from math import nan
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.frames import FrameFormat
 from protocol.hysteresis import HysteresisQuantizer
@@ -18,36 +21,45 @@ from protocol.wire import SignalSpec
 from service.logs.report import Array
 
 
-def codes_in(kind: FrameFormat, frames: Sequence[bytes]) -> Array:
-    """What `unpack` says of frames that it does not refuse: the codes of each. Shape (n, codes)."""
-    octets = np.frombuffer(b"".join(frames), dtype=np.uint8).reshape(len(frames), kind.size)
-    bits = np.unpackbits(octets, axis=1)
-    codes = np.empty((len(frames), len(kind.widths)))
+def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array:
+    """What `unpack` says of frames that it does not refuse: the codes of each.
+
+    Args:
+        kind: Their format.
+        frames: Bytes each; or an array with a frame in each element, dtype V, or with a frame in each row, dtype uint8.
+
+    Returns:
+        Codes, those of one signal side by side in memory. Shape (n, codes).
+    """
+    octets = frames if isinstance(frames, np.ndarray) else np.frombuffer(b"".join(frames), dtype=np.uint8)
+    octets = np.ascontiguousarray(octets).view(np.uint8).reshape(len(frames), kind.size)
+    # A code begins within a byte and ends at most 16 bits, or for a double 64, later; past the end there are zeros.
+    columns = np.zeros((kind.size + 9, len(frames)), dtype=np.uint8)
+    columns[: kind.size] = octets.T
+    codes = np.empty((len(kind.widths), len(frames)))
     at = kind.first_bit
     for i, width in enumerate(kind.widths):
+        byte, bit = divmod(at, 8)
         if width is None:
-            codes[:, i] = np.packbits(bits[:, at : at + 64], axis=1).view(">f8")[:, 0]
-            at += 64
+            first = np.ascontiguousarray(columns[byte : byte + 8].T).view(">u8")[:, 0].astype(np.uint64)
+            codes[i] = (first << bit | columns[byte + 8] >> (8 - bit)).view(np.float64)
         else:
-            worth = 2.0 ** np.arange(width - 1, -1, -1)
-            worth[0] *= -1  # two's complement
-            codes[:, i] = bits[:, at : at + width] @ worth
-            at += width
-    return codes
+            a, b, c = columns[byte : byte + 3].astype(np.int32)
+            codes[i] = (a << 24 | b << 16 | c << 8) << bit >> (32 - width)  # two's complement: the sign fills
+        at += 64 if width is None else width
+    return codes.T
 
 
 def levels(signal: SignalSpec, codes: Array) -> Array:
     """The level of each code, in the signal's unit; NaN of one that says "no valid value". Any shape."""
+    table = _levels(signal)
+    return codes if table is None else table[codes.astype(np.intp)]  # a negative index counts from the end
+
+
+@lru_cache(maxsize=8)
+def _levels(signal: SignalSpec) -> Array | None:
     quantizer = signal.quantizer()
-    if isinstance(quantizer, CodedQuantizer):
-        return np.array(quantizer.levels)[codes.astype(np.intp)]  # a negative index counts from the end, as in a list
-    return codes
-
-
-def encoded(signal: SignalSpec, values: Array) -> Array:
-    """The code of each value, by a quantizer a column that has encoded nothing yet; see `encoded_by`. Any shape."""
-    columns = values.reshape(len(values), -1).T
-    return np.stack([encoded_by(signal.quantizer(), column) for column in columns], axis=1).reshape(values.shape)
+    return np.array(quantizer.levels) if isinstance(quantizer, CodedQuantizer) else None
 
 
 def encoded_by(quantizer: Quantizer, values: Array) -> Array:

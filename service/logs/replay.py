@@ -20,7 +20,7 @@ from protocol.verbs import Change
 from protocol.wire import SignalSpec
 from service.config import Settings, load_over
 from service.figures import added, squares
-from service.logs.blocks import BlockController
+from service.logs.batch import BatchController
 from service.logs.codes import codes_in, levels
 from service.logs.files import LogFiles, Which
 from service.logs.filling import Read
@@ -71,7 +71,7 @@ class Replayer(Pairing):
 
     def __init__(self, settings: Settings, changes: Sequence[Change], lapses: Sequence[Lapse] = ()) -> None:
         super().__init__(settings.wire, settings.loop, lapses)
-        self._controller = BlockController(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self._controller = BatchController(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._changes = deque(changes)
         self._period = settings.loop.period
         self._begun = False
@@ -125,14 +125,23 @@ class Replayer(Pairing):
         held = next((pair for pair in self._held if pair[0] == tick), None)
         if held is None:
             return
-        controller, voltages = self._controller, self._voltages([held])
-        told = telemetry.sign, telemetry.damping_estimate, telemetry.attitude_error
-        if held is self._held[0] and told == (controller.sign, controller.damping_estimate, controller.attitude_error):
+        controller, told = self._controller, (telemetry.sign, telemetry.damping_estimate)
+        codes = codes_in(self._wire.measurement, [held[1].frame])
+        computed = controller.compute_all(np.array([tick]), codes, self._changes)
+        now = controller.state
+        same = tuple(computed.attitude_error[0].tolist()) == telemetry.attitude_error
+        if held is self._held[0] and same and told == (now.sign, now.damping_estimate):
             self.first_tick = tick  # the session's very first: nothing had been computed before it
-            self._compare([held], voltages)
+            self._compare([held], computed.voltages)
         else:
-            controller.resume(held[1].frame, tick, *told)
-            controller.sent(self._logged_codes([pair for pair in self._held if pair[0] <= tick]))
+            w, x, y, z = now.attitude
+            if float(computed.attitude_error[0] @ telemetry.attitude_error) < 0:  # it followed −q
+                w, x, y, z = -w, -x, -y, -z
+            logged = self._logged_codes([pair for pair in self._held if pair[0] <= tick])
+            valid = logged[~np.isnan(levels(self._wire.voltage, logged)).any(axis=1)][-1:].tolist()
+            encoded = tuple(valid[0]) if valid else None
+            update = {"sign": told[0], "damping_estimate": told[1], "attitude": (w, x, y, z), "voltage_codes": encoded}
+            controller.restore(now.model_copy(update=update))
             self.first_tick = tick + 1
         self._begun = True
         self._waiting += [pair for pair in self._held if pair[0] > tick]
@@ -167,7 +176,7 @@ class Replayer(Pairing):
 
     def _compare(self, pairs: Sequence[Pair], voltages: Array) -> None:
         """Compare logged commands with what the law commands."""
-        signal, ours = self._wire.voltage, self._controller.commands(voltages)
+        signal, ours = self._wire.voltage, self._controller.commands(np.array([k for k, *_ in pairs]), voltages).codes
         theirs = self._logged_codes(pairs)
         differ = np.flatnonzero((ours.view(np.int64) != theirs.view(np.int64)).any(axis=1))  # an echo cannot differ
         if len(differ) and self.first_difference is None:

@@ -1,7 +1,7 @@
 """The review: every figure, from a log alone.
 
 The log holds the configuration (in the roles' contracts) and the frames, so the review computes from each measurement
-what the controller did, to the last bit (blocks.py). A measurement counts once a command has answered it or a later
+what the controller did, to the last bit (batch.py). A measurement counts once a command has answered it or a later
 one: what the controller never used, it does not answer for.
 """
 
@@ -22,7 +22,7 @@ from protocol.topics import Address
 from protocol.verbs import Change
 from service.config import ConfigError, Settings
 from service.figures import Figures, Score
-from service.logs.blocks import BlockController
+from service.logs.batch import BatchController
 from service.logs.codes import codes_in, levels
 from service.logs.files import LogFiles, ReviewError, Which
 from service.logs.filling import Read
@@ -65,7 +65,7 @@ class Session(Pairing):
         self.settings = settings
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
         self.observer = Observer(settings, trial)
-        self._controller = BlockController(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self._controller = BatchController(settings.wire, settings.law, settings.reference, settings.loop.period)
         self._changes = deque(changes)
         self._watch = watch
         self._passed_over: list[tuple[int, Read]] = []
