@@ -96,7 +96,9 @@ class BatchController:
         self._motion = Motion(reference)
         self._gains = {name: np.array(getattr(law, name)) for name in Gains.model_fields}
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
-        self._sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(round(period * 1e9)))
+        counters = wire.measurement.counters
+        heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), counters)
+        self._sender = Sender(wire.transmit.command, heartbeat, counters)
         self.restore(ControllerState(damping_estimate=law.damping_estimate))
 
     @property
