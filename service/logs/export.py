@@ -20,7 +20,7 @@ from protocol.host import versions
 from protocol.messages import Telemetry, Truth
 from service.config import ConfigError, Settings
 from service.logs.files import LogFiles, ReviewError, Which
-from service.logs.mcap_records import Damage
+from service.logs.mcap_file import Damage
 from service.logs.review import read
 from service.logs.spool import Pile, Records, Spool, Window
 from service.logs.table import Rows, groups, telemetry_fields, tick_fields, truth_fields

@@ -12,20 +12,27 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
+from mcap.writer import Writer
+
 from protocol import topics
 from protocol.host import versions
 from protocol.messages import model_of
 from service.logs.decoded import Decoded
-from service.logs.mcap_records import CHUNK_BYTES
-from service.logs.mcap_writer import McapWriter
+from service.logs.mcap_file import CHUNK_BYTES
 from service.logs.schemas import Shape, json_shape
 from service.recording.intake import Taken
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
 
+NO_LIMIT: Final = 1 << 60
+"""A chunk size [bytes] that none reaches: `LogFile.commit` alone closes chunks."""
+
+MESSAGE_HEAD: Final = 31
+"""Bytes of a message record in front of its data."""
+
 
 class _WholeChunks:
-    """A file that grows by what `commit` can write whole."""
+    """A stream for `Writer`, and a file that grows by what `flush` can write whole."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -39,7 +46,7 @@ class _WholeChunks:
     def tell(self) -> int:
         return self.size + len(self._pending)
 
-    def commit(self) -> None:
+    def flush(self) -> None:
         """Write what is pending to the disk itself, or leave the file as it was and raise OSError."""
         if not self._pending:
             return
@@ -84,7 +91,9 @@ class LogFile:
         self._out = _WholeChunks(path)
         self._channels: dict[str, int] = {}
         self._shapes: dict[Shape, int] = {}
-        self._writer = McapWriter(self._out, library=f"aeroloop {versions()['aeroloop']}")
+        self._gathered = 0  # bytes of messages in the open chunk
+        self._writer = Writer(self._out, chunk_size=NO_LIMIT, enable_data_crcs=True)  # type: ignore[arg-type]  # it calls write, tell and flush
+        self._writer.start(profile="aeroloop", library=f"aeroloop {versions()['aeroloop']}")
 
     @property
     def size(self) -> int:
@@ -94,7 +103,7 @@ class LogFile:
     @property
     def full(self) -> bool:
         """Whether the chunk has grown as large as one should be."""
-        return self._writer.gathered >= CHUNK_BYTES
+        return self._gathered >= CHUNK_BYTES
 
     @property
     def replaced(self) -> bool:
@@ -106,12 +115,12 @@ class LogFile:
 
         Args:
             taken: The message.
-            sequence: Its number on its key, in this run.
+            sequence: Its publisher's number, of which MCAP keeps 32 bits; 0 if it has none.
         """
         channel = self._channels.get(taken.key)
         if channel is None:
             channel = self._channels[taken.key] = self._raw_channel(taken.key)
-        self._writer.add_message(channel, taken.arrived_ns, taken.published_ns, taken.payload, sequence)
+        self._add(channel, taken.arrived_ns, taken.published_ns, taken.payload, sequence)
 
     def add_decoded(self, decoded: Decoded) -> None:
         """Add what was made from a message, under a topic of its own; its log time is that message's publication."""
@@ -120,7 +129,7 @@ class LogFile:
             shape = self._schema(decoded.shape)
             channel = self._writer.register_channel(decoded.topic, decoded.shape.message_encoding, shape)
             self._channels[decoded.topic] = channel
-        self._writer.add_message(channel, decoded.at_ns, decoded.at_ns, decoded.data)
+        self._add(channel, decoded.at_ns, decoded.at_ns, decoded.data, 0)
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Add a metadata record."""
@@ -129,17 +138,17 @@ class LogFile:
     def attach_specification(self, at_ns: int) -> None:
         """Attach the wire's specification, by which frames are read."""
         text = files("protocol").joinpath("SPEC.md").read_bytes()
-        self._writer.add_attachment(at_ns, "protocol/SPEC.md", "text/markdown", text)
+        self._writer.add_attachment(at_ns, at_ns, "protocol/SPEC.md", "text/markdown", text)
 
     def commit(self) -> None:
         """Close the chunk and write it. Raises OSError; what could not be written is written with the next."""
-        self._writer.close_chunk()
-        self._out.commit()
+        self._gathered = 0
+        self._writer.flush()
 
     def end(self) -> None:
         """Write the last chunk and the index, and close the file. After an OSError it can only be abandoned."""
         self._writer.finish()
-        self._out.commit()
+        self._out.flush()
         self._out.close()
 
     def abandon(self) -> None:
@@ -151,6 +160,10 @@ class LogFile:
         self._out.close()
         with suppress(OSError):
             self.path.unlink()
+
+    def _add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int) -> None:
+        self._writer.add_message(channel, log_time, data, publish_time, sequence & 0xFFFF_FFFF)
+        self._gathered += MESSAGE_HEAD + len(data)
 
     def _raw_channel(self, key: str) -> int:
         address = topics.read_key(key)

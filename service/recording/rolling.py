@@ -11,7 +11,6 @@ from __future__ import annotations
 import errno
 import json
 import re
-import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,15 +23,7 @@ from pydantic import ValidationError
 from protocol.errors import AeroloopError
 from protocol.verbs import Change
 from service.logs.decoded import Decoded
-from service.logs.mcap_records import (
-    CHANGE_METADATA,
-    CONTRACT_METADATA,
-    HEADER,
-    METADATA,
-    RECORDER_METADATA,
-    metadata,
-    records,
-)
+from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA, RECORDER_METADATA, opening
 from service.recording.intake import Taken
 from service.recording.log_file import LogFile
 from service.settings import RecorderSettings
@@ -300,13 +291,10 @@ class RollingLog:
 
     def _is_own(self, path: Path) -> bool:
         """Whether a file says of itself that it is of this run, or, if we name ours by the time, of another such."""
-        with suppress(OSError, ValueError, KeyError, TypeError, struct.error):
-            head = next((record for record in records(path) if record.opcode != HEADER), None)
-            if head is None or head.opcode != METADATA:
-                return False
-            name, entries = metadata(head.content)
-            if name == RECORDER_METADATA:
-                said = json.loads(entries["json"])
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            head = opening(path)
+            if head is not None and head.name == RECORDER_METADATA:
+                said = json.loads(head.metadata["json"])
                 runs = re.escape(self._base.stem) if self.settings.path else r"aeroloop-\d{8}-\d{6}"
                 return said["part"] == path.stem and re.fullmatch(runs, said["run"]) is not None
         return False

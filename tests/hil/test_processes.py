@@ -18,13 +18,14 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Channel
 
 from protocol import topics
 from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
 from service.logs.files import ReviewError
-from service.logs.mcap_records import CHANNEL, Channel, records
+from service.logs.mcap_file import records
 from service.logs.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
@@ -152,7 +153,7 @@ def grown(log: Path) -> Callable[[], bool]:
     def holds_frames() -> bool:
         if not log.exists() or not log.stat().st_size:
             return False
-        topics_in_it = {Channel.read(record.content).topic for record in records(log) if record.opcode == CHANNEL}
+        topics_in_it = {record.topic for record in records(log) if isinstance(record, Channel)}
         return any(topic.startswith("aeroloop/") and topic.endswith("/command") for topic in topics_in_it)
 
     return holds_frames

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from mcap.records import Channel, Message
 
 from protocol import topics
 from protocol.messages import Loss, Status
@@ -21,7 +22,7 @@ from service.bench import Bench, free_rendezvous
 from service.config import Settings, load
 from service.hil import Hil
 from service.logs.files import LogFiles
-from service.logs.mcap_records import CHANNEL, MESSAGE, Channel, Message, records
+from service.logs.mcap_file import records
 from service.logs.replay import replay
 from service.logs.review import review
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
@@ -52,15 +53,13 @@ def _frames(paths: Sequence[Path]) -> Iterator[tuple[Path, str, Message]]:
     for path in paths:
         channels: dict[int, str] = {}
         for record in records(path):
-            if record.opcode == CHANNEL:
-                channel = Channel.read(record.content)
-                channels[channel.id] = channel.topic
-            elif record.opcode == MESSAGE:
-                message = Message.read(record.content)
-                key = channels[message.channel]
+            if isinstance(record, Channel):
+                channels[record.id] = record.topic
+            elif isinstance(record, Message):
+                key = channels[record.channel_id]
                 address = topics.read_key(key)
                 if address is not None and address.topic.carries == "frame":
-                    yield path, key, message
+                    yield path, key, record
 
 
 class Heard:

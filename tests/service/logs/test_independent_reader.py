@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Channel, Message
 
 from service.recording import rolling
 from service.logs.export import export
 from service.recording.intake import Taken
-from service.logs.mcap_records import CHANNEL, CHUNK, MESSAGE, Channel, Message, records
+from service.logs.mcap_file import records
 from service.logs.recover import RecoverError, recover
 from service.settings import RecorderSettings
 from tests.service.logs.made_log import make_log
@@ -75,16 +77,14 @@ def ours(path: Path) -> Counts:
     channels: dict[int, str] = {}
     counts: Counts = {}
     for record in records(path):
-        if record.opcode == CHANNEL:
-            channel = Channel.read(record.content)
-            channels[channel.id] = channel.topic
-        elif record.opcode == MESSAGE:
-            message = Message.read(record.content)
-            topic, at_ns = channels[message.channel], message.log_time
+        if isinstance(record, Channel):
+            channels[record.id] = record.topic
+        elif isinstance(record, Message):
+            topic, at_ns = channels[record.channel_id], record.log_time
             known = counts.get(topic, Count(0, 0, at_ns, at_ns))
             counts[topic] = Count(
                 known.messages + 1,
-                known.content + len(message.data),
+                known.content + len(record.data),
                 min(known.first_ns, at_ns),
                 max(known.last_ns, at_ns),
             )
@@ -115,7 +115,7 @@ def with_a_damaged_chunk(whole: Path, out: Path) -> Path:
     at = 8
     while at < len(data) - 8:
         length = int.from_bytes(data[at + 1 : at + 9], "little")
-        if data[at] == CHUNK:
+        if data[at] == Opcode.CHUNK:
             chunks.append((at + 9, length))
         at += 9 + length
     start, length = chunks[len(chunks) // 2]

@@ -6,6 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 
 from protocol import topics
 from service.config import load
@@ -13,7 +14,7 @@ from service.figures import Figures, Stream
 from service.lab.experiment import run_experiment
 from service.logs.files import LogFiles, ReviewError
 from service.logs.limits import Limit, LimitError
-from service.logs.mcap_records import CHANGE_METADATA, CHUNK, Damage, records
+from service.logs.mcap_file import CHANGE_METADATA
 from service.logs.replay import SessionReplay, replay
 from service.logs.review import review
 from tests.service.logs.made_log import AN_OPERATORS_WORDS, make_log
@@ -107,9 +108,6 @@ def test_a_file_cut_anywhere_gives_what_was_whole_before_the_cut_and_says_so(tmp
     cut = tmp_path / "cut.mcap"
     for size in {*(rng.randrange(8, len(data)) for _ in range(300)), *(end + d for end in ends for d in (-1, 0, 1))}:
         cut.write_bytes(data[:size])
-        damages: list[Damage] = []
-        read = [record.content for record in records(cut, damages)]
-        assert read == [record.content for record in records(whole)][: len(read)]
         complete = sum(end <= size for end in ends)
         if complete == 0:
             continue
@@ -126,7 +124,7 @@ def _chunks(data: bytes, path: Path) -> list[int]:
     while at < len(data) - 8:
         opcode, length = data[at], int.from_bytes(data[at + 1 : at + 9], "little")
         at += 9 + length
-        if opcode == CHUNK:
+        if opcode == Opcode.CHUNK:
             ends.append(at)
     assert len(ends) >= TICKS // 100, path
     return ends

@@ -19,7 +19,7 @@ from service.logs import grounds
 from service.logs.display import review_account
 from service.logs.grounds import Library, damping_of
 from service.logs.limits import Limit
-from service.logs.mcap_records import CONTRACT_METADATA
+from service.logs.mcap_file import CONTRACT_METADATA
 from service.logs.plots import draw_theorem
 from service.logs.report import Findings, Line, TheoremFindings
 from service.logs.review import Kept, read, report

@@ -6,16 +6,9 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
+from mcap.records import Channel, Message, Metadata
 
-from service.logs.mcap_records import (
-    CHANNEL,
-    MESSAGE,
-    METADATA,
-    Channel,
-    Message,
-    metadata,
-    records,
-)
+from service.logs.mcap_file import records
 from service.recording import rolling
 from service.recording.intake import Taken
 from tests.service.logs.made_log import AN_OPERATORS_WORDS, make_log
@@ -33,15 +26,13 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
     messages: list[Taken] = []
     contract: dict[str, str] = {}
     for record in records(path):
-        if record.opcode == METADATA:
-            _, contract = metadata(record.content)
-        elif record.opcode == CHANNEL:
-            channel = Channel.read(record.content)
-            channels[channel.id] = channel.topic
-        elif record.opcode == MESSAGE:
-            message = Message.read(record.content)
+        if isinstance(record, Metadata):
+            contract = record.metadata
+        elif isinstance(record, Channel):
+            channels[record.id] = record.topic
+        elif isinstance(record, Message):
             # it comes some time after it was published, so that the two cannot be taken for each other
-            messages.append(Taken(channels[message.channel], message.data, message.publish_time, message.log_time + 77))
+            messages.append(Taken(channels[record.channel_id], record.data, record.publish_time, record.log_time + 77))
     return Story(contract["key"], contract["json"].encode(), messages)
 
 
