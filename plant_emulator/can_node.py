@@ -81,29 +81,24 @@ class CanFront(Front):
             self._begin(heard)
             self.follow_session()
 
-    def send(self, frame: bytes, counter: int) -> None:
+    def send(self, frame: bytes) -> None:
         """Send a measurement frame of the session; SILENCE only where it could not be heard, in lockstep."""
-        del counter
         if frame or self._loop.lockstep:
             self._bus.send(frame)
-
-    def arrived(self, arrival: Arrival) -> bool:
-        """Every command that comes is in time: a bus keeps none back."""
-        del arrival
-        return True
 
     def follow_session(self) -> None:
         """Tell what happened, on the heartbeat at once and on stderr."""
         for notice in self._endpoint.notices:
             log.log(logging.WARNING if notice.kind == "tripped" else logging.INFO, "node: %s", notice.text)
         self._endpoint.notices.clear()
+        self._endpoint.operations.clear()  # the bridge writes the trace
         if self._endpoint.state is not self._told:
             self._told = self._endpoint.state
             self.tell()
 
-    def after_tick(self, k: int) -> None:
-        """Tell what happened."""
-        del k
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Tell what happened. The trace is written at the bridge."""
+        del measurement, arrival, sent_ns
         self.follow_session()
         self.tell_when_due()
 

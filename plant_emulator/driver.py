@@ -50,8 +50,9 @@ class Driver:
         self._loop = loop
         self._settings = settings
         self._stop = stop
-        self._k = -1
         self._counter = 0  # of the measurement sent last
+        self._command_bytes = wire.command.size
+        self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
         self.endpoint = Endpoint(
             plant,
             wire,
@@ -78,6 +79,8 @@ class Driver:
     def reconfigure(self, settings: PlantSettings) -> None:
         """Take over what can change between two ticks: limits and watchdog."""
         self._settings = settings
+        changed = {"watchdog_s": settings.watchdog_s, "limits": settings.limits.model_dump()}
+        self.endpoint.operated("reconfigure", settings=changed)
         guard = settings.guard(self._loop.period_ns, self.endpoint.wire.voltage.quantizer().outermost)
         self.endpoint.protect(settings.watchdog_s, guard)
 
@@ -115,29 +118,35 @@ class Driver:
                 time.sleep(IDLE_WAIT_S if self._front.link is None else 0)
                 self._front.tell_when_due()
                 continue
-            echo = self._tick(arrival, self._k + 1)
+            echo = self._tick(arrival, self.endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
 
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """One tick of the plant end, without the network: as `Endpoint.tick`, with what stands in between.
+
+        Args:
+            frame: The newest command frame received since the last tick, or None.
+            k: Tick index, from 0, rising.
+        """
+        if frame and len(frame) != self._command_bytes:
+            frame = self._malformed
+        return self.endpoint.tick(self._incoming(frame), k)
+
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        """One tick of the plant end. Returns the counter that an answer to its measurement will echo, if one will."""
-        arrival = self._incoming(arrival)
-        in_time = arrival is not None and self._front.arrived(arrival)
-        frame = self.endpoint.tick(arrival.frame if arrival is not None and in_time else None, k)
+        """One tick on the network. Returns the counter that an answer to its measurement will echo, if one will."""
+        front, measured = self._front, self.endpoint.wire.measurement
+        measurement = self.tick(arrival.frame if arrival is not None else None, k)
+        sent_ns = time.monotonic_ns()
         echo = None
-        for sent in self._outgoing(frame):
-            echo = self.endpoint.wire.measurement.counter(sent)
-            # What has no counter is for who reads it, in lockstep, of the tick after the last.
-            follows = (
-                (self._counter + 1) % self.endpoint.wire.measurement.counters
-                if self._loop.lockstep
-                else self.endpoint.counter
-            )
-            self._counter = follows if echo is None else echo
-            if sent == SILENCE:
-                echo = self._counter
-            self._front.send(sent, self._counter)
-        self._k = k
-        self._front.after_tick(k)
+        for sent in self._outgoing(measurement):
+            front.send(sent)
+            if self._loop.lockstep:
+                # The controller reads what has no counter as the tick after its last.
+                echo = measured.counter(sent)
+                self._counter = (self._counter + 1) % measured.counters if echo is None else echo
+                if sent == SILENCE:
+                    echo = self._counter
+        front.after_tick(measurement, arrival, sent_ns)
         return echo
 
     def _await_answer(self, echo: int) -> Arrival | None:
@@ -160,9 +169,9 @@ class Driver:
         """Whether the next step in lockstep may be taken now."""
         return True
 
-    def _incoming(self, arrival: Arrival | None) -> Arrival | None:
+    def _incoming(self, frame: bytes | None) -> bytes | None:
         """A command as it comes from the network; returned as the endpoint is to have it."""
-        return arrival
+        return frame
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
         """A measurement as the endpoint gives it; returned as what goes to the network."""

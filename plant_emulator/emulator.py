@@ -7,7 +7,6 @@ have come. On Zenoh it also tells the truth, takes faults while it runs, and ste
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 
 from plant_emulator.driver import Driver
@@ -65,21 +64,36 @@ class Emulator(Driver):
         faults = settings.parsed_faults
         self._measurements = FaultyStream("measurement", faults, settings.fault_seed)
         self._commands = FaultyStream("command", faults, settings.fault_seed)
+        self._session: str | None = None
 
-    def _incoming(self, arrival: Arrival | None) -> Arrival | None:
-        if self.endpoint.session is not None:
+    def inject(self, fault: Fault | None) -> None:
+        """Add a fault whose start and end are counted from now; None clears all.
+
+        Raises:
+            ValueError: A fault of a motor that the plant does not have.
+        """
+        if fault is None:
+            self._faulty.clear()
+            self._measurements.clear()
+            self._commands.clear()
+        else:
+            self._faulty.inject(fault)
+            self._measurements.inject(fault, self._faulty.time)
+            self._commands.inject(fault, self._faulty.time)
+        self.endpoint.operated("inject", name=None if fault is None else str(fault))
+
+    def _incoming(self, frame: bytes | None) -> bytes | None:
+        session = self.endpoint.session
+        if session != self._session:
+            self._session = session
+            self._measurements.forget()
+            self._commands.forget()
+        if session is not None:
             self._faulty.start()
-        if self._commands.idle:
-            return arrival
-        frame, sent_ns = (arrival.frame, arrival.published_ns) if arrival else (None, 0)
-        passed = self._commands.passes(frame, self._faulty.time, sent_ns)
-        if not passed:
-            return None
-        return Arrival(passed[-1], time.monotonic_ns(), self._commands.last_sent_ns)
+        passed = self._commands.passes(frame, self._faulty.time)
+        return passed[-1] if passed else None
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
-        if self._measurements.idle:
-            return super()._outgoing(frame)
         if frame == SILENCE and not self._loop.lockstep:  # then it is no frame, and nothing befalls it
             return self._measurements.passes(None, self._faulty.time) or [SILENCE]
         return self._measurements.passes(frame, self._faulty.time)
@@ -108,7 +122,7 @@ class EmulatorOnZenoh(Emulator):
         """Run until the role is told to stop; then 0 V and a last status."""
         self._role.serve("inject", Inject, lambda inject: self._inject(inject.fault))
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        super().run(front or Presence(self._role, self._loop, self.endpoint, latest_s=self._settings.watchdog_s))
+        super().run(front or Presence(self._role, self._loop, self.endpoint))
 
     def reconfigure(self, settings: PlantSettings) -> None:
         """Take over limits, watchdog, and how often the truth is told."""
@@ -145,24 +159,15 @@ class EmulatorOnZenoh(Emulator):
             raise FaultError(str(error)) from None
 
         def inject() -> Answer:
-            if fault is None:
-                self._faulty.clear()
-                self._measurements.clear()
-                self._commands.clear()
-                return self._told("no faults any more")
             try:
-                self._faulty.inject(fault)
+                self.inject(fault)
             except ValueError as error:
                 raise FaultError(str(error)) from None
-            self._measurements.inject(fault, self._faulty.time)
-            self._commands.inject(fault, self._faulty.time)
-            return self._told(f"fault injected: {fault}")
+            text = "no faults any more" if fault is None else f"fault injected: {fault}"
+            self._role.event("fault", text, self.endpoint.session, self.endpoint.event_tick)
+            return Answer(done=True, text=text)
 
         return inject
-
-    def _told(self, text: str) -> Answer:
-        self._role.event("fault", text, self.endpoint.session)
-        return Answer(done=True, text=text)
 
     def _advance(self, seconds: float) -> Answer:
         if self._steps is None:

@@ -1,26 +1,18 @@
 """Faults at work on frames: a stream in one direction that loses, delays, repeats and garbles them as it is told.
 
-Faults act one after another, in the order in which they came, each with its own random numbers. A frame keeps the time
-at which it was sent, however late it comes out; one that was garbled, too.
+Faults act one after another, in the order in which they came, each with its own random numbers.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from plant_emulator.faults import Fault
 from plant_emulator.faulty import generator
-
-
-class Sent(NamedTuple):
-    """A frame, and when it was sent, on whatever clock the caller keeps [ns]."""
-
-    frame: bytes
-    at_ns: int
 
 
 class StreamFault:
@@ -35,13 +27,13 @@ class StreamFault:
         fault: What goes wrong and when.
     """
 
-    def __init__(self, fault: Fault, random: np.random.Generator, last: Sent | None) -> None:
+    def __init__(self, fault: Fault, random: np.random.Generator, last: bytes | None) -> None:
         self.fault = fault
         self._value = 0.0 if fault.value is None else fault.value
         self._random, self._last = random, last
-        self._held: deque[tuple[float, Sent]] = deque()  # when each is due, and what
+        self._held: deque[tuple[float, bytes]] = deque()  # when each is due, and what
 
-    def apply(self, frames: list[Sent], t: float) -> list[Sent]:
+    def apply(self, frames: list[bytes], t: float) -> list[bytes]:
         """What passes at time t [s], of these frames and of those held back. Call it once a tick."""
         match self.fault.kind:
             case "delay":
@@ -53,7 +45,7 @@ class StreamFault:
             case "stuck":
                 return self._stuck(frames, t)
             case "garble":
-                return [self._flipped(sent) if sent.frame and self._happens(t) else sent for sent in frames]
+                return [self._flipped(frame) if frame and self._happens(t) else frame for frame in frames]
             case "drop":
                 return [frame for frame in frames if not self._happens(t)]
             case _:
@@ -63,10 +55,14 @@ class StreamFault:
         """Whether it has ended by time t [s] and holds nothing back."""
         return self.fault.over(t) and not self._held
 
+    def forget(self) -> None:
+        """Hold nothing back any more."""
+        self._held.clear()
+
     def _happens(self, t: float) -> bool:
         return self.fault.active(t) and bool(self._random.random() < self._value)
 
-    def _delayed(self, frames: list[Sent], t: float) -> list[Sent]:
+    def _delayed(self, frames: list[bytes], t: float) -> list[bytes]:
         """When the fault ends, what is on its way comes at once, ahead of what is not late any more."""
         active = self.fault.active(t)
         self._held.extend((round(t + self._value, 9), frame) for frame in frames)
@@ -75,12 +71,12 @@ class StreamFault:
             passed.append(self._held.popleft()[1])
         return passed
 
-    def _duplicated(self, frames: list[Sent], t: float) -> list[Sent]:
+    def _duplicated(self, frames: list[bytes], t: float) -> list[bytes]:
         again = [frame for _, frame in self._held]
         self._held = deque((t, frame) for frame in frames if self._happens(t))
         return again + frames
 
-    def _reordered(self, frames: list[Sent], t: float) -> list[Sent]:
+    def _reordered(self, frames: list[bytes], t: float) -> list[bytes]:
         passed = []
         for frame in frames:
             if self._held:
@@ -91,7 +87,7 @@ class StreamFault:
                 passed.append(frame)
         return passed
 
-    def _stuck(self, frames: list[Sent], t: float) -> list[Sent]:
+    def _stuck(self, frames: list[bytes], t: float) -> list[bytes]:
         if not frames:
             return []
         if not self.fault.active(t):
@@ -101,12 +97,11 @@ class StreamFault:
             self._last = frames[0]
         return [self._last] * len(frames)
 
-    def _flipped(self, sent: Sent) -> Sent:
-        frame = sent.frame
+    def _flipped(self, frame: bytes) -> bytes:
         bit = int(self._random.integers(8 * len(frame)))
         flipped = bytearray(frame)
         flipped[bit // 8] ^= 0x80 >> bit % 8
-        return sent._replace(frame=bytes(flipped))
+        return bytes(flipped)
 
 
 class FaultyStream:
@@ -116,37 +111,27 @@ class FaultyStream:
         signal: Which direction it is.
         faults: What goes wrong; those of other signals are left to others.
         seed: Of all random numbers, from 0 up.
-
-    Attributes:
-        last_sent_ns: When the last frame that has passed was sent [ns].
     """
 
     def __init__(self, signal: Literal["measurement", "command"], faults: Sequence[Fault], seed: int = 0) -> None:
         self._signal, self._seed = signal, seed
         self._attached = 0
-        self._last: Sent | None = None
-        self.last_sent_ns = 0
+        self._last: bytes | None = None
         self._faults: list[StreamFault] = []
         for fault in faults:
             self.inject(fault, 0.0)
 
-    @property
-    def idle(self) -> bool:
-        """Whether frames pass as they are: no fault is there, and none holds a frame back."""
-        return not self._faults
-
-    def passes(self, frame: bytes | None, t: float, sent_ns: int = 0) -> list[bytes]:
+    def passes(self, frame: bytes | None, t: float) -> list[bytes]:
         """Take in the frame of a tick, and say what comes out.
 
         Args:
             frame: The frame, or None.
             t: The plant's time [s], rising.
-            sent_ns: When the frame was sent [ns].
 
         Returns:
             What passes at this tick, in the order in which it does.
         """
-        frames = [] if frame is None else [Sent(frame, sent_ns)]
+        frames = [] if frame is None else [frame]
         if self._faults:
             t = round(t, 9)
             for fault in self._faults:
@@ -154,8 +139,7 @@ class FaultyStream:
             self._faults = [fault for fault in self._faults if not fault.done(t)]
         if frames:
             self._last = frames[-1]
-            self.last_sent_ns = self._last.at_ns
-        return [sent.frame for sent in frames]
+        return frames
 
     def inject(self, fault: Fault, now: float) -> None:
         """Add a fault whose start and end are counted from `now` [s], if it is one of this signal."""
@@ -163,6 +147,11 @@ class FaultyStream:
             random = generator(self._seed, self._attached, fault)
             self._faults.append(StreamFault(fault.later(now), random, self._last))
             self._attached += 1
+
+    def forget(self) -> None:
+        """Frames that are held back are lost: another session's key is not theirs."""
+        for fault in self._faults:
+            fault.forget()
 
     def clear(self) -> None:
         """No faults any more; a frame that one held back is lost."""

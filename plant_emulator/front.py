@@ -40,20 +40,22 @@ class Front(ABC):
         """Do what has come for the time between two ticks: claims, releases, an operator's words."""
 
     @abstractmethod
-    def send(self, frame: bytes, counter: int) -> None:
+    def send(self, frame: bytes) -> None:
         """Send a measurement frame of the session; SILENCE only where it could not be heard, in lockstep."""
-
-    @abstractmethod
-    def arrived(self, arrival: Arrival) -> bool:
-        """Keep count of a command frame. Whether it came in time to be acted upon."""
 
     @abstractmethod
     def follow_session(self) -> None:
         """Tell what happened, and close the link of a session that ended."""
 
     @abstractmethod
-    def after_tick(self, k: int) -> None:
-        """Tell what happened at tick k, and how things are when that is due."""
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Account for a tick once its measurement is out: its row of the trace, what happened, a status that is due.
+
+        Args:
+            measurement: As the endpoint made it; SILENCE where it has nothing new, None where there is none.
+            arrival: What was received since the last tick, before any injected fault; None for nothing.
+            sent_ns: When the measurement was sent, on `time.monotonic_ns()`.
+        """
 
     @abstractmethod
     def tell_when_due(self) -> None:

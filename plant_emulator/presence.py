@@ -1,8 +1,8 @@
 """What controllers and operators see of a plant: whoever stands at the plant end stands on the network through this.
 
-It answers claims and operators' verbs, opens and closes the session's link, tells status and events, and keeps count of
-the frames. Claims, verbs and lost peers come from Zenoh's threads and wait for the owner to take them between ticks:
-the endpoint is only ever touched by one thread.
+It answers claims and operators' verbs, opens and closes the session's link, publishes status, events and the trace, and
+counts the frames. Claims, verbs and lost peers come from Zenoh's threads and wait for the owner to take them between
+ticks: the endpoint is only ever touched by one thread.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from threading import Condition
 from typing import Final
 
 from plant_emulator.front import Front
+from plant_emulator.plant_trace import PlantTrace, batches_per_s
 from plant_emulator.tenancy import Tenancy
 from protocol import topics
 from protocol.clock import LoopSettings, RollingHistogram
 from protocol.links import Arrival, Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
 from protocol.role import Role
+from protocol.trace import Outcome
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask
 
@@ -32,31 +34,24 @@ class Presence(Front):
         role: Its name there.
         loop: The grid.
         endpoint: Who grants, refuses and trips.
-        latest_s: A command is acted upon for so long after it was sent, and no longer [s].
         changed: Notified when a command arrives, for an owner that waits for more than one thing.
-
-    Attributes:
-        late: Commands that came too late to be acted upon.
     """
 
-    def __init__(
-        self, role: Role, loop: LoopSettings, endpoint: Tenancy, latest_s: float, changed: Condition | None = None
-    ) -> None:
+    def __init__(self, role: Role, loop: LoopSettings, endpoint: Tenancy, changed: Condition | None = None) -> None:
         super().__init__()
         self._role = role
         self._loop = loop
         self._endpoint = endpoint
-        self._latest_ns = round(latest_s * 1e9)
         self._link: ZenohLink | None = None
         self._changed = changed
-        self.late = 0
+        self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
-        self._sent_at = [0] * endpoint.wire.measurement.counters
-        self._sparse = endpoint.wire.transmit.measurement == "on_change"
+        self._counters = endpoint.wire.measurement.counters
+        self._sent_at: list[tuple[int, int]] = []  # session tick of each counter's last frame, and when it was sent
         self._sent = self._received = 0
         self._told_state = endpoint.state
         self._since = _now() if endpoint.cause else None
-        self._k = self._status_tick = -1
+        self._status_tick = -1
         self._status_due = 0
         self._status_time = time.monotonic()
 
@@ -68,6 +63,7 @@ class Presence(Front):
     def serve(self) -> None:
         """Answer claims and operators from now on."""
         role = self._role
+        role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
         role.serve("arm", Ask, lambda _: self._arm)
@@ -81,45 +77,34 @@ class Presence(Front):
         if self._role.take_inbox():
             self.follow_session()
 
-    def send(self, frame: bytes, counter: int) -> None:
+    def send(self, frame: bytes) -> None:
         """Send a measurement frame of the session; silence is sent only where it could not be heard, in lockstep."""
-        if self._link is None:
-            return
-        if self._sparse:
-            for ahead in range(1, len(self._sent_at) // 2):
-                self._sent_at[(counter + ahead) % len(self._sent_at)] = 0  # of these nothing was sent yet
-        self._sent_at[counter] = time.monotonic_ns() if frame else 0
-        if frame or self._loop.lockstep:
+        if self._link is not None and (frame or self._loop.lockstep):
             self._link.send(frame)
-        self._sent += frame != SILENCE
+            self._sent += frame != SILENCE
 
-    def arrived(self, arrival: Arrival) -> bool:
-        """Keep count of a command frame, and of how long it took. Whether it came in time to be acted upon.
-
-        The four bits of its echo repeat every 16 ticks, so they cannot tell a stream that is late for good; its time of
-        publication can. That is never before the publication of the measurement it answers, on the plant's own clock,
-        whatever the controller's clock says (hybrid logical clocks), so nothing that is in time is taken for late.
-        """
-        self._received += arrival.frame != SILENCE
-        late_ns = time.time_ns() - arrival.published_ns
-        if late_ns > self._latest_ns and not self._loop.lockstep:
-            text = f"commands come {late_ns * 1e-6:.0f} ms after they were sent: refused"
-            self._role.warn("late", "fault", text, self._endpoint.session)
-            self.late += 1
-            return False
-        read = self._endpoint.wire.command.unpack(arrival.frame)
-        if read is not None and (sent_at := self._sent_at[read[0]]) and arrival.at_ns > sent_at:
-            self._latency.add(arrival.at_ns - sent_at)
-        return True
-
-    def after_tick(self, k: int) -> None:
-        """Tell what happened at tick k, and the status once a second."""
-        self._k = k
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Account for a tick once its measurement is out: latency, the trace's row, events, a status that is due."""
+        endpoint = self._endpoint
+        self._trace.row(endpoint, measurement, arrival, sent_ns)
+        if endpoint.outcome is Outcome.ACTED:
+            answered = endpoint.answered
+            tick, at_ns = self._sent_at[answered % self._counters]
+            if tick == answered >= 0:
+                self._latency.add((sent_ns if arrival is None else arrival.at_ns) - at_ns)
+        elif endpoint.outcome is Outcome.STALE:
+            text = "commands answer measurements older than the watchdog's time: refused"
+            self._role.warn("stale", "fault", text, endpoint.session, endpoint.event_tick)
+        if measurement:
+            self._sent_at[endpoint.session_tick % self._counters] = endpoint.session_tick, sent_ns
+        if arrival is not None:
+            self._received += arrival.frame != SILENCE
         self.follow_session()
         self.tell_when_due()
 
     def follow_session(self) -> None:
-        """Tell what happened, and close the link of a session that ended."""
+        """Publish what happened, and close the link of a session that ended."""
+        self._trace.follow(self._endpoint)
         endpoint = self._endpoint
         if endpoint.state is not self._told_state:
             self._told_state = endpoint.state
@@ -147,6 +132,7 @@ class Presence(Front):
     def leave(self) -> None:
         """Tell that the plant is at 0 V and goes."""
         self.follow_session()
+        self._trace.finish()
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
         self.tell()
 
@@ -182,13 +168,13 @@ class Presence(Front):
     def _open_link(self, session: str) -> None:
         """Listen for commands before the grant goes out, so that the first one finds somebody."""
         vehicle = self._role.vehicle
+        self._sent_at = [(-1, 0)] * self._counters
         self._link = ZenohLink(
             self._role.zenoh,
             send_key=topics.key("measurement", vehicle, session=session),
             receive_key=topics.key("command", vehicle, session=session),
             lossless=self._loop.lockstep,
             mailbox=Mailbox(self._changed),
-            numbers=self._role.numbers,
         )
 
     def tell(self) -> None:
@@ -204,12 +190,13 @@ class Presence(Front):
                 cause=endpoint.cause,
                 since=self._since,
                 uptime_s=self._role.uptime_s,
-                ticks=self._k + 1,
-                rate_hz=max(0.0, (self._k - self._status_tick) / (now - self._status_time)),
+                ticks=endpoint.ticked + 1,
+                rate_hz=max(0.0, (endpoint.ticked - self._status_tick) / (now - self._status_time)),
                 skipped=self.skipped,
                 received=self._received,
                 sent=self._sent,
-                refused=endpoint.refused + self.late,
+                refused=endpoint.refused,
+                stale=endpoint.stale,
                 saturated=endpoint.saturated,
                 latency_us=summary(self._latency.total),
                 recent_latency_us=summary(self._latency.recent()),
@@ -217,7 +204,7 @@ class Presence(Front):
                 notes=self.notes,
             )
         )
-        self._status_tick, self._status_time = self._k, now
+        self._status_tick, self._status_time = endpoint.ticked, now
         self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
 

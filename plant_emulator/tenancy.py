@@ -16,19 +16,22 @@ A tripped plant, and one that starts unarmed, refuse claims and say why. A claim
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from protocol.clock import FIRST_COMMAND_S
 from protocol.messages import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal
 from protocol.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
+from protocol.trace import Operation, OperationKind, Outcome
 from protocol.wire import WireSpec
 
 
 class Notice(NamedTuple):
-    """Something for the `event` topic."""
+    """Something for the `event` topic; `tick` is the session's, None before its first measurement."""
 
     kind: EventKind
     text: str
     session: str | None
+    tick: int | None
 
 
 class Trip(NamedTuple):
@@ -52,7 +55,12 @@ class Tenancy:
         holder: Controller that holds it, or None.
         trip: The cause of the last trip, until it is cleared.
         notices: What happened since the owner last emptied this list.
+        operations: What changed this end between its ticks since the owner last emptied this list.
+        ticked: Index of the last tick; −1 before the first.
+        outcome: What was done at the last tick with the command received before it.
+        voltages: In force from the last tick to the next command [V]. Shape (actuators,).
         refused: Malformed frames so far.
+        stale: Commands so far that answered a measurement older than the watchdog's time.
         unavailable: Why no claim can be granted now, for a reason that only the owner can see; None if there is none.
     """
 
@@ -64,7 +72,12 @@ class Tenancy:
         self.holder: str | None = None
         self.trip: TripCause | None = None
         self.notices: list[Notice] = []
-        self.refused = 0
+        self.operations: list[Operation] = []
+        self.ticked = -1
+        self.outcome = Outcome.NONE
+        self.off = (0.0,) * wire.actuators
+        self.voltages: tuple[float, ...] = self.off
+        self.refused = self.stale = 0
         self.unavailable: str | None = None
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self._latch: str | None = None if armed else "not armed since it was started"
@@ -79,6 +92,21 @@ class Tenancy:
     def cause(self) -> str | None:
         """Why claims are held back, or None."""
         return self._latch
+
+    @property
+    def session_tick(self) -> int:
+        """Tick of the last measurement since the session's first, which has 0; −1 before that."""
+        return -1
+
+    @property
+    def answered(self) -> int:
+        """Session tick that the command in force answers; −1 for none."""
+        return -1
+
+    @property
+    def event_tick(self) -> int | None:
+        """The session tick of what happens now; None without a session and before its first measurement."""
+        return self.session_tick if self.session is not None and self.session_tick >= 0 else None
 
     @property
     def saturated(self) -> int:
@@ -106,6 +134,7 @@ class Tenancy:
             return Refusal(reason=f"{self._latch}; `aeroloop op arm` clears it")
         self._machine.fire(PlantTrigger.GRANT)
         self.session, self.holder = claim.session, claim.controller
+        self.operated("claim", claim=claim)
         self._begin()
         self._notice("claimed", f"granted to {claim.controller}")
         return Grant(session=claim.session)
@@ -114,6 +143,7 @@ class Tenancy:
         """End a session at its holder's wish: 0 V. False if it is not the session that runs."""
         if session != self.session:
             return False
+        self.operated("release", name=session)
         self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}")
         return True
 
@@ -121,6 +151,7 @@ class Tenancy:
         """Clear what holds claims back; the next one is granted. False while a controller holds the plant."""
         if self.session is not None:
             return False
+        self.operated("arm")
         self._operator_stop = False
         self._clear()
         self._notice("armed", "armed by an operator: the next claim is granted")
@@ -128,18 +159,40 @@ class Tenancy:
 
     def stop(self) -> None:
         """An operator's stop, from any state: 0 V, and no claim is granted before `arm`."""
+        self.operated("stop")
         self._trip(TripCause.OPERATOR, "stopped by an operator")
         self._operator_stop = True
 
     def lost(self, controller: str) -> None:
         """A controller's liveliness token went; if it held the plant, its session ends: 0 V."""
         if controller == self.holder:
+            self.operated("lost", name=controller)
             self._trip(TripCause.HOLDER_GONE, f"{controller} is gone")
 
     def expire(self, cause: TripCause, reason: str) -> None:
         """End a session for a reason that only its owner can see, such as no answer in lockstep: 0 V."""
         if self.session is not None:
+            self.operated("expire", cause=cause, reason=reason)
             self._trip(cause, reason)
+
+    def operated(self, kind: OperationKind, **what: Any) -> None:
+        """Note something that changed this end after its last tick; fields as in Operation."""
+        self.operations.append(Operation(tick=self.ticked, kind=kind, **what))
+
+    def first_command_ns(self, watchdog_ns: int) -> int:
+        """How long a granted claim may wait for its first command [ns].
+
+        An echo counts as fresh by its age modulo the counter. A stream that is late by a whole round of it would look
+        fresh from its first command on, so that has to come before the counter is back at 0. A counter that is short
+        by configuration cannot tell, and gets the usual time.
+
+        Args:
+            watchdog_ns: The watchdog's time [ns].
+        """
+        usual, counters = round(FIRST_COMMAND_S * 1e9), self.wire.measurement.counters
+        if counters * self.period_ns < 2 * watchdog_ns:
+            return usual
+        return min(usual, (counters - 1) * self.period_ns)
 
     def _begin(self) -> None:
         """A session begins."""
@@ -162,4 +215,4 @@ class Tenancy:
         self._rest()
 
     def _notice(self, kind: EventKind, text: str) -> None:
-        self.notices.append(Notice(kind, text, self.session))
+        self.notices.append(Notice(kind, text, self.session, self.event_tick))

@@ -31,7 +31,7 @@ class PlantTrigger(StrEnum):
 
 
 class TripCause(StrEnum):
-    """Why a plant end trips. On a CAN bus a cause is its place in this list, from 1."""
+    """Why a plant end trips. In traces and on a CAN bus a cause is its number."""
 
     COMMAND_TIMEOUT = "no command in time"
     INVALID_COMMAND = "invalid command"
@@ -43,6 +43,11 @@ class TripCause(StrEnum):
     NO_ANSWER = "no answer in lockstep"
     BUS = "bus lost"
     NODE = "node lost"
+
+    @property
+    def number(self) -> int:
+        """Its place in this list, from 1."""
+        return list(TripCause).index(self) + 1
 
 
 class ControllerState(StrEnum):

@@ -47,11 +47,16 @@ _MASK: Final = 0xFFFF_FFFF
 
 
 class Sent(IntEnum):
-    """What an end did with the frame of a tick: a measurement at the plant, a command at the controller."""
+    """What an end did with the frame of a tick: a measurement at the plant, a command at the controller.
+
+    The plant's `received_as` says with it what was received since the last tick.
+    """
 
     NONE = 0
     FRAME = 1
     SILENT = 2
+    MALFORMED = 3
+    """Received, of another length than the wire's frames: nothing of it is in the row."""
 
 
 class Received(IntEnum):
@@ -81,11 +86,14 @@ class Outcome(IntEnum):
     """An injected fault keeps it back."""
 
 
+OperationKind = Literal["claim", "release", "arm", "stop", "lost", "expire", "inject", "reconfigure"]
+
+
 class Operation(Message):
     """Something that changed the plant end between two ticks. With the rows, the end's run can be computed again."""
 
     tick: int = Field(ge=-1, description="the last tick of the plant before it; −1: before the first")
-    kind: Literal["claim", "release", "arm", "stop", "lost", "expire", "inject", "reconfigure"]
+    kind: OperationKind
     claim: Claim | None = Field(default=None, description="claim: as it was granted")
     name: str | None = Field(default=None, description="release: session; lost: controller; inject: fault, null: none")
     cause: TripCause | None = Field(default=None, description="expire: the cause")

@@ -41,4 +41,4 @@ def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> N
 
     driver = BoardDriver(loop, wire, plant, role.stop)
     reload_on_hangup(role, settings, load, lambda new: driver.reconfigure(new.plant))
-    driver.run(Presence(role, loop, driver.endpoint, latest_s=plant.watchdog_s))
+    driver.run(Presence(role, loop, driver.endpoint))
