@@ -37,6 +37,7 @@ class LogFiles:
     Attributes:
         paths: The files, in the order of their first messages.
         contracts: Who took part, by vehicle and role; the last of each.
+        first_contracts: The first of each.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
 
@@ -46,6 +47,7 @@ class LogFiles:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.contracts: dict[tuple[str, str], Contract] = {}
+        self.first_contracts: dict[tuple[str, str], Contract] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
         starts = {path: self._prelude(path) for path in _files(paths)}
@@ -125,7 +127,9 @@ class LogFiles:
                     if record.name == CONTRACT_METADATA:
                         self._add_contract(record.metadata["json"].encode(), path)
                     elif record.name.startswith(METADATA_PREFIX):
-                        self.metadata[record.name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
+                        self.metadata[record.name.removeprefix(METADATA_PREFIX)] = (
+                            said if isinstance(said, dict) else {}
+                        )
         except NotMcapError as error:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
@@ -144,6 +148,7 @@ class LogFiles:
             raise ReviewError(f"{path} is a log of protocol version {version}; read it with {written_by} wrote it")
         contract = Contract.model_validate(said)
         self.contracts[contract.vehicle, contract.role] = contract
+        self.first_contracts.setdefault((contract.vehicle, contract.role), contract)
 
 
 def _is_contract(key: str) -> bool:
