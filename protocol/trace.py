@@ -5,7 +5,7 @@ columns, which compress to two thirds of the records' size:
 
     header (112 bytes) · columns, one after another · tail (JSON)
 
-`SPEC.md`, section 5, defines every byte, with golden vectors. Both writers are sans-I/O: the owner passes times and
+`SPEC.md`, section 10, defines every byte, with golden vectors. Both writers are sans-I/O: the owner passes times and
 publishes what `take` returns. Times in rows are whole microseconds after the header's `monotonic_ns`, on the end's own
 monotonic clock; nothing here compares the clocks of two hosts.
 """
@@ -384,7 +384,8 @@ class TraceWriter:
         rows = self.rows
         base_ns = self._base_ns if rows else now_ns
         tail = Tail(state=self.state, changes=self.changes, operations=self.operations)
-        text = b"" if tail == _NO_TAIL else tail.model_dump_json(exclude_defaults=True).encode()
+        nothing = {name for name, value in tail if not value}
+        text = b"" if len(nothing) == len(Tail.model_fields) else tail.model_dump_json(exclude=nothing).encode()
         header = _HEADER.pack(
             PROTOCOL_VERSION,
             ENDS.index(self.end),
@@ -406,9 +407,6 @@ class TraceWriter:
         self.rows = 0
         self.state, self.changes, self.operations = None, [], []
         return b"".join([header, *columns, text])
-
-
-_NO_TAIL: Final = Tail()
 
 
 def _record_format(end: End, measurement: int, command: int, actuators: int) -> str:

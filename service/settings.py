@@ -56,11 +56,8 @@ class RecorderSettings(BaseModel):
     chunk_s: float = Field(
         default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut costs [s]"
     )
-    batch_s: float = Field(
-        default=0.05,
-        ge=0,
-        le=0.5,
-        description="let messages gather this long before they are taken in; log times are exact to this [s]",
+    frames: bool = Field(
+        default=False, description="record the frames as they crossed the network, too, beside the ends' own traces"
     )
     decoded_hz: float = Field(
         default=25.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"

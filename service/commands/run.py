@@ -217,13 +217,9 @@ def recorder(
     log_format: LogFormat = "text",
     with_parent: WithParent = False,
 ) -> None:
-    """Record everything on the network into an MCAP log until SIGTERM."""
+    """Record traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
     options = [f"recorder.path={dumps(str(log))}"] if log is not None else []
     settings, load = reloadable(config, [*(overrides or []), *options])
-
-    from service.recording.intake import one_thread
-
-    one_thread()
 
     def run(role: Role) -> None:
         from service.recording.recorder import Recorder

@@ -1,9 +1,10 @@
-"""Raw messages, decoded: what Foxglove and Lichtblick show of a vehicle without being told anything.
+"""Raw messages, decoded: what Foxglove and Lichtblick show of a vehicle without any configuration.
 
 Sans-I/O. Topics stand under `/<vehicle>/`; poses, transforms, the scene and the log are in Foxglove's schemas, the rest
-are the models of views.py. Frames are read by the wire spec in a contract, so they give nothing before it came. At a
-bounded rate a message that is not due is turned away before anything of it is looked at: time is cut into slots, and
-the first message in a slot passes. What happens once always passes, and so do statuses, which come once a second.
+are the models of views.py. Of traces, the plant's rows give the measurements that it sent and the controller's the
+commands that it sent, at the times of sending on their own wall clocks; they are read by the wire spec in a contract,
+so they give nothing before it. Time is cut into slots, and the first row or message in a slot passes; at a bounded rate
+no other is looked at. What happens once always passes, and so do statuses, which come once a second.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pydantic import ValidationError
 from protocol import attitude, topics, verbs
 from protocol.clock import LoopSettings
 from protocol.messages import Contract, Event, Loss, Status, Telemetry, Truth
+from protocol.trace import Batch, Sent, read_batch
 from protocol.transmit import SILENCE
 from protocol.wire import WireSpec
 from service.logs import views
@@ -24,11 +26,13 @@ from service.logs.body import WORLD, desired_frame_of, frame_of, scene, timestam
 from service.logs.schemas import Shape as Shape
 from service.logs.schemas import json_shape, protobuf_shape
 
-LIMITED: Final = frozenset({"measurement", "command", "telemetry", "truth", "reference"})
-"""Topics of the network that stream, and so are held to the rate."""
+LIMITED: Final = frozenset({"telemetry", "truth", "reference"})
+"""Messages that stream, and so are held to the rate; as the rows of traces are."""
 
-UNLIMITED: Final = frozenset({"status", "event", "change", "loss"})
-"""Topics that always pass."""
+_FRAME: Final = Sent.FRAME.value
+
+UNLIMITED: Final = frozenset({"status", "event", "loss"})
+"""Messages that always pass."""
 
 ROLES: Final = ("plant", "controller", "recorder")
 """Whose statuses are known beforehand; those of others are decoded just the same."""
@@ -103,13 +107,13 @@ class _Wire:
 
 
 class Decoder:
-    """Decodes what crosses the network.
+    """Decodes what is published.
 
     Args:
         rate_hz: At most so many messages a second of each topic that streams, by time of publication; None: all.
 
     Attributes:
-        malformed: Messages and contracts so far that could not be read.
+        malformed: Messages, rows and contracts so far that could not be read.
     """
 
     def __init__(self, rate_hz: float | None) -> None:
@@ -118,15 +122,17 @@ class Decoder:
         self._slots: dict[tuple[str, str], int] = {}
         self._wires: dict[str, _Wire] = {}
         self._readers: dict[str, Callable[[topics.Address, bytes, int], list[Decoded]]] = {
-            "measurement": self._measurement,
-            "command": self._command,
+            "trace": self._trace,
             "telemetry": self._telemetry,
             "truth": self._truth,
             "reference": self._reference,
             "status": self._status,
             "event": self._event,
-            "change": self._change,
             "loss": self._loss,
+        }
+        self._frames: dict[str, Callable[[str, _Wire, bytes, int], list[Decoded]]] = {
+            "measurement": self._measurement,
+            "command": self._command,
         }
 
     def configure(self, contract: Contract) -> None:
@@ -143,24 +149,17 @@ class Decoder:
                 self.malformed += 1
 
     def take(self, address: topics.Address, payload: bytes, published_ns: int) -> list[Decoded]:
-        """What a message gives: nothing if it is not due, malformed, or of no interest to a person.
+        """What a message or a batch of a trace gives: nothing if it is not due, malformed, or of no interest.
 
         Args:
-            address: What its key says.
+            address: What its key says; a frame's gives nothing, as the traces have it.
             payload: Its bytes.
             published_ns: When it was published, ns since 1970.
         """
-        topic, vehicle, _, _ = address
-        name = topic.name
-        if payload == SILENCE and (wire := self._wires.get(vehicle)) and name in wire.silent:
-            return []
-        if self._slot_ns and name in LIMITED:
-            source, slot = (name, vehicle), published_ns // self._slot_ns
-            if self._slots.get(source) == slot:
-                return []
-            self._slots[source] = slot
-        read = self._readers.get(name)
+        read = self._readers.get(address.topic.name)
         if read is None:
+            return []
+        if address.topic.name in LIMITED and not self._due(address.topic.name, address.vehicle, published_ns):
             return []
         try:
             return read(address, payload, published_ns)
@@ -168,10 +167,51 @@ class Decoder:
             self.malformed += 1
             return []
 
-    def _measurement(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        vehicle, wire = address.vehicle, self._wires.get(address.vehicle)
+    def frame(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
+        """What a frame from the network gives, at whatever rate; silence in lockstep gives nothing."""
+        wire, show = self._wires.get(address.vehicle), self._frames.get(address.topic.name)
+        if wire is None or show is None or (payload == SILENCE and address.topic.name in wire.silent):
+            return []
+        try:
+            return show(address.vehicle, wire, payload, at_ns)
+        except _MalformedError:
+            self.malformed += 1
+            return []
+
+    def rows(self, vehicle: str, batch: Batch) -> list[Decoded]:
+        """What the rows of a trace give: the plant's its measurements, the controller's its commands."""
+        wire, columns, base_ns = self._wires.get(vehicle), batch.columns, batch.header.wall_ns
         if wire is None:
             return []
+        name = "measurement" if batch.header.end == "plant" else "command"
+        show, frames, found = self._frames[name], columns[name], []
+        for row, (sent_as, sent) in enumerate(zip(columns["sent_as"].tolist(), columns["sent"].tolist(), strict=True)):
+            at_ns = base_ns + sent * 1000
+            if sent_as == _FRAME and at_ns >= 0 and self._due(name, vehicle, at_ns):
+                try:
+                    found += show(vehicle, wire, frames[row].tobytes(), at_ns)
+                except _MalformedError:
+                    self.malformed += 1
+        return found
+
+    def _due(self, name: str, vehicle: str, at_ns: int) -> bool:
+        """Whether it is the first of its source in its slot of time."""
+        if not self._slot_ns:
+            return True
+        source, slot = (name, vehicle), at_ns // self._slot_ns
+        if self._slots.get(source) == slot:
+            return False
+        self._slots[source] = slot
+        return True
+
+    def _trace(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
+        del at_ns  # its rows have their own times
+        batch = read_batch(payload)
+        if batch is None:
+            raise _MalformedError
+        return self.rows(address.vehicle, batch)
+
+    def _measurement(self, vehicle: str, wire: _Wire, payload: bytes, at_ns: int) -> list[Decoded]:
         _, codes = _read(wire.measurement(payload))
         x, y, z = (wire.attitude(code) for code in codes[:3])
         p, q, r = (wire.rate(code) for code in codes[3:])
@@ -180,12 +220,9 @@ class Decoder:
         shown = _shown(vehicle, "measurement", views.Attitude.of(measured, (p, q, r)), at_ns)
         return [shown, *_posed(vehicle, "", frame_of(vehicle), measured, at_ns)] if measured else [shown]
 
-    def _command(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        wire = self._wires.get(address.vehicle)
-        if wire is None:
-            return []
+    def _command(self, vehicle: str, wire: _Wire, payload: bytes, at_ns: int) -> list[Decoded]:
         _, codes = _read(wire.command(payload))
-        return [_shown(address.vehicle, "command", views.Voltages.of(codes, wire.voltage, wire.outermost), at_ns)]
+        return [_shown(vehicle, "command", views.Voltages.of(codes, wire.voltage, wire.outermost), at_ns)]
 
     def _telemetry(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         told = Telemetry.model_validate_json(payload)
@@ -212,18 +249,13 @@ class Decoder:
         )
         if address.role != "plant" or wire is None:
             return [status]
-        body = scene(vehicle, wire.kind, at_ns)  # again with every status, for whoever comes late
+        body = scene(vehicle, wire.kind, at_ns)  # again with every status, for a viewer that connects late
         return [status, Decoded(topic_of(vehicle, "scene"), SHAPES["scene"], body, at_ns)]
 
     def _event(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         told = Event.model_validate_json(payload)
         level = _LEVELS.get(told.kind, LogLevel.Info)
         return [_logged(address.vehicle, level, told.role, f"{told.kind}: {told.text}", at_ns)]
-
-    def _change(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = verbs.Change.model_validate_json(payload)
-        what = told.model_dump_json(include={"gains", "reference", "within_s"}, exclude_none=True)
-        return [_logged(address.vehicle, LogLevel.Debug, "controller", f"from tick {told.tick} on: {what}", at_ns)]
 
     def _loss(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         told = Loss.model_validate_json(payload)

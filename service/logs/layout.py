@@ -44,7 +44,7 @@ def layout(vehicle: str, actuators: int) -> str:
         "RosOut!log": {
             **_titled("Log"),
             "searchTerms": [],
-            "minLogLevel": 2,  # Info: changes of gains and reference that no event tells are below it
+            "minLogLevel": 2,  # Info
             "topicToRender": topic_of(vehicle, "log"),
         },
         "Plot!attitude": _plot(
@@ -64,13 +64,13 @@ def layout(vehicle: str, actuators: int) -> str:
             "Voltages", "V", [_line(vehicle, "command", f"voltage_{motor}_v", f"u{motor}") for motor in motors]
         ),
         "Plot!timing": _plot(
-            "Latency, age of measurements",
+            "Latency, lateness of measurements",
             "µs",
             [
                 _line(vehicle, "status/plant", "latency_p50_us", "latency, median"),
                 _line(vehicle, "status/plant", "latency_p99_us", "latency, 99 %"),
-                _line(vehicle, "status/controller", "age_p50_us", "age, median"),
-                _line(vehicle, "status/controller", "age_p99_us", "age, 99 %"),
+                _line(vehicle, "status/controller", "age_p50_us", "lateness, median"),
+                _line(vehicle, "status/controller", "age_p99_us", "lateness, 99 %"),
             ],
         ),
     }

@@ -20,9 +20,9 @@ from zenoh.handlers import RingChannel
 
 from protocol import topics
 from protocol.errors import AeroloopError
-from protocol.links import published_ns
 from protocol.messages import Contract
 from protocol.network import NetworkSettings, join
+from protocol.publication import Received, RecoveringSubscriber, read_sample
 from service.logs.decoded import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder, topic_of
 from service.logs.schemas import Shape
 
@@ -30,7 +30,6 @@ log: Final = logging.getLogger("aeroloop")
 
 KEPT: Final = 1024
 """How many of what happens once may wait for the next turn."""
-CONTRACT_WAIT_S: Final = 5.0
 BACKLOG: Final = 256
 """Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
 
@@ -40,7 +39,7 @@ class LiveError(AeroloopError):
 
 
 class Feed:
-    """What crosses the network about a vehicle, decoded.
+    """What is published about a vehicle, decoded.
 
     Args:
         session: An open session; it outlives the feed.
@@ -48,46 +47,34 @@ class Feed:
     """
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
-        self._session = session
-        self._vehicle = vehicle
         self._decoder = Decoder(None)  # the pace at which it is asked bounds the rate
+        self._contracts = RecoveringSubscriber(session, topics.key("contract", vehicle), KEPT)
         self._subscribers = {
             session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
-            for names, room in ((UNLIMITED, KEPT), (LIMITED, 1))
+            for names, room in ((UNLIMITED, KEPT), (LIMITED.union(topics.FRAMES), 1))
             for name in sorted(names)
         }
-        tokens = topics.key("alive", vehicle)
-        self._tokens = session.liveliness().declare_subscriber(tokens, RingChannel(KEPT), history=True)
-        self._contracts: zenoh.handlers.Handler[zenoh.Reply] | None = None
-        self._ask()
 
     def take(self) -> Iterator[Decoded]:
         """What came since the last time: the newest of what streams, and all of what happens once. Never waits."""
-        while (token := self._tokens.try_recv()) is not None:
-            if token.kind == zenoh.SampleKind.PUT:
-                self._ask()
-        self._hear_contracts()
+        for contract in self._contracts.take():
+            try:
+                self._decoder.configure(Contract.model_validate_json(contract.payload))
+            except ValidationError:
+                log.warning("live: %s carries no contract of this version", contract.key)
         for subscriber, room in self._subscribers.items():
             for _ in range(room):
                 if (sample := subscriber.try_recv()) is None:
                     break
-                address = topics.read_key(str(sample.key_expr))
-                if address is not None:
-                    yield from self._decoder.take(address, sample.payload.to_bytes(), published_ns(sample, time_ns()))
+                yield from self._decode(read_sample(sample))
 
-    def _ask(self) -> None:
-        """Ask every role for its contract; the answers are heard later."""
-        self._contracts = self._session.get(topics.key("contract", self._vehicle), timeout=CONTRACT_WAIT_S)
-
-    def _hear_contracts(self) -> None:
-        try:
-            while self._contracts is not None and (reply := self._contracts.try_recv()) is not None:
-                if reply.ok is not None:
-                    self._decoder.configure(Contract.model_validate_json(reply.ok.payload.to_bytes()))
-        except ValidationError:
-            log.warning("live: a role tells a contract of another version")
-        except zenoh.ZError:  # all have answered
-            self._contracts = None
+    def _decode(self, received: Received) -> list[Decoded]:
+        address = topics.read_key(received.key)
+        if address is None:
+            return []
+        at_ns = time_ns() if received.published_ns is None else max(received.published_ns, 0)
+        read = self._decoder.frame if address.topic.carries == "frame" else self._decoder.take
+        return read(address, received.payload, at_ns)
 
 
 class Outlet:
@@ -106,7 +93,7 @@ class Outlet:
     """
 
     def __init__(self, vehicle: str, address: str, port: int) -> None:
-        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # who comes and goes, and how, is no news
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # clients that come and go are no news
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         for name, shape in SHAPES.items():
@@ -134,7 +121,7 @@ class Outlet:
             channel.close()
 
     def send(self, message: Decoded) -> None:
-        """Hand a message to whoever wants its topic. Never waits."""
+        """Send a message to the clients that subscribe to its topic. Never waits."""
         channel = self._channels.get(message.topic) or self._open(message.topic, message.shape)
         channel.log(message.data, log_time=message.at_ns)
 
@@ -155,7 +142,7 @@ def serve(
     rate_hz: float,
     ready: Callable[[str], None],
 ) -> None:
-    """Show a vehicle until told to stop.
+    """Show a vehicle until `stop` is set.
 
     Args:
         network: Where to join.

@@ -107,7 +107,7 @@ class Tracking(View):
 
     @classmethod
     def of(cls, told: Telemetry, period: float | None) -> Self:
-        """Of what the controller told, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
+        """Of what the controller published, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
         x, y, z = told.attitude_error
         scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
         measured = _product(told.desired, (scalar if told.sign >= 0 else -scalar, x, y, z))
@@ -143,10 +143,13 @@ class RoleStatus(View):
     rate_hz: float = Field(description="ticks (recorder: messages) a second since the last status [Hz]")
     skipped: int = Field(description="grid ticks of the session that were missed")
     refused: int = Field(description="malformed frames since start")
+    stale: int = Field(description="frames since start that came too late to be acted upon")
     saturated: int = Field(description="values beyond a quantizer's range since start")
     latency_p50_us: float | None = Field(description="plant: from a measurement to the command that answers it [µs]")
     latency_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
-    age_p50_us: float | None = Field(description="controller: age of a measurement when it is used [µs]")
+    age_p50_us: float | None = Field(
+        description="controller: how much later than the fastest a measurement was received [µs]"
+    )
     age_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
     wake_p50_us: float | None = Field(description="from when a tick was due to when it began [µs]")
     wake_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
@@ -154,7 +157,7 @@ class RoleStatus(View):
 
     @classmethod
     def of(cls, told: Status) -> Self:
-        """Of what a role told."""
+        """Of what a role published."""
         latency_p50, latency_p99 = _percentiles(told.recent_latency_us)
         age_p50, age_p99 = _percentiles(told.age_us)
         wake_p50, wake_p99 = _percentiles(told.timing.recent_wake if told.timing else None)
@@ -165,6 +168,7 @@ class RoleStatus(View):
             rate_hz=round(told.rate_hz, 3),
             skipped=told.skipped,
             refused=told.refused,
+            stale=told.stale,
             saturated=told.saturated,
             latency_p50_us=latency_p50,
             latency_p99_us=latency_p99,

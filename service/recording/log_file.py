@@ -17,12 +17,13 @@ from mcap.writer import Writer
 from protocol import topics
 from protocol.host import versions
 from protocol.messages import model_of
+from protocol.publication import Received
 from service.logs.decoded import Decoded
 from service.logs.mcap_file import CHUNK_BYTES
 from service.logs.schemas import Shape, json_shape
-from service.recording.intake import Taken
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
+TRACE_ENCODING: Final = "x-aeroloop-trace"
 
 NO_LIMIT: Final = 1 << 60
 """A chunk size [bytes] that none reaches: `LogFile.commit` alone closes chunks."""
@@ -110,17 +111,18 @@ class LogFile:
         """Whether the file is no longer where it was made: somebody has moved or removed it."""
         return not self._out.stands_at(self.path)
 
-    def add(self, taken: Taken, sequence: int) -> None:
-        """Add a message to the chunk, under its key.
+    def add(self, received: Received, at_ns: int) -> None:
+        """Add a message to the chunk, under its key and its publisher's number.
 
         Args:
-            taken: The message.
-            sequence: Its publisher's number, of which MCAP keeps 32 bits; 0 if it has none.
+            received: The message.
+            at_ns: When it was received; when it was published, too, where that is not said [ns since 1970].
         """
-        channel = self._channels.get(taken.key)
+        channel = self._channels.get(received.key)
         if channel is None:
-            channel = self._channels[taken.key] = self._raw_channel(taken.key)
-        self._add(channel, taken.arrived_ns, taken.published_ns, taken.payload, sequence)
+            channel = self._channels[received.key] = self._raw_channel(received.key)
+        published_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
+        self._add(channel, at_ns, published_ns, received.payload, received.sequence)
 
     def add_decoded(self, decoded: Decoded) -> None:
         """Add what was made from a message, under a topic of its own; its log time is that message's publication."""
@@ -162,14 +164,13 @@ class LogFile:
             self.path.unlink()
 
     def _add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int) -> None:
-        self._writer.add_message(channel, log_time, data, publish_time, sequence & 0xFFFF_FFFF)
+        self._writer.add_message(channel, log_time, data, publish_time, sequence)
         self._gathered += MESSAGE_HEAD + len(data)
 
     def _raw_channel(self, key: str) -> int:
         address = topics.read_key(key)
-        carries = address.topic.carries if address else "unknown"
         shape = _raw_shape(address.topic) if address else None
-        encoding = {"frame": FRAME_ENCODING, "unknown": "application/octet-stream"}.get(carries, "json")
+        encoding = shape.message_encoding if shape else "application/octet-stream"
         return self._writer.register_channel(key, encoding, self._schema(shape) if shape else 0)
 
     def _schema(self, shape: Shape) -> int:
@@ -179,6 +180,9 @@ class LogFile:
 
 
 def _raw_shape(topic: topics.Topic) -> Shape:
+    if topic.carries == "trace":
+        text = "batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's contract"
+        return Shape("aeroloop.Trace", TRACE_ENCODING, text.encode(), TRACE_ENCODING)
     if topic.carries == "frame":
         text = (
             f"{topic.model} frame: bits as in the attachment protocol/SPEC.md, by the wire spec in the plant's contract"

@@ -1,43 +1,48 @@
-"""The recorder process: everything that crosses the network, as it crossed, into MCAP files.
+"""The recorder process: what both ends and all others publish, into MCAP files.
 
-It is only a subscriber: messages gather in an intake and are written many at a time. A channel per key holds the raw
-payloads with their time of publication; decoded channels stand beside them at a bounded rate. Every role's contract,
-with its effective configuration and the wire spec, is fetched when the role appears and stands in every file, so that
-one file needs nothing else to be read. What was lost is found by its sender's numbers and written into the log.
+It subscribes, and asks nobody: traces, messages and contracts are published from caches, so a recorder that starts late
+or again recovers the last minute. Five times a second it takes what was received and writes it, so log times are exact
+to 0.2 s. A channel per key holds the raw payloads, decoded channels stand beside them at a bounded rate, and what was
+lost is published and recorded.
 
-A crash costs what the open chunk holds, `chunk_s` at the most, and what was on its way there: 0.1 s, or 1 s while a
-role is asked for its contract and does not answer.
+A crash costs this process what the open chunk holds and 0.2 s; its successor recovers that from the caches.
 """
 
 from __future__ import annotations
 
-import gc
-import logging
 import time
-from collections import Counter, deque
+from collections import Counter
+from functools import lru_cache
 from typing import Final, Literal
 
 from pydantic import ValidationError
 
 from protocol import topics
 from protocol.messages import Contract, Loss, Status
+from protocol.publication import Received
 from protocol.role import Role
+from protocol.trace import read_batch
 from service.logs.decoded import Decoded, Decoder
-from service.recording.intake import Intake, Taken
+from service.recording.backlog import Backlog
 from service.recording.rolling import RollingLog
+from service.recording.subscriptions import Subscriptions
 from service.settings import RecorderSettings
-
-log: Final = logging.getLogger("aeroloop")
 
 WORK_EVERY_S: Final = 0.2
 """Messages can wait: a chunk is closed only once a second."""
 
 STATUS_EVERY_S: Final = 1.0
-ASK_EVERY_S: Final = 1.0
-CHANGED: Final = "?"
-"""Somebody whose configuration was read again and so has another contract; nobody's name."""
-SETTLED_S: Final = 3.0
-"""After this everybody who was there before the recorder has been heard: statuses come once a second."""
+
+QUIET_S: Final = 0.3
+"""A network from which nothing was received for so long has nothing more on its way [s]."""
+
+ANSWER_S: Final = 5.0
+"""How long a role may take to answer before recording ends without its last messages [s]."""
+
+GOES_ON_S: Final = 1.0
+"""A network that does not become quiet in this time goes on for good [s]."""
+
+_address = lru_cache(maxsize=4096)(topics.read_key)
 
 
 class Recorder:
@@ -56,126 +61,108 @@ class Recorder:
 
     def __init__(self, role: Role, settings: RecorderSettings) -> None:
         self._role = role
-        self._batch_s = settings.batch_s
-        self._addresses: dict[str, topics.Address | None] = {}
-        self._tokens: deque[tuple[str, bool]] = deque()  # who has come or gone
-        self._silent: set[str] = set()  # who has appeared and not yet told its contract
-        self._ask_due = 0.0
+        self._frames = settings.frames
+        self._backlog = Backlog()
         self._lost: Counter[str] = Counter()  # by reason
         self._status_due = 0.0
         self._status_written = 0
         self._status_at = time.monotonic()
-        self._disk_failed = False  # since losses were last told
-        self.log = RollingLog(settings, self._tell)
+        self.log = RollingLog(settings, self._report)
         self._decoder = Decoder(settings.decoded_hz) if settings.decoded_hz else None
 
     def run(self) -> None:
-        """Record until the role is told to stop; then take what is still on its way and close the log."""
-        self._intake = Intake(self._role.zenoh, topics.EVERYTHING, self._batch_s)
-        self._role.watch_tokens(lambda name, came: self._tokens.append((name, came)))
+        """Record until the role's `stop` is set; then take what is still on its way and close the log."""
+        self._subscriptions = Subscriptions(self._role.zenoh, frames=self._frames)
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
-        gc.freeze()  # a collection looks at the messages that wait, not at all that was ever imported
         try:
             while not self._role.stop.wait(WORK_EVERY_S):
-                self._work()
+                self._take()
+                self._role.take_inbox()
+                if time.monotonic() >= self._status_due:
+                    self._publish_losses()
+                    self._publish_status()
+                self.log.tend()
         finally:
-            if not self._intake.settle():
-                self._role.event("lost", "stopped while more came than could be taken in: the log lacks the last of it")
+            self._settle()
             self.log.try_again()
-            self._status_due = 0.0
-            self._work()
-            self._intake.close()
-            self._drain()
-            self.log.close(len(self._intake))
+            self._publish_losses()
+            self._take()
+            self._publish_status()
+            self._take()
+            self.log.close(len(self._backlog))
 
     def reconfigure(self, settings: RecorderSettings) -> None:
         """Take over what can change while recording."""
         self.log.settings = settings
 
-    def _work(self) -> None:
-        self._drain()
-        self._role.take_inbox()
-        self._fetch_contracts()
-        if time.monotonic() >= self._status_due:
-            self._intake.numbers.settled = self._role.uptime_s > SETTLED_S
-            self._tell_losses()
-            self._publish_status()
-        self.log.tend()
+    def _settle(self) -> None:
+        """Take what is on its way. A role's answer follows all that it published before, as a link keeps the order."""
+        for _ in self._role.zenoh.get(topics.key("contract", "*"), timeout=ANSWER_S):
+            pass
+        now = last = time.monotonic()
+        deadline = now + GOES_ON_S
+        while now < deadline and now - last < QUIET_S:
+            time.sleep(QUIET_S / 10)
+            now = time.monotonic()
+            if self._take():
+                last = now
 
-    def _drain(self) -> None:
-        intake, log = self._intake, self.log
-        while log.writable and (taken := intake.next()) is not None:
-            self._take(taken)
+    def _take(self) -> int:
+        """Take what was received and write it, or keep it while the disk refuses. How many messages were received."""
+        count, now = 0, time.time_ns()
+        for received in self._subscriptions.take():
+            count += 1
+            address = _address(received.key)
+            if address is not None and address.topic.name == "contract":
+                self._configure(received)  # at once: without it the rest cannot be read
+            if not self._backlog.room(received):
+                self._write()
+            self._backlog.put(received, now)
+        self._write()
+        return count
 
-    def _take(self, taken: Taken) -> None:
-        if taken.missing:
-            self._lose(taken.key, taken.missing, "network", taken.published_ns)
-        address = self._address(taken.key)
-        decoded: list[Decoded] = []
-        if address is not None:
-            if self._decoder is not None:
-                decoded = self._decoder.take(address, taken.payload, taken.published_ns)
-            if address.topic.name == "change":
-                self.log.add_change(taken)
-            elif address.topic.name == "event" and b'"changed"' in taken.payload:
-                self._tokens.append((CHANGED, True))
-        self.log.add(taken, decoded)
+    def _write(self) -> None:
+        while self.log.writable and (entry := self._backlog.next()) is not None:
+            received, at_ns = entry
+            self.log.add(received, at_ns, self._decode(received, at_ns))
 
-    def _address(self, key: str) -> topics.Address | None:
-        if key not in self._addresses:
-            self._addresses[key] = topics.read_key(key)
-        return self._addresses[key]
+    def _decode(self, received: Received, at_ns: int) -> list[Decoded]:
+        address = _address(received.key)
+        if address is None or address.topic.carries == "frame":
+            return []
+        if address.topic.name == "trace" and (batch := read_batch(received.payload)) is not None:
+            for change in batch.tail.changes:
+                self.log.add_change(received.key, change)
+            return self._decoder.rows(address.vehicle, batch) if self._decoder else []
+        at_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
+        return self._decoder.take(address, received.payload, at_ns) if self._decoder else []
 
-    def _lose(self, key: str, count: int, reason: Literal["network", "queue", "disk"], until_ns: int) -> None:
-        """Tell the network, and thereby the log, of a loss."""
-        self._lost[reason] += count
-        self._role.publish("loss", Loss(key=key, count=count, reason=reason, until_ns=until_ns))
-
-    def _tell_losses(self) -> None:
-        """Tell what found no room, once there is room to tell it."""
-        if not self.log.writable:
-            return
-        refusals, now = self._intake.refusals(), time.time_ns()
-        for key, count in refusals.messages.items():
-            self._lose(key, count, "disk" if self._disk_failed else "queue", now)
-        for key, count in refusals.missing.items():
-            if count:
-                self._lose(key, count, "network", now)
-        self._disk_failed = False
-
-    def _fetch_contracts(self) -> None:
-        """Ask who appeared for its contract, until each has told it; every role answers for itself."""
-        while self._tokens:
-            name, came = self._tokens.popleft()
-            if came:
-                self._silent.add(name)
-                self._ask_due = 0.0
-            else:
-                self._silent.discard(name)
-        now = time.monotonic()
-        if not self._silent or now < self._ask_due:
-            return
-        self._ask_due = now + ASK_EVERY_S
-        for reply in self._role.zenoh.get(topics.key("contract", "*"), timeout=1.0):
-            if reply.ok is not None:
-                self._hear(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
-
-    def _hear(self, key: str, payload: bytes) -> None:
-        """A role's contract."""
+    def _configure(self, received: Received) -> None:
         try:
-            contract = Contract.model_validate_json(payload)
+            contract = Contract.model_validate_json(received.payload)
         except ValidationError:
-            self._role.warn(key, "fault", f"{key} does not answer with a contract of this version: not recorded")
+            self._role.warn(received.key, "fault", f"{received.key} carries no contract of this version")
             return
-        self._silent = {name for name in self._silent if name.partition("-")[0] not in (contract.role, CHANGED)}
-        self.log.add_contract(key, payload)
+        self.log.add_contract(received.key, received.payload)
         if self._decoder is not None:
             self._decoder.configure(contract)
 
-    def _tell(self, text: str, bad: bool) -> None:
+    def _publish_losses(self) -> None:
+        """Publish, and thereby record, what was lost; what found no room once the disk has some again."""
+        for lost in self._subscriptions.losses():
+            self._lose(lost.key, lost.messages, lost.reason)
+        if self.log.writable:
+            refused, self._backlog.refused = self._backlog.refused, Counter()
+            for key, count in refused.items():
+                self._lose(key, count, "disk")
+
+    def _lose(self, key: str, count: int, reason: Literal["network", "queue", "disk"]) -> None:
+        self._lost[reason] += count
+        self._role.publish("loss", Loss(key=key, count=count, reason=reason))
+
+    def _report(self, text: str, bad: bool) -> None:
         if bad:
-            self._disk_failed = self._disk_failed or not self.log.writable
             self._role.warn("disk", "fault", text)
         else:
             self._role.event("changed", text)
@@ -185,7 +172,7 @@ class Recorder:
         written, log = self.log.written, self.log
         notes = [f"{count} messages lost: {reason}" for reason, count in sorted(self._lost.items())]
         if log.trouble:
-            notes.append(f"{log.trouble}; {len(self._intake)} messages wait")
+            notes.append(f"{log.trouble}; {len(self._backlog)} messages wait")
         state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "waiting for the disk"
         self._role.status(
             Status(

@@ -18,13 +18,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from pydantic import ValidationError
-
 from protocol.errors import AeroloopError
+from protocol.publication import Received
 from protocol.verbs import Change
 from service.logs.decoded import Decoded
 from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA, RECORDER_METADATA, opening
-from service.recording.intake import Taken
 from service.recording.log_file import LogFile
 from service.settings import RecorderSettings
 
@@ -46,8 +44,8 @@ def parts(path: Path) -> list[Path]:
 
 
 class _Entry(NamedTuple):
-    taken: Taken
-    sequence: int
+    received: Received
+    at_ns: int
     decoded: list[Decoded]
 
 
@@ -72,10 +70,8 @@ class RollingLog:
         self.trouble = ""
         self._tell = tell
         self._base = settings.path or settings.directory / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap")
-        self._sequences: dict[str, int] = {}
         self._contracts: dict[str, bytes] = {}
-        self._changes: dict[str, list[bytes]] = {}  # of the last session of each key
-        self._change_sessions: dict[str, str] = {}
+        self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[_Entry] = []
         self._part = 0  # of the next file
         self._began = 0.0
@@ -99,10 +95,9 @@ class RollingLog:
         """Whether messages can be added."""
         return not self.trouble
 
-    def add(self, taken: Taken, decoded: list[Decoded]) -> None:
-        """Add a message and what was made of it; only while `writable`."""
-        sequence = self._sequences[taken.key] = self._sequences.get(taken.key, 0) + 1
-        entry = _Entry(taken, sequence, decoded)
+    def add(self, received: Received, at_ns: int, decoded: list[Decoded]) -> None:
+        """Add a message, when it was received [ns since 1970], and what was made of it; only while `writable`."""
+        entry = _Entry(received, at_ns, decoded)
         self._unwritten.append(entry)
         self.written += 1
         self._put(self._file, entry)
@@ -115,16 +110,17 @@ class RollingLog:
             self._contracts[key] = payload
             self._file.add_metadata(CONTRACT_METADATA, {"key": key, "json": payload.decode()})
 
-    def add_change(self, taken: Taken) -> None:
-        """Remember what a controller follows, for the files that follow; as a message it is added as any other."""
-        try:
-            change = Change.model_validate_json(taken.payload)
-        except ValidationError:
-            return  # what anybody may publish need not be one
-        if self._change_sessions.get(taken.key) != change.session:
-            self._change_sessions[taken.key] = change.session
-            self._changes[taken.key] = []
-        self._changes[taken.key].append(taken.payload)
+    def add_change(self, key: str, change: Change) -> None:
+        """Remember what a controller follows, for the files that follow; as part of a trace it is added as any other.
+
+        Args:
+            key: Of the trace.
+            change: Out of its tail.
+        """
+        known = self._changes.get(key)
+        if known is None or known[0].session != change.session:
+            known = self._changes[key] = []
+        known.append(change)
 
     def tend(self) -> None:
         """Do what is due: close a chunk, begin a new file, try a disk again."""
@@ -170,7 +166,7 @@ class RollingLog:
 
     @staticmethod
     def _put(file: LogFile, entry: _Entry) -> None:
-        file.add(entry.taken, entry.sequence)
+        file.add(entry.received, entry.at_ns)
         for decoded in entry.decoded:
             file.add_decoded(decoded)
 
@@ -252,7 +248,7 @@ class RollingLog:
                 file.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract.decode()})
             for key, changes in self._changes.items():
                 for change in changes:
-                    file.add_metadata(CHANGE_METADATA, {"key": key, "json": change.decode()})
+                    file.add_metadata(CHANGE_METADATA, {"key": key, "json": change.model_dump_json()})
             file.commit()
         except OSError:
             file.remove()

@@ -1,10 +1,11 @@
-"""What the recorder costs and keeps up with: a real recorder process, and senders that publish as the daemons do.
+"""What the recorder costs and keeps up with: a real recorder process, and publishers that publish as the ends do.
 
-    uv run python tests/benchmarks/record.py
+    uv run python -m tests.benchmarks.record
 
-First a loop at 500 Hz with telemetry and truth at 50 Hz: CPU time of the recorder by its process's own account, and MB
-an hour, with and without decoded channels. Then 20 000 messages a second for 30 s from two senders: every message is
-looked for in the log. Nothing is asserted; a shared machine's figures are for reading.
+First what a loop at 500 Hz publishes, traces of both ends with telemetry at 25 Hz and truth at 50 Hz: CPU time of the
+recorder by its process's own account, and MB an hour, with and without decoded channels. Then 20 000 JSON messages a
+second for 10 s from two publishers: every message is looked for in the log. Nothing is asserted; CPU time on a shared
+machine depends on what else runs, so compare figures of the same minutes.
 """
 
 from __future__ import annotations
@@ -15,38 +16,24 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
-import zenoh
 from mcap.reader import make_reader
 
 from protocol import topics
-from protocol.messages import Telemetry, Truth
-from protocol.network import NetworkSettings, join
+from protocol.network import join
+from protocol.publication import CachedPublisher
 from service.bench import Bench, free_rendezvous
 from service.config import Settings, load
+from tests.service.recording.ends import VEHICLE, Ends, contract_of
 
 LOOP_S = 20.0
 FLOOD_PER_S = 20_000
-FLOOD_S = 30.0
-SENDERS = 2
-TELEMETRY = Telemetry(
-    session="s1",
-    tick=123456,
-    counter=3,
-    attitude_error=(0.00123456789, -0.0123456789, 0.0456789123),
-    rate_error=(0.0123456789, 0.00123456789, -0.0456789123),
-    desired=(0.99123456789, 0.0123456789, 0.0456789123, 0.0789123456),
-    damping_estimate=(0.00123456789, 0.00456789123, 0.00789123456),
-    voltages=(3.456789123, -2.345678912),
-    sign=1,
-).encode()
-TRUTH = Truth(
-    tick=123456,
-    attitude=(0.99123456789, 0.0123456789, 0.0456789123, 0.0789123456),
-    rate=(0.0123456789, 0.00123456789, -0.0456789123),
-    voltages=(3.456789123, -2.345678912),
-).encode()
+FLOOD_S = 10.0
+PUBLISHERS = 2
+
+Put = Callable[[str, bytes, float], None]
 
 
 def settings_for(log: Path, *overrides: str) -> Settings:
@@ -54,43 +41,52 @@ def settings_for(log: Path, *overrides: str) -> Settings:
     return load(overrides=[f"network.rendezvous={free_rendezvous()}", f"recorder.path={log}", *overrides])
 
 
-def send(rendezvous: str, name: str, rate_hz: float, seconds: float, flood: bool) -> None:
-    """Publish as a plant or a controller does, or as many as it takes; in a process of its own."""
-    from protocol.links import Numbered, ZenohLink
+def publish(rendezvous: str, name: str, seconds: float) -> None:
+    """Publish as both ends of a loop, or, under any other name, as many as it takes; in a process of its own."""
+    settings = load(overrides=[f"network.rendezvous={rendezvous}"])
+    with join(settings.network) as session:
+        publishers: dict[str, CachedPublisher] = {}
 
-    with join(NetworkSettings(rendezvous=rendezvous)) as session:
-        if flood:
-            frame_key, json_key, payload = topics.key("measurement", name, session="s1"), None, b""
-        elif name == "plant":
-            frame_key, json_key, payload = topics.key("measurement", "aero", session="s1"), "truth", TRUTH
+        def put(key: str, payload: bytes, per_s: float) -> None:
+            if key not in publishers:
+                publishers[key] = CachedPublisher(session, key, per_s, lossless=per_s > 1000)
+            publishers[key].put(payload)
+
+        if name == "ends":
+            contract = contract_of(settings, "plant").encode()
+            put(topics.key("contract", VEHICLE, role="plant"), contract, 1)
+            time.sleep(1.0)
+            loop(settings, put, seconds)
         else:
-            frame_key, json_key, payload = topics.key("command", "aero", session="s1"), "telemetry", TELEMETRY
-        blocks = zenoh.CongestionControl.BLOCK
-        sender = (
-            Numbered(session.declare_publisher(frame_key, congestion_control=blocks)).put
-            if flood
-            else ZenohLink(session, frame_key, "none/" + name).send
-        )
-        json = Numbered(session.declare_publisher(topics.key(json_key, "aero"))) if json_key else None
-        size = 2 if name == "controller" else 7
-        time.sleep(1.0)
-        start, sent = time.monotonic(), 0
-        while sent < rate_hz * seconds:
-            ahead = start + sent / rate_hz - time.monotonic()
-            if ahead > 0:
-                time.sleep(ahead)
-            for _ in range(20 if flood else 1):
-                sender(bytes([(sent & 15) << 4]) + os.urandom(size - 1))
-                sent += 1
-            if json is not None and sent % 10 == 0:
-                json.put(payload)
+            flood(topics.key("telemetry", name), put, seconds)
         time.sleep(1.0)
 
 
-def senders(rendezvous: str, names: list[str], rate_hz: float, seconds: float, *, flood: bool) -> None:
+def loop(settings: Settings, put: Put, seconds: float) -> None:
+    """What both ends publish, in real time."""
+    ends, period_s, start = Ends(settings), settings.loop.period, time.monotonic()
+    for k in range(round(seconds / period_s)):
+        if (ahead := start + k * period_s - time.monotonic()) > 0:
+            time.sleep(ahead)
+        for said in ends.tick(k, time.monotonic_ns(), time.time_ns()):
+            put(said.key, said.payload, 50)
+
+
+def flood(key: str, put: Put, seconds: float) -> None:
+    """Telemetry, 20 messages at a time."""
+    said = (said.payload for said in Ends(load()).tick(0, 1, 1) if said.topic == "telemetry")
+    payload, rate_hz, start = next(said), FLOOD_PER_S / PUBLISHERS, time.monotonic()
+    for sent in range(0, round(rate_hz * seconds), 20):
+        if (ahead := start + sent / rate_hz - time.monotonic()) > 0:
+            time.sleep(ahead)
+        for _ in range(20):
+            put(key, payload, rate_hz)
+
+
+def run_publishers(rendezvous: str, names: list[str], seconds: float) -> None:
     """Run them all and wait."""
-    command = [sys.executable, __file__, "send", rendezvous]
-    running = [subprocess.Popen([*command, name, str(rate_hz), str(seconds), str(int(flood))]) for name in names]
+    command = [sys.executable, "-m", "tests.benchmarks.record", "publish", rendezvous]
+    running = [subprocess.Popen([*command, name, str(seconds)]) for name in names]
     for process in running:
         process.wait()
 
@@ -114,54 +110,41 @@ def counted(folder: Path) -> Counter[str]:
     return counts
 
 
-def loop(decoded_hz: float) -> None:
-    """A 500 Hz loop."""
+def measured(names: list[str], seconds: float, *overrides: str) -> tuple[Counter[str], float, float]:
+    """Messages in the log by topic, share of a core, and MB an hour, while publishers run beside a recorder."""
     with tempfile.TemporaryDirectory() as folder:
-        settings = settings_for(Path(folder) / "log.mcap", f"recorder.decoded_hz={decoded_hz}")
-        with Bench(settings) as bench:
-            bench.start("recorder")
-            bench.await_role("recorder")
-            pid, rate = bench.pid("recorder"), settings.loop.rate_hz
-            before, began = cpu_s(pid), time.monotonic()
-            senders(settings.network.rendezvous, ["plant", "controller"], rate, LOOP_S, flood=False)
-            used, took = cpu_s(pid) - before, time.monotonic() - began
-            bench.stop("recorder")
-        counts = counted(Path(folder))
-        size = sum(path.stat().st_size for path in Path(folder).glob("*.mcap"))
-        frames = sum(count for key, count in counts.items() if key.startswith("aeroloop/aero/s1/"))
-        print(
-            f"500 Hz, decoded at {decoded_hz:g} Hz: {used / LOOP_S:.2%} of one core over {took:.0f} s, "
-            f"{frames} of {2 * rate * LOOP_S:.0f} frames, {size / LOOP_S * 3600 / 1e6:.0f} MB/h"
-        )
-
-
-def flood() -> None:
-    """20 000 messages a second."""
-    with tempfile.TemporaryDirectory() as folder:
-        settings = settings_for(Path(folder) / "log.mcap")
-        names = [f"v{i}" for i in range(SENDERS)]
+        settings = settings_for(Path(folder) / "log.mcap", *overrides)
         with Bench(settings) as bench:
             bench.start("recorder")
             bench.await_role("recorder")
             pid = bench.pid("recorder")
             before = cpu_s(pid)
-            senders(settings.network.rendezvous, names, FLOOD_PER_S / SENDERS, FLOOD_S, flood=True)
+            run_publishers(settings.network.rendezvous, names, seconds)
             used = cpu_s(pid) - before
             bench.stop("recorder")
-        counts = counted(Path(folder))
         size = sum(path.stat().st_size for path in Path(folder).glob("*.mcap"))
-        frames = sum(count for key, count in counts.items() if "/s1/" in key)
-        lost = counts[topics.key("loss", settings.vehicle)]
+        return counted(Path(folder)), used / seconds, size / seconds * 3600 / 1e6
+
+
+def main() -> None:
+    """Print all figures."""
+    for decoded_hz in (0.0, 25.0):
+        counts, share, size = measured(["ends"], LOOP_S, f"recorder.decoded_hz={decoded_hz}")
+        batches = sum(count for key, count in counts.items() if "/trace/" in key)
         print(
-            f"{FLOOD_PER_S}/s for {FLOOD_S:.0f} s: {frames} of {FLOOD_PER_S * FLOOD_S:.0f} messages in the log, "
-            f"{lost} reports of a loss, {used / FLOOD_S:.0%} of one core, {size / FLOOD_S * 3600 / 1e6:.0f} MB/h"
+            f"500 Hz, decoded at {decoded_hz:g} Hz: {share:.2%} of one core, {batches} of {20 * LOOP_S:.0f} batches, "
+            f"{counts[f'/{VEHICLE}/pose']} poses, {size:.0f} MB/h"
         )
+    counts, share, size = measured([f"v{i}" for i in range(PUBLISHERS)], FLOOD_S)
+    received = sum(count for key, count in counts.items() if key.endswith("/telemetry"))
+    print(
+        f"{FLOOD_PER_S}/s for {FLOOD_S:.0f} s: {received} of {FLOOD_PER_S * FLOOD_S:.0f} messages in the log, "
+        f"{counts[topics.key('loss', VEHICLE)]} reports of a loss, {share:.0%} of one core, {size:.0f} MB/h"
+    )
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["send"]:
-        send(sys.argv[2], sys.argv[3], float(sys.argv[4]), float(sys.argv[5]), sys.argv[6] == "1")
+    if sys.argv[1:2] == ["publish"]:
+        publish(sys.argv[2], sys.argv[3], float(sys.argv[4]))
     else:
-        loop(0.0)
-        loop(25.0)
-        flood()
+        main()

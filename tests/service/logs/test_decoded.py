@@ -14,9 +14,23 @@ from hypothesis import strategies as st
 from protocol import topics
 from protocol.attitude import Quaternion, distance, sent_vector, to_euler
 from protocol.frames import FrameFormat
-from protocol.messages import Contract, Event, Loss, Percentiles, Status, Telemetry, Timing, Truth, model_of
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Contract,
+    Event,
+    Loss,
+    Percentiles,
+    Status,
+    Telemetry,
+    Timing,
+    Truth,
+    model_of,
+)
 from protocol.quantizer import Quantizer
-from protocol.verbs import Change, Gains, Message, Setpoint
+from protocol.trace import ENDS, End, Outcome, Sent, TraceWriter
+from protocol.trace import Received as ReceivedAs
+from protocol.verbs import Message, Setpoint
+from protocol.wire import WireSpec
 from service.config import load
 from service.logs.decoded import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder
 from service.logs.schemas import json_shape, plain_schema
@@ -49,7 +63,14 @@ ATTITUDE = product(about(3, YAW), product(about(2, PITCH), about(1, ROLL)))
 
 
 def contract(role: str = "plant", *overrides: str, vehicle: str = "aero") -> Contract:
-    return Contract(role=role, vehicle=vehicle, host="h", versions={}, config=load(None, overrides).contract())
+    return Contract(
+        protocol=PROTOCOL_VERSION,
+        role=role,
+        vehicle=vehicle,
+        host="h",
+        versions={},
+        config=load(None, overrides).contract(),
+    )
 
 
 def address(name: str, role: str = "plant", vehicle: str = "aero") -> topics.Address:
@@ -71,6 +92,23 @@ def frame(form: FrameFormat, quantizers: list[Quantizer], values: list[float | N
 def measurement(*values: float | None) -> bytes:
     quantizers = [WIRE.attitude.quantizer()] * 3 + [WIRE.rate.quantizer()] * 3
     return frame(WIRE.measurement, quantizers, list(values))
+
+
+def batch(end: End, rows: list[tuple[int, Sent, bytes]], wire: WireSpec = WIRE) -> bytes:
+    """A batch with rows of times [ns since 1970], what was sent, and the frame that was; the other frame is zero."""
+    writer = TraceWriter(end, wire, 1, 10**8)
+    writer.session = "s1"
+    ahead_ns = NOW - 10**12  # of the wall clock to the monotonic clock
+    for tick, (at_ns, sent_as, frame) in enumerate(rows):
+        sent_ns = at_ns - ahead_ns
+        if end == "plant":
+            echo = bytes(wire.command.size)
+            volts = [0.0] * wire.actuators
+            writer.plant_row(tick, tick, sent_as, Sent.NONE, Outcome.NONE, 0, -1, sent_ns, 0, frame, echo, volts)
+        else:
+            taken = bytes(wire.measurement.size)
+            writer.controller_row(tick, ReceivedAs.FRAME, sent_as, sent_ns - 200_000, sent_ns, taken, frame)
+    return writer.take(NOW - ahead_ns, NOW)
 
 
 def by_topic(decoded: list[Decoded]) -> dict[str, Decoded]:
@@ -125,10 +163,14 @@ RAW = {
     "reference": Setpoint(attitude=(0.0, 0.0, 0.0)).encode(),
     "status": STATUS.encode(),
     "event": Event(role="plant", kind="started", text="x").encode(),
-    "change": Change(session="s1", tick=0).encode(),
-    "loss": Loss(key="k", count=1, reason="queue", until_ns=NOW).encode(),
+    "loss": Loss(key="k", count=1, reason="queue").encode(),
+    "trace": batch("plant", [(NOW, Sent.FRAME, measurement(0, 0, 0, 0, 0, 0))]),
 }
 """A message of every topic that is decoded."""
+
+
+def decode(decoder: Decoder, name: str, payload: bytes, at_ns: int) -> list[Decoded]:
+    return (decoder.frame if name in topics.FRAMES else decoder.take)(address(name), payload, at_ns)
 
 
 # ── what was measured ──
@@ -136,7 +178,7 @@ RAW = {
 
 def test_a_measurement_is_shown_as_the_body_stood_to_within_a_quantizers_step() -> None:
     found = by_topic(
-        configured().take(address("measurement"), measurement(*sent_vector(ATTITUDE), 0.5, -0.25, 0.0), NOW)
+        configured().frame(address("measurement"), measurement(*sent_vector(ATTITUDE), 0.5, -0.25, 0.0), NOW)
     )
     assert set(found) == {"/aero/measurement", "/aero/pose", "/aero/tf"}
     shown = said(found["/aero/measurement"])
@@ -148,7 +190,7 @@ def test_a_measurement_is_shown_as_the_body_stood_to_within_a_quantizers_step() 
 
 
 def test_pose_transform_and_angles_of_a_measurement_are_the_same_attitude() -> None:
-    found = by_topic(configured().take(address("measurement"), measurement(*sent_vector(ATTITUDE), 0, 0, 0), NOW))
+    found = by_topic(configured().frame(address("measurement"), measurement(*sent_vector(ATTITUDE), 0, 0, 0), NOW))
     pose, transform = found["/aero/pose"].data, fields(found["/aero/tf"].data)
     assert (transform[2], transform[3]) == ([b"world"], [b"aero"])
     assert quaternion(transform[5][0]) == orientation(pose)
@@ -162,7 +204,7 @@ def test_pose_transform_and_angles_of_a_measurement_are_the_same_attitude() -> N
 
 def test_what_a_measurement_does_not_know_is_null_and_gives_no_pose() -> None:
     decoder = configured()
-    (shown,) = decoder.take(address("measurement"), measurement(0.1, None, 0.1, 0.5, None, 0.0), NOW)
+    (shown,) = decoder.frame(address("measurement"), measurement(0.1, None, 0.1, 0.5, None, 0.0), NOW)
     values = said(shown)
     assert [values[name] for name in ("roll_deg", "pitch_deg", "yaw_deg", "q_deg_s")] == [None] * 4
     assert values["p_deg_s"] == pytest.approx(degrees(0.5), abs=degrees(WIRE.rate.quantizer().bound))
@@ -175,7 +217,7 @@ def test_what_a_measurement_does_not_know_is_null_and_gives_no_pose() -> None:
 def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_and_saturation_is_marked() -> None:
     volts = WIRE.voltage.quantizer()
     payload = frame(WIRE.command, [volts, volts], [24.0, -3.0])
-    (shown,) = configured().take(address("command"), payload, NOW)
+    (shown,) = configured().frame(address("command"), payload, NOW)
     assert said(shown) == {
         "voltage_1_v": None,
         "voltage_2_v": pytest.approx(volts.outermost, abs=1e-4),
@@ -188,7 +230,7 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_and_saturation_is
 
 def test_a_command_without_a_valid_value_is_null() -> None:
     volts = WIRE.voltage.quantizer()
-    (shown,) = configured().take(address("command"), frame(WIRE.command, [volts, volts], [None, 5.0]), NOW)
+    (shown,) = configured().frame(address("command"), frame(WIRE.command, [volts, volts], [None, 5.0]), NOW)
     assert said(shown)["voltage_2_v"] is said(shown)["saturated_2"] is None
     assert said(shown)["voltage_3_v"] == pytest.approx(volts.quantize(5.0), abs=1e-4)
 
@@ -196,7 +238,7 @@ def test_a_command_without_a_valid_value_is_null() -> None:
 def test_a_body_with_three_motors_and_no_quantizer_shows_all_three() -> None:
     decoder = configured(None, "wire.actuators=3", "wire.voltage.bits=cont")
     wire = load(None, ["wire.actuators=3", "wire.voltage.bits=cont"]).wire
-    (shown,) = decoder.take(address("command"), wire.command.pack(0, [1.5, -24.0, 0.0]), NOW)
+    (shown,) = decoder.frame(address("command"), wire.command.pack(0, [1.5, -24.0, 0.0]), NOW)
     assert list(said(shown).values()) == [1.5, -24.0, 0.0, False, True, False]
 
 
@@ -274,8 +316,7 @@ def test_the_body_hangs_in_the_frame_that_its_transform_moves(kind: str, rotors:
         ("event", Event(role="plant", kind="tripped", text="over 60°"), 4, b"tripped: over 60\xc2\xb0"),
         ("event", Event(role="controller", kind="lost", text="no measurement"), 3, b"lost: no measurement"),
         ("event", Event(role="controller", kind="claimed", text="aero"), 2, b"claimed: aero"),
-        ("change", Change(session="s1", tick=40, gains=Gains(C1=(0.4, 0.4, 0.4))), 1, b"from tick 40 on: "),
-        ("loss", Loss(key="k", count=7, reason="disk", until_ns=NOW), 3, b"7 messages of k"),
+        ("loss", Loss(key="k", count=7, reason="disk"), 3, b"7 messages of k"),
     ],
 )
 def test_what_happens_is_a_line_of_the_log(name: str, message: Message, level: int, words: bytes) -> None:
@@ -292,34 +333,36 @@ def test_what_happens_is_a_line_of_the_log(name: str, message: Message, level: i
 def test_frames_give_nothing_before_a_contract_and_are_read_by_the_plants() -> None:
     decoder = Decoder(None)
     payload = measurement(*sent_vector(ATTITUDE), 0, 0, 0)
-    assert decoder.take(address("measurement"), payload, NOW) == []
+    assert decoder.frame(address("measurement"), payload, NOW) == []
     decoder.configure(contract("recorder"))
-    assert decoder.take(address("measurement"), payload, NOW) == []
+    assert decoder.frame(address("measurement"), payload, NOW) == []
     assert decoder.malformed == 0
     decoder.configure(contract("controller", "wire.attitude.bits=12"))
-    assert decoder.take(address("measurement"), payload, NOW) == []
+    assert decoder.frame(address("measurement"), payload, NOW) == []
     decoder.configure(contract("plant"))
     decoder.configure(contract("controller", "wire.attitude.bits=12"))
-    assert len(decoder.take(address("measurement"), payload, NOW)) == 3
+    assert len(decoder.frame(address("measurement"), payload, NOW)) == 3
 
 
 def test_silence_in_lockstep_shows_nothing_new_and_takes_no_frames_turn() -> None:
     decoder = Decoder(25.0)
     decoder.configure(contract("plant", "wire.transmit.measurement=on_change"))
     frame = WIRE.measurement.pack(3, (1, 2, 3, 4, 5, 6))
-    assert decoder.take(address("measurement"), b"", NOW) == []
-    assert decoder.take(address("measurement"), frame, NOW + 1)
+    assert decoder.frame(address("measurement"), b"", NOW) == []
+    assert decoder.frame(address("measurement"), frame, NOW + 1)
     assert decoder.malformed == 0
-    assert decoder.take(address("command"), b"", NOW) == []  # which are periodic
+    assert decoder.frame(address("command"), b"", NOW) == []  # which are periodic
     assert decoder.malformed == 1
 
 
 def test_a_contract_of_another_version_changes_nothing_and_is_counted() -> None:
     decoder = configured()
-    decoder.configure(Contract(role="plant", vehicle="aero", host="h", versions={}, config={"wire": {"bits": 3}}))
-    decoder.configure(Contract(role="plant", vehicle="aero", host="h", versions={}, config={}))
+    decoder.configure(
+        Contract(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config={"wire": {"bits": 3}})
+    )
+    decoder.configure(Contract(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config={}))
     assert decoder.malformed == 2
-    assert decoder.take(address("measurement"), measurement(0, 0, 0, 0, 0, 0), NOW)
+    assert decoder.frame(address("measurement"), measurement(0, 0, 0, 0, 0, 0), NOW)
 
 
 def test_vehicles_do_not_get_in_each_others_way() -> None:
@@ -327,9 +370,9 @@ def test_vehicles_do_not_get_in_each_others_way() -> None:
     decoder.configure(contract("plant", vehicle="other"))
     payload = measurement(0, 0, 0, 0, 0, 0)
     for vehicle in ("aero", "other"):
-        assert {m.topic.split("/")[1] for m in decoder.take(address("measurement", vehicle=vehicle), payload, NOW)} == {
-            vehicle
-        }
+        assert {
+            m.topic.split("/")[1] for m in decoder.frame(address("measurement", vehicle=vehicle), payload, NOW)
+        } == {vehicle}
 
 
 # ── the rate ──
@@ -337,32 +380,92 @@ def test_vehicles_do_not_get_in_each_others_way() -> None:
 
 def test_a_topic_that_streams_gives_at_most_so_many_a_second_by_time_of_publication() -> None:
     decoder = configured(30.0)
-    payload, where = measurement(0, 0, 0, 0, 0, 0), address("measurement")
-    given = [NOW + k * 1_000_000 for k in range(3000) if decoder.take(where, payload, NOW + k * 1_000_000)]
+    given = [NOW + k * 1_000_000 for k in range(3000) if decode(decoder, "truth", RAW["truth"], NOW + k * 1_000_000)]
     assert len(given) == pytest.approx(90, abs=1)
     assert max(b - a for a, b in pairwise(given)) < 2 / 30 * 1e9
 
 
 def test_without_a_rate_everything_is_given() -> None:
     decoder = configured(None)
-    payload, where = measurement(0, 0, 0, 0, 0, 0), address("measurement")
-    assert all(decoder.take(where, payload, NOW) for _ in range(10))
+    assert all(decode(decoder, name, RAW[name], NOW) for name in RAW for _ in range(10))
 
 
 def test_what_happens_once_is_given_whatever_the_rate() -> None:
     decoder = configured(0.001)
     event = Event(role="plant", kind="tripped", text="x").encode()
-    loss = Loss(key="k", count=1, reason="queue", until_ns=NOW).encode()
-    change = Change(session="s1", tick=0).encode()
-    for name, payload in (("event", event), ("loss", loss), ("change", change), ("status", STATUS.encode())):
+    loss = Loss(key="k", count=1, reason="queue").encode()
+    for name, payload in (("event", event), ("loss", loss), ("status", STATUS.encode())):
         assert all(decoder.take(address(name), payload, NOW + k) for k in range(5))
 
 
 def test_a_clock_that_is_set_back_does_not_silence_a_topic() -> None:
     decoder = configured(30.0)
-    payload, where = measurement(0, 0, 0, 0, 0, 0), address("measurement")
-    assert decoder.take(where, payload, NOW)
-    assert decoder.take(where, payload, NOW - 3600 * 10**9)
+    assert decode(decoder, "truth", RAW["truth"], NOW)
+    assert decode(decoder, "truth", RAW["truth"], NOW - 3600 * 10**9)
+
+
+# ── traces ──
+
+
+def test_the_rows_of_each_end_give_what_it_sent_as_frames_do_at_the_times_of_sending() -> None:
+    frames = {
+        "plant": ("measurement", measurement(*sent_vector(ATTITUDE), 0.5, -0.25, 0.0)),
+        "controller": ("command", frame(WIRE.command, [WIRE.voltage.quantizer()] * 2, [24.0, None])),
+    }
+    for end in ENDS:
+        name, sent = frames[end]
+        given = configured().take(
+            address("trace", end), batch(end, [(NOW, Sent.FRAME, sent), (NOW + 2_000_000, Sent.FRAME, sent)]), 5
+        )
+        assert given == [
+            shown for at_ns in (NOW, NOW + 2_000_000) for shown in configured().frame(address(name), sent, at_ns)
+        ]
+
+
+def test_ticks_at_which_nothing_or_silence_was_sent_give_nothing() -> None:
+    sent = measurement(0, 0, 0, 0, 0, 0)
+    rows = [(NOW, Sent.NONE, sent), (NOW + 1000, Sent.SILENT, sent), (NOW + 2000, Sent.FRAME, sent)]
+    given = configured(25.0).take(address("trace"), batch("plant", rows), NOW)
+    assert {shown.at_ns for shown in given} == {NOW + 2000}
+
+
+@given(
+    times=st.lists(st.integers(0, 3000), max_size=60).map(sorted),
+    cuts=st.sets(st.integers(1, 59)),
+)
+def test_the_rows_given_are_those_that_messages_of_the_same_times_would_give_however_they_are_batched(
+    times: list[int], cuts: set[int]
+) -> None:
+    """Times in ms; at 10 Hz."""
+    sent = measurement(0, 0, 0, 0, 0, 0)
+    rows = [(NOW + ms * 1_000_000, Sent.FRAME, sent) for ms in times]
+    edges = [0, *sorted(cut for cut in cuts if cut < len(rows)), len(rows)]
+    decoder, one_by_one = configured(10.0), configured(10.0)
+    given = [
+        shown.at_ns
+        for begin, end in pairwise(edges)
+        for shown in decoder.take(address("trace"), batch("plant", rows[begin:end]), 0)
+        if shown.topic == "/aero/pose"
+    ]
+    assert given == [at_ns for at_ns, *_ in rows if decode(one_by_one, "truth", RAW["truth"], at_ns)]
+
+
+def test_frames_beside_a_trace_are_not_decoded_twice() -> None:
+    """A log may hold both; `take` is for what a log holds."""
+    decoder = configured()
+    assert [decoder.take(address(name), RAW[name], NOW) for name in topics.FRAMES] == [[], []]
+    assert decoder.malformed == 0
+
+
+def test_rows_of_another_wire_spec_are_counted_and_those_of_no_time_are_left_out() -> None:
+    other = load(None, ["wire.attitude.bits=12"]).wire
+    decoder = configured()
+    rows = [(NOW, Sent.FRAME, bytes(other.measurement.size))]
+    assert decoder.take(address("trace"), batch("plant", rows, other), NOW) == []
+    assert decoder.malformed == 1
+    payload = bytearray(RAW["trace"])
+    payload[40:48] = (-(2**62)).to_bytes(8, "little", signed=True)  # the header's wall clock
+    assert configured().take(address("trace"), bytes(payload), NOW) == []
 
 
 # ── what is broken ──
@@ -375,14 +478,20 @@ def test_a_clock_that_is_set_back_does_not_silence_a_topic() -> None:
 )
 def test_any_bytes_at_any_time_give_something_or_nothing_and_never_raise(name: str, payload: bytes, at_ns: int) -> None:
     decoder = configured()
-    assert bool(decoder.take(address(name), payload, at_ns)) != bool(decoder.malformed)
+    assert bool(decode(decoder, name, payload, at_ns)) != bool(decoder.malformed)
+
+
+@given(st.integers(0, len(RAW["trace"]) - 1), st.binary(min_size=1, max_size=8))
+def test_a_damaged_trace_gives_something_or_nothing_and_never_raises(place: int, damage: bytes) -> None:
+    payload = RAW["trace"][:place] + damage + RAW["trace"][place + len(damage) :]
+    assert all(0 <= shown.at_ns < 2**64 for shown in configured(25.0).take(address("trace"), payload, NOW))
 
 
 @pytest.mark.parametrize("name", sorted(RAW))
 def test_a_time_beyond_what_viewers_can_hold_is_the_last_they_can(name: str) -> None:
-    for shown in configured().take(address(name), RAW[name], 2**64 - 1):
-        assert shown.at_ns == 2**64 - 1
-        if shown.shape.name == "foxglove.PoseInFrame":
+    for shown in decode(configured(), name, RAW[name], 2**64 - 1):
+        assert shown.at_ns == 2**64 - 1 or name == "trace"  # whose rows have their own
+        if shown.shape.name == "foxglove.PoseInFrame" and name != "trace":
             assert fields(fields(shown.data)[1][0])[1] == [2**32 - 1]
 
 
@@ -416,8 +525,8 @@ TYPES: dict[str, type | tuple[type, ...]] = {
 
 def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says() -> None:
     decoder = configured()
-    assert set(RAW) == LIMITED | UNLIMITED
-    given = [shown for name, payload in RAW.items() for shown in decoder.take(address(name), payload, NOW)]
+    assert set(RAW) == LIMITED | UNLIMITED | {"trace", *topics.FRAMES}
+    given = [shown for name, payload in RAW.items() for shown in decode(decoder, name, payload, NOW)]
     given += decoder.take(address("status", "controller"), STATUS.encode(), NOW)
     given += decoder.take(address("status", "recorder"), STATUS.encode(), NOW)
     assert {shown.topic: shown.shape for shown in given} == {f"/aero/{name}": shape for name, shape in SHAPES.items()}
@@ -442,7 +551,7 @@ def test_every_schema_is_one_that_viewers_read() -> None:
 
 def test_fields_that_are_numbers_have_a_unit_in_their_names_or_count_something() -> None:
     units = ("_deg", "_deg_s", "_v", "_s", "_hz", "_us")
-    plain = {"damping_1", "damping_2", "damping_3", "sign", "skipped", "refused", "saturated"}
+    plain = {"damping_1", "damping_2", "damping_3", "sign", "skipped", "refused", "stale", "saturated"}
     for shape in {shape for shape in SHAPES.values() if shape.encoding == "jsonschema"}:
         for name, field in json.loads(shape.schema)["properties"].items():
             assert field["type"] in ("string", "boolean") or name.endswith(units) or name in plain, name

@@ -2,38 +2,46 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
-from mcap.records import Channel, Message, Metadata
 
-from service.logs.mcap_file import records
+from protocol import topics
+from protocol.publication import Received
+from protocol.verbs import Change, Gains, Hold
+from service.config import load
 from service.recording import rolling
-from service.recording.intake import Taken
-from tests.service.logs.made_log import AN_OPERATORS_WORDS, make_log
-from tests.service.recording.recording import Clock, Disk, Story
+from tests.service.recording.ends import SESSION, VEHICLE, Ends, contract_of
+from tests.service.recording.recording import Arrived, Clock, Disk, Story
 
 TICKS = 600
+START_NS = 1_800_000_000_000_000_000
+CHANGES = {
+    0: Change(session=SESSION, tick=0, gains=Gains(), reference=load().reference),
+    120: Change(session=SESSION, tick=120, gains=Gains(C2=(0.2, 0.2, 0.2))),
+    250: Change(session=SESSION, tick=250, reference=Hold(attitude=(0.0, 5.0, -10.0)), within_s=1.0),
+    400: Change(session=SESSION, tick=400, gains=Gains(Gamma=(0.01, 0.01, 0.01))),
+}
 
 
 @pytest.fixture(scope="session")
-def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
-    """A session of 1.2 s, in which an operator speaks at 0.24, 0.5 and 0.8 s."""
-    path = tmp_path_factory.mktemp("made") / "made.mcap"
-    make_log(path, TICKS, changes=AN_OPERATORS_WORDS)
-    channels: dict[int, str] = {}
-    messages: list[Taken] = []
-    contract: dict[str, str] = {}
-    for record in records(path):
-        if isinstance(record, Metadata):
-            contract = record.metadata
-        elif isinstance(record, Channel):
-            channels[record.id] = record.topic
-        elif isinstance(record, Message):
-            # it comes some time after it was published, so that the two cannot be taken for each other
-            messages.append(Taken(channels[record.channel_id], record.data, record.publish_time, record.log_time + 77))
-    return Story(contract["key"], contract["json"].encode(), messages)
+def story() -> Story:
+    """A session of 1.2 s in batches of one row, in which an operator changes something at 0.24, 0.5 and 0.8 s."""
+    settings = load()
+    ends = Ends(settings, rows=1, changes=CHANGES)
+    messages: list[Arrived] = []
+    numbers: Counter[str] = Counter()
+    for k in range(TICKS):
+        at_ns = START_NS + k * 2_000_000
+        for said in ends.tick(k, k * 2_000_000 + 1, at_ns):
+            # received some time after it was published, so that the two cannot be taken for each other
+            received = Received(said.key, said.payload, 5 + numbers[said.key], at_ns, None)
+            messages.append(Arrived(received, at_ns + 77))
+            numbers[said.key] += 1
+    contract = contract_of(settings, "plant").encode()
+    return Story(topics.key("contract", VEHICLE, role="plant"), contract, messages, list(CHANGES.values()))
 
 
 @pytest.fixture

@@ -16,10 +16,12 @@ from mcap.reader import make_reader
 
 from protocol import topics
 from protocol.messages import Contract
+from protocol.publication import Received
+from protocol.trace import read_batch
+from protocol.verbs import Change
 from service.logs.decoded import Decoded, Decoder
 from service.recording import log_file as writer
 from service.recording import rolling
-from service.recording.intake import Taken
 from service.recording.rolling import RollingLog
 from service.settings import RecorderSettings
 
@@ -27,12 +29,20 @@ TICK_S = 0.002
 EVERYTHING = 1 << 60
 
 
+class Arrived(NamedTuple):
+    """A message, and when it was received [ns since 1970]."""
+
+    received: Received
+    at_ns: int
+
+
 class Story(NamedTuple):
-    """A session's messages as they came, and its contract."""
+    """A session's messages as they were received, its contract, and what its controller follows, in order."""
 
     key: str
     contract: bytes
-    messages: list[Taken]
+    messages: list[Arrived]
+    changes: list[Change]
 
 
 class Clock:
@@ -94,28 +104,30 @@ class Recording:
     def __init__(self, clock: Clock, story: Story, **settings: object) -> None:
         self.told: list[tuple[str, bool]] = []
         self._clock = clock
-        self.waiting: list[Taken] = []
+        self.waiting: list[Arrived] = []
         self.log = RollingLog(RecorderSettings.model_validate(settings), lambda *told: self.told.append(told))
         clock.logs.append(self.log)
         self.log.add_contract(story.key, story.contract)
         self._decoder = Decoder(25.0)
         self._decoder.configure(Contract.model_validate_json(story.contract))
 
-    def take(self, messages: list[Taken]) -> None:
-        for taken in messages:
-            self.waiting.append(taken)
+    def take(self, messages: list[Arrived]) -> None:
+        for arrived in messages:
+            self.waiting.append(arrived)
             while self.waiting and self.log.writable:
                 self._add(self.waiting.pop(0))
             self._clock.now += TICK_S / 2
             self.log.tend()
 
-    def _add(self, taken: Taken) -> None:
-        address = topics.read_key(taken.key)
+    def _add(self, arrived: Arrived) -> None:
+        received, at_ns = arrived
+        address = topics.read_key(received.key)
         assert address is not None
-        if address.topic.name == "change":
-            self.log.add_change(taken)
-        decoded: list[Decoded] = self._decoder.take(address, taken.payload, taken.published_ns)
-        self.log.add(taken, decoded)
+        if batch := read_batch(received.payload) if address.topic.name == "trace" else None:
+            for change in batch.tail.changes:
+                self.log.add_change(received.key, change)
+        decoded: list[Decoded] = self._decoder.take(address, received.payload, received.published_ns or at_ns)
+        self.log.add(received, at_ns, decoded)
 
     def wait(self, seconds: float) -> None:
         """Nothing comes for so long."""
@@ -150,13 +162,12 @@ def decoded_count(paths: list[Path]) -> int:
     return count
 
 
-def numbered(messages: list[Taken]) -> list[tuple[str, int, int, int, bytes]]:
-    """Messages as they must stand in the log: numbered by key from 1, over all files, in order of their log times."""
-    sequences: dict[str, int] = {}
-    found = []
-    for taken in messages:
-        sequences[taken.key] = sequences.get(taken.key, 0) + 1
-        found.append((taken.key, sequences[taken.key], taken.arrived_ns, taken.published_ns, taken.payload))
+def numbered(messages: list[Arrived]) -> list[tuple[str, int, int, int, bytes]]:
+    """Messages as they must stand in the log: by their publishers' numbers, in order of their log times."""
+    found = [
+        (received.key, received.sequence, at_ns, received.published_ns or at_ns, received.payload)
+        for received, at_ns in messages
+    ]
     return sorted(found, key=lambda one: one[2])
 
 

@@ -1,6 +1,6 @@
-"""The recorder over real Zenoh sessions, in this process, where its disk and its queue are the test's to fill.
+"""The recorder over real Zenoh sessions, in this process, where its disk and its memory are the test's to fill.
 
-What it promises as a process of its own is in tests/hil/test_recorder.py.
+What it promises as a process of its own is in tests/hil.
 """
 
 from __future__ import annotations
@@ -9,25 +9,32 @@ import errno
 import os
 import threading
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
 import zenoh
 from mcap.reader import make_reader
 
+from protocol import topics
 from protocol.messages import Loss, Status
+from protocol.publication import CachedPublisher
 from protocol.role import Role
-from service.recording import recorder as recorder_module
-from service.recording import rolling
-from service.recording.intake import Intake
+from protocol.trace import read_batch
+from protocol.verbs import Change
+from service.config import load
+from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from service.recording import backlog, rolling
+from service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
 from service.recording.recorder import Recorder
-from service.recording.rolling import RecorderError
+from service.recording.rolling import RecorderError, parts
 from service.settings import RecorderSettings
 from tests.protocol.gathering import Gathering, eventually
+from tests.service.recording.conftest import CHANGES
+from tests.service.recording.ends import Ends, contract_of
 
-KEY = "aeroloop/aero/s1/measurement"
+KEY = "aeroloop/aero/telemetry"
 ROOM = 50
+START_NS = 1_800_000_000_000_000_000
 
 
 class Running:
@@ -38,15 +45,14 @@ class Running:
         error: What it ended with, if it did not end well.
     """
 
-    def __init__(self, path: Path, gathering: Gathering) -> None:
+    def __init__(self, path: Path, gathering: Gathering, **settings: object) -> None:
         self.path = path
         self.full = False
         self.error: Exception | None = None
-        self.state: list[str] = []
         self._write = os.pwrite
         self.role = Role("recorder", "aero", gathering.settings, {})
-        settings = RecorderSettings(path=path, chunk_s=0.05, batch_s=0.0, decoded_hz=0.0)
-        self.recorder = Recorder(self.role, settings)
+        told = {"chunk_s": 0.05, "decoded_hz": 0.0, **settings}
+        self.recorder = Recorder(self.role, RecorderSettings.model_validate({"path": path, **told}))
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -65,18 +71,25 @@ class Running:
         """Stop it and wait until its log is closed."""
         self.role.stop.set()
         self._thread.join()
-        self.role.__exit__(None, None, None)
+        if not self.role.zenoh.is_closed():
+            self.role.__exit__(None, None, None)
 
     def messages(self) -> list[tuple[str, bytes]]:
-        with self.path.open("rb") as file:
-            return [(channel.topic, one.data) for _, channel, one in make_reader(file).iter_messages()]
+        found = []
+        for path in parts(self.path):
+            with path.open("rb") as file:
+                found += [(channel.topic, one.data) for _, channel, one in make_reader(file).iter_messages()]
+        return found
 
-    def frames(self) -> list[int]:
-        return [int.from_bytes(data, "big") for topic, data in self.messages() if topic == KEY]
+    def of(self, key: str) -> list[bytes]:
+        return [data for topic, data in self.messages() if topic == key]
+
+    def numbers(self) -> list[int]:
+        return [int.from_bytes(data, "big") for data in self.of(KEY)]
 
     def losses(self) -> list[tuple[str, int, str]]:
         """Key, how many and why, in the log."""
-        told = [Loss.model_validate_json(data) for topic, data in self.messages() if topic.endswith("/loss")]
+        told = [Loss.model_validate_json(data) for data in self.of("aeroloop/aero/loss")]
         return [(loss.key, loss.count, loss.reason) for loss in told]
 
 
@@ -86,33 +99,43 @@ def gathering() -> Iterator[Gathering]:
         yield gathering
 
 
+Record = Callable[..., Running]
+
+
 @pytest.fixture
-def running(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
-    """A recorder whose queue holds fifty messages and whose disk is tried ten times a second."""
-    monkeypatch.setattr(recorder_module, "Intake", partial(Intake, most=ROOM))
+def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record]:
+    """Starts recorders: in memory there is room for fifty messages, and the disk is tried ten times a second."""
+    monkeypatch.setattr(backlog, "MOST_MESSAGES", ROOM)
     monkeypatch.setattr(rolling, "RETRY_S", 0.1)
-    running = Running(tmp_path / "a.mcap", gathering)
-    monkeypatch.setattr(os, "pwrite", running.write)
-    yield running
-    running.full = False
-    running.end()
+    running: list[Running] = []
+
+    def start(**settings: object) -> Running:
+        running.append(Running(tmp_path / f"log{len(running)}.mcap", gathering, **settings))
+        monkeypatch.setattr(os, "pwrite", running[-1].write)
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.full = False
+        one.end()
 
 
-Send = Callable[[int], None]
+class Publisher:
+    """Publishes messages with a number, from a cache of 65 000."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
+        self._next = 0
+
+    def send(self, until: int) -> None:
+        for number in range(self._next, until):
+            self._publisher.put(number.to_bytes(4, "big"))
+        self._next = until
 
 
 @pytest.fixture
-def send(gathering: Gathering, running: Running) -> Send:
-    """Publishes a message with a number, as a sender that the recorder knows from the start."""
-    declared = gathering.join().declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-    eventually("the match", lambda: bool(declared.matching_status.matching))  # type: ignore[attr-defined]
-
-    def put(number: int) -> None:
-        declared.put(number.to_bytes(4, "big"), source_info=zenoh.SourceInfo(declared.id, number))
-
-    put(0)
-    eventually("the first", lambda: running.recorder.log.written > 0)
-    return put
+def publisher(gathering: Gathering) -> Publisher:
+    return Publisher(gathering.join())
 
 
 def statuses(gathering: Gathering) -> list[Status]:
@@ -125,104 +148,216 @@ def statuses(gathering: Gathering) -> list[Status]:
     return found
 
 
+# What is recorded
+
+
+def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and_every_file_can_be_read_alone(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rolling, "LOOK_S", 0.0)
+    session, settings = gathering.join(), load()
+    publishers: dict[str, CachedPublisher] = {}
+    published: dict[str, list[bytes]] = {}
+
+    def publish(key: str, payload: bytes) -> None:
+        if key not in publishers:
+            publishers[key] = CachedPublisher(session, key, per_s=50)
+        publishers[key].put(payload)
+        published.setdefault(key, []).append(payload)
+
+    contract = topics.key("contract", "aero", role="plant")
+    publish(contract, contract_of(settings, "plant").encode())
+    ends = Ends(settings, changes=CHANGES)
+    for k in range(500):
+        for said in ends.tick(k, 10**10 + k * 2_000_000, START_NS + k * 2_000_000):
+            publish(said.key, said.payload)
+    for _ in range(2):
+        running = record(max_file_s=0.001)
+        eventually("two files", lambda running=running: len(parts(running.path)) > 2)  # type: ignore[misc]
+        running.end()
+        assert {key: running.of(key) for key in published} == published
+        assert running.losses() == []
+        with parts(running.path)[-1].open("rb") as file:
+            metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
+        changes = [told for name, told in metadata if name == CHANGE_METADATA]
+        assert {told["key"] for told in changes} == {"aeroloop/aero/trace/controller"}
+        assert [Change.model_validate_json(told["json"]) for told in changes] == list(CHANGES.values())
+        contracts = {told["key"]: told["json"].encode() for name, told in metadata if name == CONTRACT_METADATA}
+        assert contracts[contract] == published[contract][0]
+
+
+def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishers_numbers(
+    gathering: Gathering, record: Record
+) -> None:
+    session = gathering.join()
+    contract = CachedPublisher(session, topics.key("contract", "aero", role="plant"), per_s=1)
+    contract.put(contract_of(load(), "plant").encode())
+    trace = CachedPublisher(session, topics.key("trace", "aero", role="plant"), per_s=10)
+    ends = Ends(load())
+    batches = [
+        said.payload
+        for k in range(100)
+        for said in ends.tick(k, 10**10 + k * 2_000_000, START_NS + k * 2_000_000)
+        if (said.topic, said.role) == ("trace", "plant")
+    ]
+    running = record(decoded_hz=10_000.0)
+    eventually("the contract", lambda: running.recorder.log.written > 2)
+    for batch in batches:
+        trace.put(batch)
+    eventually("the trace", lambda: running.recorder.log.written > 4)
+    running.end()
+    times, raw = [], []
+    with running.path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.topic == "/aero/pose":
+                times.append(message.publish_time)
+            elif "/trace/" in channel.topic:
+                assert schema is not None
+                assert (channel.message_encoding, schema.encoding) == (TRACE_ENCODING, TRACE_ENCODING)
+                raw.append((message.sequence, message.data))
+    first = read_batch(batches[0])
+    assert first is not None
+    assert raw == list(enumerate(batches))
+    assert times == [START_NS + k * 2_000_000 for k in range(100)]
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_frames_are_recorded_only_if_that_is_configured(gathering: Gathering, record: Record, frames: bool) -> None:
+    running = record(frames=frames)
+    measurement = topics.key("measurement", "aero", session="s1")
+    declared = gathering.join().declare_publisher(measurement)
+    sent = 0
+
+    def recorded() -> bool:
+        nonlocal sent
+        declared.put(sent.to_bytes(7, "big"))
+        sent += 1
+        return running.recorder.log.written > 20 if frames else sent > 20
+
+    eventually("frames", recorded)
+    running.end()
+    found = running.of(measurement)
+    assert bool(found) == frames
+    if frames:
+        assert found == sorted(found)
+        with running.path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert {c.message_encoding for c in summary.channels.values() if c.topic == measurement} == {FRAME_ENCODING}
+
+
+def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_message(
+    record: Record, publisher: Publisher
+) -> None:
+    running = record()
+    publisher.send(1)
+    eventually("the first", lambda: running.recorder.log.written > 2)
+    publisher.send(20_000)
+    running.end()
+    assert running.numbers() == list(range(20_000))
+    assert running.losses() == []
+
+
+def test_the_last_message_in_a_log_is_that_recording_stopped(record: Record, publisher: Publisher) -> None:
+    running = record()
+    publisher.send(2)
+    running.end()
+    key, said = running.messages()[-1]
+    assert key == "aeroloop/aero/status/recorder"
+    assert Status.model_validate_json(said).state == "stopped"
+    assert Status.model_validate_json(said).received == len(running.messages()) - 1
+
+
+def test_what_is_no_contract_or_no_batch_is_recorded_as_it_is_and_stops_nothing(
+    gathering: Gathering, record: Record
+) -> None:
+    running = record(decoded_hz=25.0)
+    session = gathering.join()
+    names = {topics.key(name, "aero", role="plant"): name for name in topics.RECORDED}
+    for key in names:
+        CachedPublisher(session, key, per_s=1).put(b"\xff\x00")
+    eventually("all", lambda: running.recorder.log.written >= len(names) + 2)
+    running.end()
+    assert running.error is None
+    recorded = {key for key, data in running.messages() if data == b"\xff\x00"}
+    assert recorded == set(names)
+
+
+# What is lost
+
+
 def test_while_the_disk_is_full_it_says_so_and_what_finds_no_room_in_memory_is_counted_in_the_log(
-    running: Running, send: Send, gathering: Gathering
+    record: Record, publisher: Publisher, gathering: Gathering
 ) -> None:
     """Every message is in the log or in the count of those that are not; none is in both, and none is lost twice."""
+    running = record()
     told = statuses(gathering)
+    publisher.send(1)
+    eventually("the first", lambda: running.recorder.log.written > 2)
     running.full = True
-    send(1)
+    publisher.send(2)
     eventually("trouble", lambda: not running.recorder.log.writable)
-    for number in range(2, 502):
-        send(number)
+    publisher.send(502)
     eventually("its word", lambda: any(status.state == "waiting for the disk" for status in told))
-    assert len(running.recorder._intake) == ROOM
+    eventually("a full backlog", lambda: len(running.recorder._backlog) == ROOM)
     running.full = False
     eventually(
         "its word", lambda: told[-1].state == "recording" and any("lost: disk" in note for note in told[-1].notes)
     )
-    for number in range(502, 510):
-        send(number)
+    publisher.send(510)
     running.end()
-    frames = running.frames()
+    numbers = running.numbers()
     lost = sum(count for key, count, reason in running.losses() if key == KEY and reason == "disk")
-    assert frames == sorted(set(frames))
-    assert frames[-8:] == list(range(502, 510))
-    assert lost == 510 - len(frames)
+    assert numbers == sorted(set(numbers))
+    assert numbers[-8:] == list(range(502, 510))
+    assert lost == 510 - len(numbers)
     assert 502 - ROOM < lost + 3 <= 502
     assert {reason for _, _, reason in running.losses()} == {"disk"}
     assert running.error is None
 
 
-def test_what_comes_faster_than_it_is_written_is_no_fault_of_the_disk(
-    running: Running, send: Send, gathering: Gathering
-) -> None:
-    """Even if the disk was full before, and had room for all."""
-    told = statuses(gathering)
-    running.full = True
-    send(1)
-    eventually("trouble", lambda: not running.recorder.log.writable)
-    running.full = False
-    before = len(told)
-    eventually("its word", lambda: "recording" in [status.state for status in told[before:]])
-    written = threading.Event()
-    running.role.later(lambda: written.wait(20))  # the thread that writes is busy
-    for number in range(2, 200):
-        send(number)
-    eventually("a full queue", lambda: len(running.recorder._intake) == ROOM)
-    eventually("refusals", lambda: running.recorder._intake._refusals.messages[KEY] > 0)
-    written.set()
-    eventually("its word", lambda: any("lost: queue" in note for note in told[-1].notes))
+def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gathering, record: Record) -> None:
+    """A publisher without a cache: what it did not publish cannot be recovered."""
+    running = record()
+    declared = gathering.join().declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+    eventually("the match", lambda: bool(declared.matching_status.matching))  # type: ignore[attr-defined]
+    for number in (0, 1, 2, 3, 1000):
+        declared.put(number.to_bytes(4, "big"), source_info=zenoh.SourceInfo(declared.id, number))
     running.end()
-    losses = running.losses()
-    assert {reason for _, _, reason in losses} == {"queue"}
-    assert sum(count for key, count, _ in losses if key == KEY) == 200 - len(running.frames())
+    assert running.numbers() == [0, 1, 2, 3, 1000]
+    assert running.losses() == [(KEY, 996, "network")]
+
+
+# The end, with a disk that refuses
 
 
 def test_a_recorder_that_is_stopped_when_the_disk_has_room_again_writes_what_waited(
-    running: Running, send: Send, monkeypatch: pytest.MonkeyPatch
+    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rolling, "RETRY_S", 1e6)
+    running = record()
     running.full = True
-    send(1)
+    publisher.send(1)
     eventually("trouble", lambda: not running.recorder.log.writable)
-    for number in range(2, 30):
-        send(number)
-    eventually(
-        "the last", lambda: (29).to_bytes(4, "big") in [one.payload for one in list(running.recorder._intake._queue)]
-    )
+    publisher.send(30)
+    eventually("all", lambda: len(running.recorder._backlog) >= 29)
     running.full = False
     running.end()
     assert running.error is None
-    assert running.frames() == list(range(30))
+    assert running.numbers() == list(range(30))
 
 
-def test_a_recorder_that_is_stopped_while_the_disk_is_full_says_how_much_is_lost(running: Running, send: Send) -> None:
+def test_a_recorder_that_is_stopped_while_the_disk_is_full_says_how_much_is_lost(
+    record: Record, publisher: Publisher
+) -> None:
+    running = record()
     running.full = True
-    send(1)
+    publisher.send(1)
     eventually("trouble", lambda: not running.recorder.log.writable)
-    for number in range(2, 30):
-        send(number)
+    publisher.send(30)
     running.end()
     assert isinstance(running.error, RecorderError)
     count, _, rest = str(running.error).partition(" ")
     assert int(count) >= 29
     assert rest.startswith(f"messages and the index of {running.path} could not be written")
     running.recorder.log._file.abandon()
-
-
-def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(running: Running, send: Send) -> None:
-    for number in (1, 2, 3, 1000):
-        send(number)
-    running.end()
-    assert running.frames() == [0, 1, 2, 3, 1000]
-    assert running.losses() == [(KEY, 996, "network")]
-
-
-def test_the_last_word_in_a_log_is_that_recording_stopped(running: Running, send: Send) -> None:
-    send(1)
-    running.end()
-    key, said = running.messages()[-1]
-    assert key == "aeroloop/aero/status/recorder"
-    assert Status.model_validate_json(said).state == "stopped"
-    assert Status.model_validate_json(said).received == len(running.messages()) - 1

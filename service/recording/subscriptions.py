@@ -1,0 +1,101 @@
+"""What the recorder receives: traces and JSON messages of all vehicles, and which of them it will never receive.
+
+Messages wait in rings that Zenoh's own threads fill, until they are taken. A publisher numbers its messages; the
+subscriber asks its cache for those that it lacks and reports what the cache no longer holds. A number that is neither
+taken nor reported was dropped by a full ring.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from typing import Final, Literal, NamedTuple
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from protocol import topics
+from protocol.publication import WAITING, Received, RecoveringSubscriber, read_sample
+
+_MASK: Final = 0xFFFF_FFFF
+"""Publishers' numbers have 32 bits and begin again at 0."""
+
+_Source = tuple[zenoh.ZenohId, int]
+"""A publisher: an EntityGlobalId cannot be compared."""
+
+
+class Lost(NamedTuple):
+    """Messages that are not in the log.
+
+    Attributes:
+        key: Their key, or a key expression where no message of their publisher was received.
+        messages: How many.
+        reason: As in Loss.
+    """
+
+    key: str
+    messages: int
+    reason: Literal["network", "queue"]
+
+
+class Subscriptions:
+    """Subscribers to every recorded topic of every vehicle.
+
+    Args:
+        session: An open session; it outlives the subscriptions.
+        frames: Receive the loop's frames, too; these have no numbers, so their losses are not known.
+        waiting: Messages of one topic that may wait to be taken.
+    """
+
+    def __init__(self, session: zenoh.Session, *, frames: bool = False, waiting: int = WAITING) -> None:
+        self._waiting = waiting
+        self._topics = {
+            key: RecoveringSubscriber(session, key, waiting) for key in (topics.key(n, "*") for n in topics.RECORDED)
+        }
+        self._frames = [
+            session.declare_subscriber(topics.key(name, "*"), RingChannel(waiting)) for name in topics.FRAMES if frames
+        ]
+        self._keys: dict[_Source, str] = {}
+        self._following: dict[_Source, int] = {}  # the number that comes next
+        self._gaps: Counter[_Source] = Counter()  # numbers that were skipped since losses were last asked for
+        self._reported: Counter[_Source] = Counter()  # numbers that were reported missing, and not yet skipped
+
+    def take(self) -> Iterator[Received]:
+        """What was received and not yet taken, topic by topic, contracts first. Never waits."""
+        for subscriber in self._topics.values():
+            for received in islice(subscriber.take(), self._waiting):
+                if received.source is not None:
+                    self._follow(received.key, (received.source.zid, received.source.eid), received.sequence)
+                yield received
+        for frames in self._frames:
+            for _ in range(self._waiting):
+                if (sample := frames.try_recv()) is None:
+                    break
+                yield read_sample(sample)
+
+    def losses(self) -> list[Lost]:
+        """What was found lost since this was last called."""
+        found = []
+        for expression, subscriber in self._topics.items():
+            for miss in subscriber.missed():
+                source = miss.source.zid, miss.source.eid
+                self._reported[source] += miss.count
+                found.append(Lost(self._keys.get(source, expression), miss.count, "network"))
+        for source, gap in self._gaps.items():
+            reported = min(gap, self._reported[source])
+            self._reported[source] -= reported
+            if gap > reported:
+                found.append(Lost(self._keys[source], gap - reported, "queue"))
+        self._gaps.clear()
+        return found
+
+    def _follow(self, key: str, source: _Source, number: int) -> None:
+        expected = self._following.get(source)
+        if expected is None:
+            self._keys[source] = key
+        elif gap := number - expected & _MASK:
+            if gap > _MASK >> 1:
+                return  # an older one
+            self._gaps[source] += gap
+        self._following[source] = number + 1 & _MASK

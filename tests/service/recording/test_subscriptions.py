@@ -1,0 +1,71 @@
+"""Every number that is not taken is counted once, under the reason for which it was lost; and memory is bounded."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from protocol.publication import CachedPublisher, Received
+from service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlog
+from service.recording.subscriptions import Subscriptions
+from tests.protocol.gathering import Gathering, eventually
+
+EVENT, TRUTH = "aeroloop/aero/event", "aeroloop/v2/truth"
+
+
+@pytest.fixture
+def gathering() -> Iterator[Gathering]:
+    with Gathering() as gathering:
+        yield gathering
+
+
+def test_numbers_that_no_cache_has_are_lost_on_the_network_and_those_that_a_full_ring_dropped_in_the_queue(
+    gathering: Gathering,
+) -> None:
+    subscriptions = Subscriptions(gathering.join(), waiting=10)
+    session = gathering.join()
+    cached = CachedPublisher(session, EVENT, per_s=10)
+    bare = session.declare_publisher(TRUTH, congestion_control=zenoh.CongestionControl.BLOCK)
+    eventually("the match", lambda: bool(bare.matching_status.matching))  # type: ignore[attr-defined]
+    taken: dict[str, list[int]] = {EVENT: [], TRUTH: []}
+    lost: Counter[tuple[str, str]] = Counter()
+
+    def take() -> bool:
+        for received in subscriptions.take():
+            taken[received.key].append(received.sequence)
+        for loss in subscriptions.losses():
+            lost[loss.key, loss.reason] += loss.messages
+        return taken[EVENT][-1:] == [99] and taken[TRUTH][-1:] == [40]
+
+    def send(number: int) -> None:
+        bare.put(b"", source_info=zenoh.SourceInfo(bare.id, number))
+
+    cached.put(b"")
+    send(7)  # the first that is received, whatever its number
+    eventually("both", lambda: bool(take() or (taken[EVENT] and taken[TRUTH])))
+    for _ in range(99):
+        cached.put(b"")
+    send(8)
+    send(40)
+    time.sleep(0.2)  # nothing is taken meanwhile, so that the ring overflows
+    eventually("all", take)
+    eventually("losses", lambda: take() and len(lost) == 2)
+    assert taken[TRUTH] == [7, 8, 40]
+    assert lost == {(TRUTH, "network"): 31, (EVENT, "queue"): 100 - len(taken[EVENT])}
+    assert subscriptions.losses() == []
+
+
+@pytest.mark.parametrize(("size", "fit"), [(1_000_000, MOST_BYTES // 1_000_000), (1, MOST_MESSAGES)])
+def test_what_waits_is_bounded_in_bytes_and_in_messages_and_the_oldest_are_kept_in_order(size: int, fit: int) -> None:
+    backlog, payload = Backlog(), bytes(size)
+    for number in range(fit + 5):
+        backlog.put(Received("k", payload, number, None, None), number)
+    assert len(backlog) == fit
+    assert backlog.refused == {"k": 5}
+    assert [entry[1] for entry in iter(backlog.next, None)] == list(range(fit))
+    backlog.put(Received("k", payload, 0, None, None), 0)
+    assert len(backlog) == 1
