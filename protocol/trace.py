@@ -15,6 +15,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -217,20 +218,29 @@ def read_batch(payload: bytes) -> Batch | None:
     header = read_header(payload)
     if header is None or header.rows > MAX_ROWS:
         return None
-    columns = _columns_dtype(
-        row_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators), header.rows
-    )
-    if len(payload) != HEADER_BYTES + columns.itemsize + header.tail_bytes:
+    columns = read_columns(payload, header)
+    if columns is None:
         return None
     try:
         tail = Tail.model_validate_json(payload[-header.tail_bytes :]) if header.tail_bytes else Tail()
     except ValidationError:
         return None
-    return Batch(header, np.frombuffer(payload, columns, 1, HEADER_BYTES)[0], tail)
+    return Batch(header, columns, tail)
 
 
-def _columns_dtype(row: np.dtype[np.void], rows: int) -> np.dtype[np.void]:
-    """The columns of so many rows, one after another."""
+def read_columns(payload: bytes, header: Header) -> np.void | None:
+    """The columns of a batch, as in `Batch`; None if its length is not what its header says."""
+    dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
+    if len(payload) != HEADER_BYTES + dtype.itemsize + header.tail_bytes:
+        return None
+    columns: np.void = np.frombuffer(payload, dtype, 1, HEADER_BYTES)[0]
+    return columns
+
+
+@lru_cache(maxsize=1024)
+def _columns_dtype(end: End, measurement: int, command: int, actuators: int, rows: int) -> np.dtype[np.void]:
+    """The columns of so many rows, one after another; a reader of hours has few different numbers of rows."""
+    row = row_dtype(end, measurement, command, actuators)
     assert row.names is not None
     return np.dtype([(name, row[name].base, (rows, *row[name].shape)) for name in row.names])
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from service.logs.export import Exported
     from service.logs.recover import Recovery
-    from service.logs.replay import SessionReplay
+    from service.logs.replay import Replay
     from service.logs.report import Report
 
 group = typer.Typer(no_args_is_help=True, help="What happened, from logs; and what happens.")
@@ -55,16 +55,17 @@ def review(
 
     def run() -> Report:
         from service.display import share_bar
-        from service.logs.review import Kept, read
+        from service.logs.review import read
+        from service.logs.ticks import Ticks
 
-        kept = Kept()
+        kept: list[Ticks] = []
         with share_bar("reading", hidden=json) as update:
-            judged = read(*logs, watch=None if figures is None else kept.watch, progress=update)
+            judged = read(*logs, watch=None if figures is None else kept.append, progress=update)
         report = judged.report(limits)
         if figures is not None:
             from service.logs.plots import draw_figures, draw_theorem
 
-            drawn = draw_figures(judged.session.settings, kept[judged.which], figures)
+            drawn = draw_figures(judged.session.settings, kept, figures)
             for path in [*drawn, *draw_theorem(report, figures)]:
                 typer.echo(f"aeroloop: drew {path}", err=True)
         if html is not None:
@@ -95,9 +96,9 @@ def replay(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Compute every command of a log again from its measurements, and compare byte for byte."""
+    """Compute what both ends did again from their traces, and compare byte for byte."""
 
-    def run() -> list[SessionReplay]:
+    def run() -> Replay:
         from service.display import share_bar
         from service.logs.replay import replay
 
@@ -106,14 +107,12 @@ def replay(
 
     replayed = guarded(run)
     if json:
-        from json import dumps
-
-        typer.echo(dumps([session.model_dump(mode="json") for session in replayed], indent=2))
+        typer.echo(replayed.model_dump_json(indent=2))
     else:
         from service.logs.display import replay_table
 
         replay_table(replayed)
-    if not overrides and any(session.differing for session in replayed):
+    if not overrides and replayed.differs:
         raise typer.Exit(1)
 
 

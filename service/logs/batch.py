@@ -23,7 +23,7 @@ from service.controller import ControllerState, resume
 from service.law import LawSettings, law_of_many
 from service.logs.codes import encoded_by, levels
 from service.logs.report import Array
-from service.logs.tallies import Integers
+from service.logs.traces import Integers
 from service.reference import Motion, reference_function
 
 ROWS: Final = 1024
@@ -96,7 +96,9 @@ class BatchController:
         self._motion = Motion(reference)
         self._gains = {name: np.array(getattr(law, name)) for name in Gains.model_fields}
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
-        self._sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(round(period * 1e9)))
+        counters = wire.measurement.counters
+        heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), counters)
+        self._sender = Sender(wire.transmit.command, heartbeat, counters)
         self.restore(ControllerState(damping_estimate=law.damping_estimate))
 
     @property
@@ -111,6 +113,12 @@ class BatchController:
         self._state = state
         resume(self._voltage, state.voltage_codes)
         self._sender.resume(state.sent_codes, state.sent_tick)
+
+    def follow(self, other: BatchController) -> None:
+        """Stand where another of the same configuration does: its state, its gains, its reference."""
+        self.restore(other.state)
+        self._gains = dict(other._gains)
+        self._motion.plan = other._motion.plan
 
     def compute_all(self, k: Integers, codes: Array, changes: deque[Change]) -> Computed:
         """What `Controller.compute` makes of measurements, one after another.

@@ -50,6 +50,30 @@ def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array
     return codes.T
 
 
+def frames_of(kind: FrameFormat, counters: NDArray[np.int64], codes: Array) -> NDArray[np.uint8]:
+    """What `pack` makes of counters and codes.
+
+    Args:
+        kind: The format.
+        counters: One a frame. Shape (n,).
+        codes: Shape (n, codes).
+
+    Returns:
+        A frame in each row. Shape (n, size).
+    """
+    bits = np.zeros((8 * kind.size, len(counters)), dtype=np.uint8)
+    bits[: kind.counter_bits] = counters >> np.arange(kind.counter_bits - 1, -1, -1)[:, np.newaxis] & 1
+    at = kind.first_bit
+    for i, width in enumerate(kind.widths):
+        if width is None:
+            octets = np.ascontiguousarray(codes[:, i]).astype(">f8").view(np.uint8).reshape(-1, 8)
+            bits[at : at + 64] = np.unpackbits(octets, axis=1).T
+        else:
+            bits[at : at + width] = codes[:, i].astype(np.int64) >> np.arange(width - 1, -1, -1)[:, np.newaxis] & 1
+        at += 64 if width is None else width
+    return np.packbits(bits, axis=0).T
+
+
 def levels(signal: SignalSpec, codes: Array) -> Array:
     """The level of each code, in the signal's unit; NaN of one that says "no valid value". Any shape."""
     table = _levels(signal)

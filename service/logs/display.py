@@ -14,13 +14,18 @@ from service.display import figures_table
 from service.logs.report import Findings, Mark, Spread, TheoremFindings
 
 if TYPE_CHECKING:
-    from service.logs.replay import SessionReplay
+    from service.logs.replay import Replay
 
 LABELS: Final = 22
 """Width of the column of labels, as in the table of figures."""
 
 MARKS_SHOWN: Final = 12
-_TIMINGS: Final = {"period": "period as published", "latency": "latency as published"}
+_TIMINGS: Final = {
+    "period": "period",
+    "latency": "latency",
+    "measurement_delay": "plant to controller",
+    "command_delay": "controller to plant",
+}
 _BARS: Final = "▁▂▃▄▅▆▇█"
 _SPARK_WIDTH: Final = 22
 
@@ -104,10 +109,15 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
             yield f"invalid {name}s", str(count)
     lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
     yield "messages lost", lost or "none that the recorder knows of"
+    for gap in findings.missing:
+        yield "not recorded", str(gap)
     if findings.lapses:
-        kinds = {"late": "late", "lost": "lost on the way", "missed": "times ticks missed"}
-        yield "heard otherwise", ", ".join(f"{findings.lapses[kind]} {text}" for kind, text in kinds.items()
-                                           if kind in findings.lapses)  # fmt: skip
+        yield "otherwise than planned", ", ".join(f"{count} {name}" for name, count in findings.lapses.items())
+    if findings.clock_offset_us is not None:
+        first, last = findings.clock_offset_us
+        yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
+    for kind, counts in (findings.frames or {}).items():
+        yield f"{kind} frames", f"{counts['recorded']} on the wire, {counts['differ']} differ from the traces"
     began = findings.started.replace("T", " ").replace("+00:00", " UTC")
     others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
     yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"
@@ -167,29 +177,37 @@ def _marks_table(marks: Sequence[Mark]) -> Table:
     return table
 
 
-def replay_table(sessions: Sequence[SessionReplay]) -> None:
+def replay_table(replay: Replay) -> None:
     """Print what replaying has shown."""
     console = Console()
-    table = Table("session", "from tick", "commands", "differing", "rms", "largest", "u_total", box=None)
-    for session in sessions:
+    table = Table("session", "from tick", "ticks", "differ", "rms", "largest", "u_total", box=None)
+    for session in replay.sessions:
         table.add_row(
             f"{session.vehicle}/{session.session}",
             str(session.first_tick) if session.first_tick is not None else "–",
-            str(session.commands),
-            str(session.differing),
+            str(session.ticks),
+            str(session.differ),
             f"{session.rms_v:.3f} V" if session.rms_v is not None else "–",
             f"{session.max_v:.2f} V" if session.max_v is not None else "–",
             f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s",
         )
     console.print(table)
-    for session in sessions:
-        first = session.first_difference
-        if first is not None:
+    for session in replay.sessions:
+        if (first := session.first_difference) is not None:
             console.print(
                 f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): "
-                f"{first.logged} logged, {first.computed or 'none'} computed"
+                f"{first.logged} logged, {first.computed} computed"
             )
-        elif session.commands:
-            console.print(f"{session.session}: every command is the same, byte for byte")
+    for plant in replay.plants:
+        if (other := plant.first_difference) is not None:
+            console.print(
+                f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} "
+                f"logged, {other.computed} computed"
+            )
+    for name, end in (("controller", replay.controller), ("plant", replay.plant)):
+        if end is None:
+            console.print(f"{name}: not replayed: {replay.reasons[name]}", markup=False)
         else:
-            console.print(f"{session.session}: nothing could be replayed: no telemetry says where it began")
+            same = "every tick is the same, byte for byte" if not end.differ else f"{end.differ} differ"
+            why = f"; {replay.reasons[name]}" if name in replay.reasons else ""
+            console.print(f"{name}: {end.ticks} ticks, {same}{why}", markup=False)

@@ -1,35 +1,33 @@
 """Export: a log for programs that know nothing of frames, as a table or as a log with everything decoded.
 
-For a table the log is read twice. First the review's own reader tells every tick of every session, so that what is
-exported is what is judged; only then is it known which session is the longest. Then comes what stands beside the ticks.
-Both are put aside on disk, and written out as a table from there, so that memory does not grow with the log.
+What is exported as a table is what is judged: the review's own reader gives every tick, block by block, and each block
+is written as it comes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from protocol.attitude import Quaternion, Vector
 from protocol.host import versions
-from protocol.messages import Telemetry, Truth
+from protocol.messages import Truth
+from protocol.topics import Address
 from service.config import ConfigError, Settings
-from service.logs.files import LogFiles, ReviewError, Which
-from service.logs.mcap_file import Damage
-from service.logs.review import read
-from service.logs.spool import Pile, Records, Spool, Window
-from service.logs.table import Rows, groups, telemetry_fields, tick_fields, truth_fields
-from service.logs.table_files import FILES, ExportError
-from service.logs.ticks import Tick
+from service.logs.files import LogFiles, Progress, ReviewError
+from service.logs.runs import Block, Run, Taker
+from service.logs.tick_reader import TickReader
+from service.logs.table import Rows, Truths, groups
+from service.logs.table_files import FILES, ExportError, TableFile
+from service.logs.traces import Integers, Which
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
-Progress = Callable[[float], None]
-
 ALL: Final = "all"
 
 ENDINGS: Final[dict[Format, str]] = {
@@ -92,7 +90,7 @@ def _log(paths: Sequence[Path], part: Path, session: str | None, progress: Progr
 
     if session is not None:
         raise ExportError("--session chooses the rows of a table; --to mcap writes the log with all its sessions")
-    written = write_decoded(LogFiles(paths), part, _share(progress, 0.0, 1.0))
+    written = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
     return Exported(
         out=str(part),
         format="mcap",
@@ -100,42 +98,76 @@ def _log(paths: Sequence[Path], part: Path, session: str | None, progress: Progr
         rows=written.messages,
         columns=written.topics,
         bytes=part.stat().st_size,
-        damages=_lines(written.damages),
+        damages=[f"{path}: {damage.what}" for path, found in written.damages.items() for damage in found],
     )
 
 
 def _table(paths: Sequence[Path], to: Format, part: Path, session: str | None, progress: Progress | None) -> Exported:
-    with Spool(part.parent) as spool:
-        ticks = _Ticks(spool)
-        longest = read(*paths, watch=ticks.watch, progress=_share(progress, 0.0, 0.7)).which
-        files = LogFiles(paths)
-        settings = files.settings
-        chosen = _chosen(ticks.piles, longest, session, files.name)
-        beside_them = _Beside(spool, settings, chosen)
-        beside_them.gather(files, _share(progress, 0.7, 0.8))
-        table = groups(settings.wire, settings.loop.period)
-        sessions = ["/".join(which) for which in chosen]
-        file = FILES[to](part, table, facts(files, settings, sessions))
-        total, done, written = sum(ticks.piles[which].rows for which in chosen), 0, _share(progress, 0.8, 1.0)
-        for which in chosen:
-            for block in beside_them.rows(which, ticks.piles[which]):
-                file.write(block)
-                done += len(block.ticks)
-                written(done / total)
-        file.close()
+    run = Run(paths, progress)
+    chosen = _chosen(run, session)
+    settings = run.files.settings(chosen[0][0])
+    table = groups(settings.wire, settings.loop.period)
+    names = ["/".join(which) for which in chosen]
+    file = FILES[to](part, table, facts(run.files, settings, names))
+    writers = {which: _Writer(which, file, run.files.settings(which[0])) for which in chosen}
+
+    def truth(vehicle: str, payload: bytes, _: int) -> None:
+        true = Truth.model_validate_json(payload)
+        writer = writers.get((vehicle, true.session or ""))
+        if writer is not None and true.session_tick is not None:
+            writer.truths.append((true.session_tick, true.attitude, true.rate, true.voltages))
+
+    def route(address: Address) -> Taker | None:
+        return partial(truth, address.vehicle) if address.topic.name == "truth" else None
+
+    try:
+        for block in run.read(chosen, route):
+            writers[block.which].take(block)
+    except ValidationError as error:
+        raise ReviewError(f"{run.files.name} is not a log of this version: {str(error).splitlines()[0]}") from None
+    rows = sum(writer.rows for writer in writers.values())
+    if not rows:
+        raise ExportError(f"{run.files.name} has no answered measurement to export")
+    file.close()
     return Exported(
         out=str(part),
         format=to,
-        sessions=sessions,
-        rows=done,
+        sessions=names,
+        rows=rows,
         columns=[column.name for group in table for column in group.columns],
         bytes=part.stat().st_size,
-        damages=_lines(files.damages),
+        damages=run.files.unread,
     )
 
 
-def _lines(damages: dict[Path, list[Damage]]) -> list[str]:
-    return [f"{path}: {damage.what}" for path, found in damages.items() for damage in found]
+class _Writer:
+    """Writes one session's ticks into a table."""
+
+    def __init__(self, which: Which, file: TableFile, settings: Settings) -> None:
+        self.truths: list[tuple[int, Quaternion, Vector, tuple[float, ...]]] = []
+        self.rows = 0
+        self._which = which
+        self._file = file
+        self._actuators = settings.wire.actuators
+        self._reader = TickReader(settings)
+
+    def take(self, block: Block) -> None:
+        judged = self._reader.take(block).judged
+        if len(judged.k):
+            self._file.write(Rows(*self._which, judged, self._true_at(judged.k)))
+            self.rows += len(judged.k)
+
+    def _true_at(self, k: Integers) -> Truths:
+        """Of each tick the last truth by then. Shapes (n, columns)."""
+        shapes = (1, 4, 3, self._actuators)
+        known = [
+            np.array(column).reshape(-1, n) for column, n in zip(zip(*self.truths, strict=True), shapes, strict=True)
+        ]
+        known = known or [np.empty((0, n)) for n in shapes]
+        at = np.searchsorted(known[0][:, 0], k, side="right")
+        self.truths = self.truths[max(0, int(at[-1]) - 1) :]
+        ticks, *columns = (np.vstack([np.full((1, column.shape[1]), np.nan), column])[at] for column in known)
+        return Truths(ticks[:, 0], *columns)
 
 
 def beside(log: Path, ending: str) -> Path:
@@ -171,101 +203,17 @@ def facts(files: LogFiles, settings: Settings, sessions: Sequence[str]) -> dict[
         "config": settings.contract(),
         "sessions": list(sessions),
         "logs": [str(path) for path in files.paths],
-        "recorded_by": {role: contract.versions for role, contract in files.contracts.items()},
+        "recorded_by": {role: contract.versions for (_, role), contract in files.contracts.items()},
         "exported_by": versions(),
     }
 
 
-class _Ticks:
-    """Puts aside every tick of every session."""
-
-    def __init__(self, spool: Spool) -> None:
-        self._spool = spool
-        self.piles: dict[Which, Pile] = {}
-
-    def watch(self, which: Which, settings: Settings) -> Callable[[Tick], None]:
-        """Who is told the ticks of a session."""
-        pile = self.piles[which] = self._spool.pile(tick_fields(settings.wire.actuators))
-        add = pile.add
-
-        def keep(tick: Tick) -> None:
-            add(
-                tick.k,
-                tick.published_ns,
-                -1 if tick.latency_ns is None else tick.latency_ns,
-                *tick.attitude,
-                *tick.desired,
-                *tick.rate,
-                *tick.desired_rate,
-                *tick.attitude_error,
-                *tick.rate_error,
-                *tick.voltages,
-            )
-
-        return keep
-
-
-class _Beside:
-    """Telemetry of some sessions and the truth of their vehicles, and which of it belongs to which tick."""
-
-    def __init__(self, spool: Spool, settings: Settings, sessions: Sequence[Which]) -> None:
-        actuators = settings.wire.actuators
-        self._telemetry = {which: spool.pile(telemetry_fields(actuators)) for which in sessions}
-        self._truth = {vehicle: spool.pile(truth_fields(actuators)) for vehicle, _ in sessions}
-
-    def gather(self, files: LogFiles, progress: Progress) -> None:
-        """Read it. Raises ReviewError."""
-        try:
-            for address, payload, published_ns in files.messages(("telemetry", "truth"), progress):
-                if address.topic.name == "telemetry":
-                    told = Telemetry.model_validate_json(payload)
-                    pile = self._telemetry.get((address.vehicle, told.session))
-                    if pile is not None:
-                        pile.add(told.tick, *told.damping_estimate, *told.voltages, told.sign)
-                elif (pile := self._truth.get(address.vehicle)) is not None:
-                    truth = Truth.model_validate_json(payload)
-                    pile.add(published_ns, *truth.attitude, *truth.rate, *truth.voltages)
-        except ValidationError as error:
-            raise ReviewError(f"{files.name} is not a log of this version: {str(error).splitlines()[0]}") from None
-
-    def rows(self, which: Which, ticks: Pile) -> Iterator[Rows]:
-        """A session's ticks with what stands beside them, a block at a time."""
-        telemetry = Window(self._telemetry[which], "k")
-        truth = Window(self._truth[which[0]], "published_ns")
-        for block in ticks.blocks():
-            told, is_told = telemetry.not_after(block["k"])
-            true, is_true = truth.not_after(block["published_ns"])
-            yield Rows(*which, block, _only(told, is_told & (told["k"] == block["k"])), _only(true, is_true))
-
-
-def _only(rows: Records, found: npt.NDArray[np.bool_]) -> Records:
-    """The rows, with NaN for every double of those that were not found."""
-    rows = rows.copy()
-    assert rows.dtype.names is not None
-    for name in rows.dtype.names:
-        if rows[name].dtype == np.float64:
-            rows[name][~found] = np.nan
-    return rows
-
-
-def _chosen(piles: dict[Which, Pile], longest: Which, session: str | None, name: str) -> list[Which]:
-    known = [which for which, pile in piles.items() if pile.rows]
+def _chosen(run: Run, session: str | None) -> list[Which]:
+    known = [which for which, extent in run.extents.items() if extent.rows["controller"]]
     if session is None:
-        chosen = [which for which in known if which == longest]
-    elif session == ALL:
-        chosen = known
-    else:
-        chosen = [which for which in known if session in (which[1], "/".join(which))]
-        if known and not chosen:
-            names = ", ".join("/".join(which) for which in known[:5]) + (", …" if len(known) > 5 else "")
-            raise ExportError(f"{name} has no session {session!r} with a tick; it has {names}")
+        return [run.longest]
+    chosen = [which for which in known if session in (ALL, which[1], "/".join(which))]
     if not chosen:
-        raise ExportError(f"{name} has no answered measurement to export")
+        names = ", ".join("/".join(which) for which in known[:5]) + (", …" if len(known) > 5 else "")
+        raise ExportError(f"{run.files.name} has no session {session!r} with a tick; it has {names}")
     return chosen
-
-
-def _share(progress: Progress | None, begin: float, end: float) -> Progress:
-    """Progress of a part of the work that begins and ends at these shares of the whole."""
-    if progress is None:
-        return lambda _share: None
-    return lambda share: progress(begin + share * (end - begin))

@@ -1,9 +1,9 @@
-"""A run as its logs tell it: one file, a folder, or the files of a rotated run, read as one and in bounded memory."""
+"""A run's files: one, a folder, or those of a rotated run, read as one; and what they say of themselves."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -13,28 +13,15 @@ from pydantic import ValidationError
 from plant_emulator.settings import PlantSettings
 from protocol import topics
 from protocol.errors import AeroloopError
-from protocol.messages import Contract, Lapse
-from protocol.topics import Address
-from protocol.verbs import Change
+from protocol.messages import PROTOCOL_VERSION, Contract
 from service.config import Settings, from_contract
-from service.logs.mcap_file import (
-    CHANGE_METADATA,
-    CONTRACT_METADATA,
-    Damage,
-    NotMcapError,
-    messages,
-    records,
-    skim,
-)
+from service.logs.mcap_file import CONTRACT_METADATA, Damage, Logged, NotMcapError, messages, records, skim
 
 METADATA_PREFIX: Final = "aeroloop."
 
-_TOLD: Final = ("change", "lapse")
+Progress = Callable[[float], None]
 
 T = TypeVar("T")
-
-Which = tuple[str, str]
-"""A vehicle and a session."""
 
 
 class ReviewError(AeroloopError):
@@ -49,58 +36,40 @@ class LogFiles:
 
     Attributes:
         paths: The files, in the order of their first messages.
-        contracts: Who took part, by role; the last of each.
-        changes: What controllers followed from which tick on, by vehicle and session.
-        lapses: Where controllers that hear silence did not compute with the plant's levels, likewise.
+        contracts: Who took part, by vehicle and role; the last of each.
+        first_contracts: The first of each.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
 
     Raises:
-        ReviewError: Nothing is there, or no log can be read.
+        ReviewError: Nothing is there, no log can be read, or it is of another version of the protocol.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self.contracts: dict[str, Contract] = {}
-        self.changes: dict[Which, list[Change]] = {}
-        self.lapses: dict[Which, list[Lapse]] = {}
+        self.contracts: dict[tuple[str, str], Contract] = {}
+        self.first_contracts: dict[tuple[str, str], Contract] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
-        self._told: set[tuple[str, bytes]] = set()  # changes and lapses, as vehicle and JSON
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
-        if not self.contracts:  # one that is damaged may have a copy; where none can be read, it is not damage
-            for path, damages in self.damages.items():
-                for damage in damages:
-                    if CONTRACT_METADATA in damage.what:
-                        raise ReviewError(f"{path} is not a log of this version: {damage.what}")
-        for changes in self.changes.values():
-            changes.sort(key=lambda change: change.tick)
         self._size = sum(path.stat().st_size for path in self.paths)
 
-    @property
-    def settings(self) -> Settings:
-        """The controller's configuration if the logs have it, else the plant's.
+    def settings(self, vehicle: str) -> Settings:
+        """The configuration of a vehicle's controller if the logs have it, else its plant's.
 
         Raises:
             ReviewError: They have neither.
             ConfigError: It is not of this version.
         """
         for role in ("controller", "plant"):
-            if role in self.contracts:
-                return from_contract(self.contracts[role].config)
-        raise ReviewError(f"{self.name} has no contract of a controller or a plant, so its frames cannot be read")
+            if contract := self.contracts.get((vehicle, role)):
+                return from_contract(contract.config)
+        raise ReviewError(f"{self.name} has no contract of {vehicle}'s controller or plant: its frames cannot be read")
 
-    @property
-    def plant(self) -> PlantSettings:
-        """The plant's own configuration if the logs have it, else what the controller took for it. Raises as above."""
-        contract = self.contracts.get("plant")
-        return self.settings.plant if contract is None else from_contract(contract.config).plant
-
-    @property
-    def promised(self) -> dict[str, Any] | None:
-        """The certificate in the controller's contract, if there is one."""
-        contract = self.contracts.get("controller")
-        return None if contract is None else contract.certificate
+    def plant(self, vehicle: str) -> PlantSettings:
+        """The plant's own configuration if the logs have it, else what the controller assumed. Raises as `settings`."""
+        contract = self.contracts.get((vehicle, "plant"))
+        return self.settings(vehicle).plant if contract is None else from_contract(contract.config).plant
 
     @property
     def name(self) -> str:
@@ -108,19 +77,14 @@ class LogFiles:
         first = str(self.paths[0])
         return first if len(self.paths) == 1 else f"{first} and {len(self.paths) - 1} more"
 
-    def messages(
-        self, names: Collection[str], progress: Callable[[float], None] | None = None
-    ) -> Iterator[tuple[topics.Address, bytes, int]]:
-        """Key, content and time of publication [ns] of every message of these topics, in the order of recording."""
-        return self.routed(lambda address: address if address.topic.name in names else None, progress)
-
     def routed(
-        self, route: Callable[[topics.Address], T | None], progress: Callable[[float], None] | None = None
-    ) -> Iterator[tuple[T, bytes, int]]:
-        """The same with, instead of the key, what `route` says of it; it is asked once for every key of a file.
+        self, route: Callable[[topics.Address], T | None], progress: Progress | None = None
+    ) -> Iterator[Logged[T]]:
+        """Messages of every key that `route` answers for, in the order of recording.
 
         Args:
-            route: Whose the messages of a key are, such as a method that takes them; None leaves them out.
+            route: Called once for every key of a file, such as for a method that takes its messages; None leaves them
+                out.
             progress: Called now and then with the share that is done, 0…1.
         """
 
@@ -131,36 +95,41 @@ class LogFiles:
         read = 0
         for path in self.paths:
             damages: list[Damage] = []
-            for message in messages(path, wanted, damages, _share_of(progress, read, self._size)):
-                yield message.answer, message.data, message.publish_time
+            yield from messages(path, wanted, damages, _share_of(progress, read, self._size))
             read += path.stat().st_size
             if damages:
                 self.damages[path] = damages
 
+    @property
+    def unread(self) -> list[str]:
+        """What could not be read, a line each."""
+        return [f"{path}: {damage.what}" for path, found in self.damages.items() for damage in found]
+
     def _prelude(self, path: Path) -> int:
-        """Gather contracts, changes and lapses, which may stand anywhere in a file.
+        """Collect contracts and other metadata.
 
         Returns:
-            The time of its first message.
+            When its first message was recorded [ns].
         """
         first = 0
-        told: dict[int, Address] = {}
+        contracts: set[int] = set()
         damages: list[Damage] = []
         try:
-            for record in skim(path, _is_told) or records(path, damages):
+            for record in skim(path, _is_contract) or records(path, damages):
                 if isinstance(record, Message):
-                    first = first or record.publish_time
-                    if record.channel_id in told:
-                        self._tells(told[record.channel_id], record.data)
-                elif isinstance(record, Channel):
-                    key = topics.read_key(record.topic)
-                    if key is not None and key.topic.name in _TOLD:
-                        told[record.id] = key
+                    first = first or record.log_time
+                    if record.channel_id in contracts:
+                        self._add_contract(record.data, path)
+                elif isinstance(record, Channel) and _is_contract(record.topic):
+                    contracts.add(record.id)
                 elif isinstance(record, Metadata):
-                    try:
-                        self._metadata(record.name, record.metadata)
-                    except (ValidationError, ValueError, KeyError) as error:
-                        damages.append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
+                    said = json.loads(record.metadata.get("json", "{}"))
+                    if record.name == CONTRACT_METADATA:
+                        self._add_contract(record.metadata["json"].encode(), path)
+                    elif record.name.startswith(METADATA_PREFIX):
+                        self.metadata[record.name.removeprefix(METADATA_PREFIX)] = (
+                            said if isinstance(said, dict) else {}
+                        )
         except NotMcapError as error:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
@@ -171,36 +140,23 @@ class LogFiles:
             self.damages[path] = damages
         return first
 
-    def _metadata(self, name: str, entries: dict[str, str]) -> None:
-        if name == CONTRACT_METADATA:
-            contract = Contract.model_validate_json(entries["json"])
-            self.contracts[contract.role] = contract
-        elif name == CHANGE_METADATA:
-            if key := topics.read_key(entries["key"]):
-                self._tells(key, entries["json"].encode())
-        elif name.startswith(METADATA_PREFIX) and "json" in entries:
-            said = json.loads(entries["json"])
-            self.metadata[name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
-
-    def _tells(self, key: Address, text: bytes) -> None:
-        """Add a change or a lapse; the files of a rotated run tell the same change again."""
-        if (key.vehicle, text) in self._told:
-            return
-        self._told.add((key.vehicle, text))
-        if key.topic.name == "lapse":
-            lapse = Lapse.model_validate_json(text)
-            self.lapses.setdefault((key.vehicle, lapse.session), []).append(lapse)
-        else:
-            change = Change.model_validate_json(text)
-            self.changes.setdefault((key.vehicle, change.session), []).append(change)
+    def _add_contract(self, text: bytes, path: Path) -> None:
+        said = json.loads(text)
+        version = said.get("protocol", 1)
+        if version != PROTOCOL_VERSION:
+            written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
+            raise ReviewError(f"{path} is a log of protocol version {version}; read it with {written_by} wrote it")
+        contract = Contract.model_validate(said)
+        self.contracts[contract.vehicle, contract.role] = contract
+        self.first_contracts.setdefault((contract.vehicle, contract.role), contract)
 
 
-def _is_told(key: str) -> bool:
+def _is_contract(key: str) -> bool:
     address = topics.read_key(key)
-    return address is not None and address.topic.name in _TOLD
+    return address is not None and address.topic.name == "contract"
 
 
-def _share_of(progress: Callable[[float], None] | None, before: int, size: int) -> Callable[[int], None] | None:
+def _share_of(progress: Progress | None, before: int, size: int) -> Callable[[int], None] | None:
     return None if progress is None else lambda reached: progress((before + reached) / size)
 
 

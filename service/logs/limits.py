@@ -8,6 +8,7 @@ from protocol.errors import AeroloopError
 from service.figures import Figures
 from service.logs.report import Check, Findings
 
+_SPREADS: Final = ("latency", "period", "measurement_delay", "command_delay")
 _PERCENTILES: Final = ("p50", "p90", "p99", "p999", "max")
 
 UNITS: Final[dict[str, str]] = {
@@ -21,11 +22,12 @@ UNITS: Final[dict[str, str]] = {
     "gap_count": "",
     "losses": "",
     "lapses": "",
+    "missing_ticks": "",
     "invalid": "",
     "damages": "",
     **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
     **{f"timing.latency.{name}": "µs" for name in _PERCENTILES},
-    **{f"timing.period.{name}": "µs" for name in _PERCENTILES},
+    **{f"timing.{way}.{name}": "µs" for way in _SPREADS[1:] for name in _PERCENTILES},
     **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
     **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
     **{f"theorem.{name}": "" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "broken")},
@@ -36,7 +38,7 @@ UNITS: Final[dict[str, str]] = {
 SHORT: Final[dict[str, str]] = {
     "skipped": "skipped_ticks",
     "gaps": "gap_count",
-    **{f"{name}.{p}": f"timing.{name}.{p}" for name in ("latency", "period") for p in _PERCENTILES},
+    **{f"{name}.{p}": f"timing.{name}.{p}" for name in _SPREADS for p in _PERCENTILES},
     **{name: f"theorem.{name}" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "radius_deg")},
     "settled_error_deg": "theorem.error_deg",
     "true_settled_error_deg": "theorem.true_error_deg",

@@ -17,32 +17,33 @@ from service.config import Settings
 from service.logs.files import ReviewError
 from service.logs.panels import NUMBERS, case_of, title_of
 from service.logs.report import Report
-from service.logs.ticks import Tick
+from service.logs.ticks import Ticks
 
 Array = npt.NDArray[np.float64]
 
 
-def draw_figures(settings: Settings, ticks: Sequence[Tick], folder: Path) -> list[Path]:
+def draw_figures(settings: Settings, blocks: Sequence[Ticks], folder: Path) -> list[Path]:
     """Draw every quantity of a session into PNG files and return their paths.
 
     Args:
         settings: The configuration of its controller.
-        ticks: Its ticks.
+        blocks: Its ticks.
         folder: Where; made if need be.
 
     Raises:
         ReviewError: The session has no ticks, or the folder cannot be written.
     """
-    if not ticks:
+    ticks = Ticks.joined(blocks) if blocks else None
+    if ticks is None or not len(ticks.k):
         raise ReviewError("the log has no answered measurement to draw")
     case, wire = case_of(settings), settings.wire
-    t = np.array([tick.k for tick in ticks]) * settings.loop.period
+    t = ticks.k * settings.loop.period
     q = "" if case == "continuous" else "^Q"
     first_motor = 3 - wire.actuators + 1
 
-    attitude, desired = _column(ticks, "attitude"), _column(ticks, "desired")
+    attitude, desired = ticks.attitude, ticks.desired
     attitude = attitude * np.sign(np.sum(attitude * desired, axis=1, keepdims=True))  # of ±q, the one beside q_d
-    rate, desired_rate = _column(ticks, "rate"), _column(ticks, "desired_rate")
+    rate, desired_rate = ticks.rate, ticks.desired_rate
     drawings = {
         "attitude": _stack(
             "Attitude", t, attitude, desired, [rf"$\eta{q}$", *(rf"$\epsilon_{i}{q}$" for i in (1, 2, 3))], "1"
@@ -51,15 +52,15 @@ def draw_figures(settings: Settings, ticks: Sequence[Tick], folder: Path) -> lis
             "Angular velocity", t, rate, desired_rate, [rf"$\omega_{i}{q}$" for i in (1, 2, 3)], "rad/s"
         ),
         "error": _stack(
-            "Attitude error", t, _column(ticks, "attitude_error"), None,
+            "Attitude error", t, ticks.attitude_error, None,
             [rf"$\tilde{{\epsilon}}_{i}{q}$" for i in (1, 2, 3)], "1",
         ),
         "rate_error": _stack(
-            "Angular velocity error", t, _column(ticks, "rate_error"), None,
+            "Angular velocity error", t, ticks.rate_error, None,
             [rf"$\omega_{{e,{i}}}{q}$" for i in (1, 2, 3)], "rad/s",
         ),
         "input": _stack(
-            "Input", t, _column(ticks, "voltages"), None,
+            "Input", t, ticks.voltages, None,
             [rf"$u_{first_motor + i}{q}$" for i in range(wire.actuators)], "V",
         ),
     }  # fmt: skip
@@ -112,10 +113,6 @@ def draw_theorem(report: Report, folder: Path) -> list[Path]:
     except OSError as error:
         raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
     return [path]
-
-
-def _column(ticks: Sequence[Tick], name: str) -> Array:
-    return np.array([getattr(tick, name) for tick in ticks], dtype=np.float64)
 
 
 def _stack(title: str, t: Array, values: Array, desired: Array | None, labels: Sequence[str], unit: str) -> Figure:

@@ -1,58 +1,57 @@
-"""Replay: a log's measurements through the controller again, and every command compared with the one that was logged.
+"""Replay: what both ends did, computed again from a log's traces and compared byte for byte.
 
-The controller is sans-I/O, and what an operator changed is in the log with its tick, so the same frames in must give
-the same frames out, byte for byte. With another configuration it says what would have been commanded instead; the plant
-of the log does not follow that, so it is no simulation.
+The controller is sans-I/O, and its rows hold all that it had, so the same rows must give the same commands: which were
+sent, which silence stood for, and every bit of them. The emulated plant is replayed from its own rows (plant_replay.py).
+With another configuration it says what would have been commanded instead; the plant of the log does not follow that, so
+it is no simulation.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import sqrt
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from protocol.messages import Lapse, Telemetry
-from protocol.verbs import Change
+from protocol.messages import Contract
+from protocol.topics import Address
+from protocol.trace import Batch, Sent
 from protocol.wire import SignalSpec
-from service.config import Settings, load_over
+from service.config import Settings, from_contract, load_over
+from service.controller import Codes
 from service.figures import added, squares
-from service.logs.batch import BatchController
-from service.logs.codes import codes_in, levels
-from service.logs.files import LogFiles, Which
-from service.logs.filling import Read
-from service.logs.pairing import MAX_WAITING, Pairing, Sessions, without_collections
+from service.logs.codes import codes_in, frames_of, levels
+from service.logs.evaluate import Evaluator, held_codes
+from service.logs.files import Progress, ReviewError
+from service.logs.plant_replay import PlantReplay, PlantReplayed, why_not
 from service.logs.report import Array
-from service.logs.tallies import BLOCK
-
-Pair = tuple[int, Read, Read]
-"""A tick, its measurement and the command that answered it."""
+from service.logs.runs import BLOCK, Block, Join, Run, Taker
+from service.logs.traces import Source, Which
 
 
 class Difference(BaseModel):
-    """The first command that was computed otherwise than it was logged."""
+    """The first row that was computed otherwise than it was logged."""
 
     model_config = ConfigDict(frozen=True)
 
     tick: int
     time_s: float = Field(description="on the law's clock [s]")
-    logged: str = Field(description="the frame, in hexadecimal")
+    logged: str = Field(description="the command frame, in hexadecimal; `silent` or `none` where none was sent")
     computed: str
 
 
 class SessionReplay(BaseModel):
-    """What replaying one session has shown."""
+    """What replaying one session's controller has shown."""
 
     model_config = ConfigDict(frozen=True)
 
     vehicle: str
     session: str
-    first_tick: int | None = Field(description="where the replay could begin; null if nowhere")
-    commands: int = Field(description="commands compared")
-    differing: int
+    first_tick: int | None = Field(description="where the replay began; null without any row")
+    ticks: int = Field(description="ticks that were computed again")
+    differ: int = Field(description="rows whose command is not the same")
     first_difference: Difference | None
     rms_v: float | None = Field(description="root mean square of the difference between computed and logged levels [V]")
     max_v: float | None = Field(description="largest difference of a motor [V]")
@@ -60,144 +59,114 @@ class SessionReplay(BaseModel):
     u_total_computed: float
 
 
-class Replayer(Pairing):
-    """Replays one session.
+class EndReplay(BaseModel):
+    """What replaying one end has shown, over all sessions."""
 
-    Args:
-        settings: The controller's configuration.
-        changes: What it followed from which tick on, in order.
-        lapses: Where it did not compute with the plant's levels.
-    """
+    model_config = ConfigDict(frozen=True)
 
-    def __init__(self, settings: Settings, changes: Sequence[Change], lapses: Sequence[Lapse] = ()) -> None:
-        super().__init__(settings.wire, settings.loop, lapses)
-        self._controller = BatchController(settings.wire, settings.law, settings.reference, settings.loop.period)
-        self._changes = deque(changes)
-        self._period = settings.loop.period
-        self._begun = False
-        self._unplaced: deque[Telemetry] = deque(maxlen=MAX_WAITING)
-        self._held: deque[Pair] = deque(maxlen=MAX_WAITING)  # until it is known where to begin
-        self._waiting: list[Pair] = []  # to be computed as a block
-        self.first_tick: int | None = None
-        self.first_difference: Difference | None = None
-        self.commands = self.differing = 0
-        self._square = self._largest = self._logged = self._computed = 0.0
+    ticks: int = Field(description="ticks that were computed again")
+    differ: int = Field(description="of them, how many gave another result, to the last bit")
+
+
+class Replay(BaseModel):
+    """What replaying a run has shown."""
+
+    model_config = ConfigDict(frozen=True)
+
+    controller: EndReplay | None = Field(description="null: it could not be replayed; `reasons` says why")
+    plant: EndReplay | None
+    reasons: dict[str, str] = Field(description="why an end could not be replayed, or not to its end")
+    sessions: list[SessionReplay]
+    plants: list[PlantReplayed] = Field(description="the plant's processes, in the order of recording")
 
     @property
-    def wants_telemetry(self) -> bool:
-        """Until it is known where to begin."""
-        return not self._begun
+    def differs(self) -> bool:
+        """Whether anything does."""
+        return any(end is not None and end.differ > 0 for end in (self.controller, self.plant))
 
-    def measured(self, frame: bytes, published_ns: int) -> None:
-        """Only what was answered is computed again."""
 
-    def commanded(self, frame: bytes) -> None:
-        """Only what answers is compared."""
+class Replayer:
+    """Replays one session's controller.
 
-    def answered(self, k: int, measurement: Read, command: Read) -> None:
-        """Compute the command of tick k again."""
-        if not self._begun:
-            self._held.append((k, measurement, command))
+    Args:
+        which: The session.
+        evaluator: Computes its rows.
+        settings: The configuration that it computes with.
+    """
+
+    def __init__(self, which: Which, evaluator: Evaluator, settings: Settings) -> None:
+        self._which = which
+        self._evaluator = evaluator
+        self._wire, self._period = settings.wire, settings.loop.period
+        self._held: Codes | None = None  # codes of the last command sent
+        self._first: Difference | None = None
+        self._first_tick: int | None = None
+        self._ticks = self._differ = 0
+        self._square = self._largest = self._logged = self._computed = 0.0
+
+    def take(self, block: Block) -> None:
+        """Replay the next block."""
+        rows, wire, evaluator = block.controller, self._wire, self._evaluator
+        used = evaluator.used(block)
+        if not rows:
             return
-        self._waiting.append((k, measurement, command))
-        if len(self._waiting) >= BLOCK:
-            self._compute()
-
-    def passed_over(self, k: int, measurement: Read) -> None:
-        """The controller never saw it."""
-
-    def telemetry(self, telemetry: Telemetry, published_ns: int) -> None:
-        """The first telemetry whose tick is known tells where to begin, and with what if that is not the start."""
-        super().telemetry(telemetry, published_ns)
-        self._unplaced.append(telemetry)
-        while not self._begun and self._unplaced and self._held and self._unplaced[0].tick <= self._held[-1][0]:
-            self._begin(self._unplaced.popleft())
-
-    def finish(self) -> None:
-        """No more is to come."""
-        super().finish()
-        while not self._begun and self._unplaced:
-            self._begin(self._unplaced.popleft())
-        self._compute()
-
-    def _begin(self, telemetry: Telemetry) -> None:
-        tick = telemetry.tick
-        held = next((pair for pair in self._held if pair[0] == tick), None)
-        if held is None:
-            return
-        controller, told = self._controller, (telemetry.sign, telemetry.damping_estimate)
-        codes = codes_in(self._wire.measurement, [held[1].frame])
-        computed = controller.compute_all(np.array([tick]), codes, self._changes)
-        now = controller.state
-        same = tuple(computed.attitude_error[0].tolist()) == telemetry.attitude_error
-        if held is self._held[0] and same and told == (now.sign, now.damping_estimate):
-            self.first_tick = tick  # the session's very first: nothing had been computed before it
-            self._compare([held], computed.voltages)
-        else:
-            w, x, y, z = now.attitude
-            if float(computed.attitude_error[0] @ telemetry.attitude_error) < 0:  # it followed −q
-                w, x, y, z = -w, -x, -y, -z
-            logged = self._logged_codes([pair for pair in self._held if pair[0] <= tick])
-            valid = logged[~np.isnan(levels(self._wire.voltage, logged)).any(axis=1)][-1:].tolist()
-            encoded = tuple(valid[0]) if valid else None
-            update = {"sign": told[0], "damping_estimate": told[1], "attitude": (w, x, y, z), "voltage_codes": encoded}
-            controller.restore(now.model_copy(update=update))
-            self.first_tick = tick + 1
-        self._begun = True
-        self._waiting += [pair for pair in self._held if pair[0] > tick]
-        self._held.clear()
-
-    def result(self, vehicle: str, session: str) -> SessionReplay:
-        """What has been found."""
-        compared = self.commands > 0
-        return SessionReplay(
-            vehicle=vehicle,
-            session=session,
-            first_tick=self.first_tick,
-            commands=self.commands,
-            differing=self.differing,
-            first_difference=self.first_difference,
-            rms_v=sqrt(self._square / self.commands) if compared else None,
-            max_v=self._largest if compared else None,
-            u_total_logged=self._logged * self._period,
-            u_total_computed=self._computed * self._period,
-        )
-
-    def _compute(self) -> None:
-        """Compute the commands that wait again, and compare them."""
-        pairs, self._waiting = self._waiting, []
-        if pairs:
-            self._compare(pairs, self._voltages(pairs))
-
-    def _voltages(self, pairs: Sequence[Pair]) -> Array:
-        """What the law commands at the next ticks [V]; NaN for no valid value. Shape (n, actuators)."""
-        codes = codes_in(self._wire.measurement, [measurement.frame for _, measurement, _ in pairs])
-        return self._controller.compute_all(np.array([k for k, _, _ in pairs]), codes, self._changes).voltages
-
-    def _compare(self, pairs: Sequence[Pair], voltages: Array) -> None:
-        """Compare logged commands with what the law commands."""
-        signal, ours = self._wire.voltage, self._controller.commands(np.array([k for k, *_ in pairs]), voltages).codes
-        theirs = self._logged_codes(pairs)
-        differ = np.flatnonzero((ours.view(np.int64) != theirs.view(np.int64)).any(axis=1))  # an echo cannot differ
-        if len(differ) and self.first_difference is None:
-            k, measurement, command = pairs[differ[0]]
-            codes = [int(code) if signal.bits else code for code in ours[differ[0]].tolist()]
-            self.first_difference = Difference(
-                tick=k,
-                time_s=round(k * self._period, 9),
-                logged=command.frame.hex(),
-                computed=self._wire.command.pack(measurement.counter, codes).hex(),
+        commands = evaluator.commands(used, evaluator.compute(used))
+        expected = {
+            "sent_as": np.full(len(rows["tick"]), int(Sent.NONE), dtype=np.uint8),
+            "command": np.zeros((len(rows["tick"]), wire.command.size), dtype=np.uint8),
+        }
+        expected["sent_as"][used.rows] = np.where(commands.sent, int(Sent.FRAME), int(Sent.SILENT))
+        sent = used.rows[commands.sent]
+        counters = used.k[commands.sent] % wire.measurement.counters
+        expected["command"][sent] = frames_of(wire.command, counters, commands.codes[commands.sent])
+        logged = np.ascontiguousarray(rows["command"]).view(np.uint8).reshape(len(rows["tick"]), -1)
+        differ = (rows["sent_as"] != expected["sent_as"]) | (logged != expected["command"]).any(axis=1)
+        if differ.any() and self._first is None:
+            i = int(np.argmax(differ))
+            self._first = Difference(
+                tick=int(rows["tick"][i]),
+                time_s=round(int(rows["tick"][i]) * self._period, 9),
+                logged=_said(rows["sent_as"][i], logged[i]),
+                computed=_said(expected["sent_as"][i], expected["command"][i]),
             )
-        self.commands += len(pairs)
-        self.differing += len(differ)
-        ours, theirs = _volts(signal, ours), _volts(signal, theirs)
+        self._differ += int(differ.sum())
+        self._ticks += len(used.k)
+        if self._first_tick is None:
+            self._first_tick = int(rows["tick"][0])
+        framed = rows["sent_as"] == Sent.FRAME
+        held, self._held = held_codes(framed, codes_in(wire.command, rows["command"][framed]), self._held)
+        self._compare(held[used.rows], commands.codes)
+
+    def _compare(self, theirs: Array, ours: Array) -> None:
+        """Compare voltages."""
+        signal = self._wire.voltage
+        known = ~np.isnan(theirs).all(axis=1) if signal.bits else np.ones(len(theirs), dtype=np.bool_)
+        if not known.any():
+            return
+        theirs, ours = _volts(signal, theirs[known]), _volts(signal, ours[known])
         self._logged = added(self._logged, squares(theirs))
         self._computed = added(self._computed, squares(ours))
         self._square = added(self._square, squares(ours - theirs))
         self._largest = max(self._largest, float(np.abs(ours - theirs).max()))
 
-    def _logged_codes(self, pairs: Sequence[Pair]) -> Array:
-        return codes_in(self._wire.command, [command.frame for _, _, command in pairs])
+    def result(self) -> SessionReplay:
+        """What has been found."""
+        return SessionReplay(
+            vehicle=self._which[0],
+            session=self._which[1],
+            first_tick=self._first_tick,
+            ticks=self._ticks,
+            differ=self._differ,
+            first_difference=self._first,
+            rms_v=sqrt(self._square / self._ticks) if self._ticks else None,
+            max_v=self._largest if self._ticks else None,
+            u_total_logged=self._logged * self._period,
+            u_total_computed=self._computed * self._period,
+        )
+
+
+def _said(sent_as: int, frame: Array) -> str:
+    return frame.tobytes().hex() if sent_as == Sent.FRAME else Sent(int(sent_as)).name.lower()
 
 
 def _volts(signal: SignalSpec, codes: Array) -> Array:
@@ -206,38 +175,107 @@ def _volts(signal: SignalSpec, codes: Array) -> Array:
     return np.where(np.isnan(volts), 0.0, volts)
 
 
-@without_collections()
-def replay(
-    paths: Sequence[Path], overrides: Sequence[str] = (), progress: Callable[[float], None] | None = None
-) -> list[SessionReplay]:
+class Plants:
+    """Replays the plants of a run, each process from its first row.
+
+    Args:
+        run: The run.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._contracts = dict(run.files.first_contracts)
+        self._replays: dict[Source, PlantReplay] = {}
+        self._reason = "the log has no trace of a plant"
+
+    def route(self, address: Address) -> Taker | None:
+        """Contracts, since a process is replayed with what it began with."""
+        return self._contract if address.topic.name == "contract" else None
+
+    def take(self, source: Source, batch: Batch) -> None:
+        """The next batch of a plant."""
+        if source not in self._replays:
+            contract = self._contracts.get((source.vehicle, "plant"))
+            if contract is None:
+                self._reason = f"the log has no contract of {source.vehicle}'s plant"
+                return
+            settings = from_contract(contract.config)
+            if (why := why_not(settings.plant)) is not None:
+                self._reason = why
+                return
+            self._replays[source] = PlantReplay(settings.loop, settings.wire, settings.plant)
+        self._replays[source].feed(batch)
+
+    def results(self) -> tuple[list[PlantReplayed], str | None]:
+        """What has been found of each process, and why there is none, or it ends early."""
+        results = [replay.result() for replay in self._replays.values()]
+        stopped = next((result.stopped for result in results if result.stopped is not None), None)
+        return results, stopped if results else self._reason
+
+    def _contract(self, payload: bytes, _: int) -> None:
+        contract = Contract.model_validate_json(payload)
+        self._contracts[contract.vehicle, contract.role] = contract
+
+
+def replay(paths: Sequence[Path], overrides: Sequence[str] = (), progress: Progress | None = None) -> Replay:
     """Replay every session of a run.
 
     Args:
         paths: Logs, folders of logs, or a rotated run.
         overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
-            or of the reference stands in for every change that the log has of them.
+            or of the reference stands in for every change that the log has of them. The plant is not replayed then.
         progress: Called now and then with the share that is done, 0…1.
 
     Raises:
         ReviewError: It cannot be read, or has no controller's configuration.
         ConfigError: An override is wrong.
     """
-    files = LogFiles(paths)
-    settings = load_over(files.settings, overrides)
+    try:
+        run = Run(paths, progress)
+        run.longest  # noqa: B018  # raises where there is no session
+        return _replayed(run, overrides)
+    except ValidationError as error:
+        raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
+
+
+def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
     own_gains = any(override.startswith("law.") for override in overrides)
     own_reference = any(override.startswith("reference") for override in overrides)
+    replayers: dict[Which, Replayer] = {}
+    joins: dict[Which, Join] = {}
+    plants = Plants(run)
+    for arrived in run.batches(plants.route):
+        source, batch = arrived.source, arrived.batch
+        which = source.vehicle, batch.header.session
+        if source.end == "plant":
+            if not overrides:
+                plants.take(source, batch)
+            continue
+        if which not in run.extents:
+            continue
+        if which not in joins:
+            settings = load_over(run.files.settings(source.vehicle), overrides)
+            evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
+            replayers[which] = Replayer(which, evaluator, settings)
+            joins[which] = Join(which, 0, run.extents[which].of("controller"), BLOCK)
+        for block in joins[which].add(arrived):
+            replayers[which].take(block)
+    sessions = [replayer.result() for replayer in replayers.values()]
+    results, reason = plants.results()
+    reasons = {} if sessions else {"controller": "the log has no trace of a controller"}
+    if overrides:
+        reason = "the plant of a log does not follow another configuration"
+    if reason is not None:
+        reasons["plant"] = reason
+    return Replay(
+        controller=_sum(sessions),
+        plant=_sum([result for result in results if result.ticks]),
+        reasons=reasons,
+        sessions=sessions,
+        plants=results,
+    )
 
-    def replayer(which: Which) -> Replayer:
-        changes = files.changes.get(which, [])
-        if own_gains:
-            changes = [change.model_copy(update={"gains": None}) for change in changes]
-        if own_reference:
-            changes = [change.model_copy(update={"reference": None}) for change in changes]
-        return Replayer(settings, changes, files.lapses.get(which, ()))
 
-    sessions = Sessions(replayer)
-    for take, payload, published_ns in files.routed(sessions.route, progress):
-        take(payload, published_ns)
-    for session in sessions.values():
-        session.finish()
-    return [session.result(vehicle, name) for (vehicle, name), session in sessions.items()]
+def _sum(parts: Sequence[SessionReplay] | Sequence[PlantReplayed]) -> EndReplay | None:
+    if not parts:
+        return None
+    return EndReplay(ticks=sum(part.ticks for part in parts), differ=sum(part.differ for part in parts))

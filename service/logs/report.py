@@ -15,6 +15,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.figures import Figures
+from service.logs.traces import Missing
 
 Array = npt.NDArray[np.float64]
 
@@ -120,10 +121,13 @@ class Findings(Figures):
     vehicle: str
     session: str
     sessions: int = Field(description="sessions in the log; the longest is judged")
-    started: str = Field(description="when the session's first measurement was published, UTC")
+    started: str = Field(description="when the session's first measurement was sent, UTC")
     timing: dict[str, Spread] = Field(
-        description="`period`: between measurements; `latency`: from a measurement to the command that answers it; "
-        "both by times of publication"
+        description="`period`: between measurements, and `latency`: from a measurement to the command that answers it, "
+        "on the plant's clock; `measurement_delay`, `command_delay`: one way, if both are equally fast at the median"
+    )
+    clock_offset_us: list[float] | None = Field(
+        default=None, description="the controller's monotonic clock less the plant's, at the first and the last tick"
     )
     age_us: dict[str, float] | None = Field(
         description="age of measurements when they were used, as the controller tells it: p50, p99, max"
@@ -135,9 +139,17 @@ class Findings(Figures):
     )
     invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
     losses: dict[str, int] = Field(description="messages that the recorder knows it has lost, by topic")
+    missing_ticks: dict[str, int] = Field(description="rows of either end that were never recorded, in all sessions")
+    missing: list[Missing] = Field(description="where they are, and sessions of whose last batch there is none")
     lapses: dict[str, int] = Field(
-        description="where frames are sent on change: measurements that the controller had `late` or not at all "
-        "(`lost`), and times that it `missed` ticks"
+        description="what went otherwise than one frame each way a tick. At the controller: measurements that came "
+        "`late`, ticks `missed`, `malformed` measurements; at the plant: commands `stale`, `repeated`, `refused` "
+        "(malformed, or without a valid value), `withheld` by a fault"
+    )
+    frames: dict[str, dict[str, int]] | None = Field(
+        default=None,
+        description="where the recorder took frames from the wire, too: how many were `recorded` of either kind, and "
+        "how many `differ` from what the ends have in their traces",
     )
     marks: list[Mark]
     theorem: TheoremFindings | None = None

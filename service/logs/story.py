@@ -1,66 +1,62 @@
-"""What happened, as roles told it: events, changes, losses, and how old measurements were when they were used.
+"""What happened, as roles published it: events, changes, losses, and how old measurements were when they were used.
 
-Of each kind of thing the first few hundred become marks, the rest are counted; so a log with a storm of them can still
-be read, and held in memory.
+What carries a session tick stands there; the rest stands at the tick that the plant's trace had reached in the file when
+it was recorded. Of each kind the first few hundred become marks and the rest are counted, so that a log with a storm of
+them can be read and held in memory.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from protocol import topics
 from protocol.clock import Histogram
 from protocol.messages import Event, Loss, Status
+from protocol.topics import Address
 from protocol.verbs import Change, Gains, Hold, Points, Reference, Sinusoid
-from service.logs.files import Which
 from service.logs.report import Mark
+from service.logs.runs import Taker
+from service.logs.traces import Which
 
 MAX_MARKS: Final = 300
 """Of one kind of one role."""
 
-AROUND_S: Final = 1.0
-"""What happened this long before or after a session belongs to it: what led to it, and what came of it [s]."""
-
-Clock = Callable[[int], float | None]
+_RECENT: Final = 100_000
+"""Messages that are remembered, so that a recorder that was restarted and got them again does not double them."""
 
 
-class Happening(NamedTuple):
-    """Something that happened at a time of publication [ns]."""
-
-    published_ns: int
-    kind: str
-    role: str
-    text: str
-    session: str | None = None
+Place = tuple[int, float]
+"""Where a mark stands among others: −1 before the session, 0 and a time [s] within it, 1 after it."""
 
 
 class Kind:
     """All of one kind: the first few hundred, and how many more."""
 
     def __init__(self) -> None:
-        self.first: list[Happening] = []
+        self.first: list[tuple[Place, Mark]] = []
         self.more = 0
-        self.last: Happening | None = None
+        self.last: tuple[Place, Mark] | None = None
 
-    def add(self, happening: Happening) -> None:
+    def add(self, place: Place, mark: Mark) -> None:
         """One more."""
         if len(self.first) < MAX_MARKS:
-            self.first.append(happening)
+            self.first.append((place, mark))
         else:
             self.more += 1
-            self.last = happening
+            self.last = place, mark
 
-    def all(self) -> list[Happening]:
-        """As many as were kept, and one that tells of the others."""
+    def all(self) -> list[tuple[Place, Mark]]:
+        """As many as were kept, and one that stands for the others."""
         if self.last is None:
             return self.first
-        return [*self.first, self.last._replace(text=f"{self.more} more, the last: {self.last.text}")]
+        place, mark = self.last
+        return [*self.first, (place, mark.model_copy(update={"text": f"{self.more} more, the last: {mark.text}"}))]
 
 
 class Ages:
-    """What a controller told of the age of measurements, each time over ten seconds."""
+    """Age of measurements by a controller's statuses, each over ten seconds."""
 
     def __init__(self) -> None:
         self._p50 = Histogram()
@@ -73,84 +69,119 @@ class Ages:
             self._p99, self._max = max(self._p99, status.age_us.p99), max(self._max, status.age_us.max)
 
     def figures(self) -> dict[str, float] | None:
-        """The median of all tens of seconds, and the worst p99 and maximum of any [µs]; None if nothing was told."""
+        """The median of all tens of seconds, and the worst p99 and maximum of any [µs]; None without any."""
         if not self._p50.count:
             return None
         return {"p50": round(self._p50.percentile(50), 1), "p99": self._p99, "max": self._max}
 
 
 class Story:
-    """What a log tells beside its frames.
+    """What a log has beside its traces, of one session and its vehicle.
+
+    Args:
+        which: The session that is judged.
+        period: Time between its ticks [s].
+        reached: The last tick of each session that the traces have reached in the files so far.
+        open_sessions: The session of each vehicle that has begun there and not ended.
 
     Attributes:
         statuses: The last of every vehicle and role.
         trips: Why a plant went to 0 V by itself, each time one did.
+        losses: Messages of the vehicle that the recorder lost, by topic.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self, which: Which, period: float, reached: Mapping[Which, int], open_sessions: Mapping[str, str]
+    ) -> None:
         self.statuses: dict[tuple[str, str], Status] = {}
         self.trips: list[str] = []
-        self._kinds: defaultdict[tuple[str, str, str], Kind] = defaultdict(Kind)
-        self._ages: defaultdict[Which, Ages] = defaultdict(Ages)
-        self._losses: defaultdict[str, defaultdict[str, int]] = defaultdict(lambda: defaultdict(int))
+        self.losses: dict[str, int] = {}
+        self._which = which
+        self._period = period
+        self._reached = reached
+        self._open = open_sessions
+        self._kinds: defaultdict[tuple[str, str], Kind] = defaultdict(Kind)
+        self._ages = Ages()
+        self._known: dict[int, None] = {}
+        self._status_ns: dict[tuple[str, str], int] = {}
 
-    def event(self, vehicle: str, event: Event, published_ns: int) -> None:
-        """An event of any role."""
+    def route(self, address: Address) -> Taker | None:
+        """Who takes the messages of a key; None if they are not part of it."""
+        vehicle, role = address.vehicle, address.role
+        match address.topic.name:
+            case "event":
+                return lambda payload, at_ns: self._event(vehicle, payload, at_ns)
+            case "loss":
+                return lambda payload, at_ns: self._loss(vehicle, payload, at_ns)
+            case "status" if role is not None:
+                return lambda payload, at_ns: self._status(vehicle, role, payload, at_ns)
+        return None
+
+    def changed(self, changes: Sequence[Change]) -> None:
+        """What the controller followed from which tick on."""
+        for change in changes:
+            self._add("change", "controller", described(change), change.tick)
+
+    @property
+    def age_us(self) -> dict[str, float] | None:
+        """Age of measurements when they were used [µs]; None if no status has it."""
+        return self._ages.figures()
+
+    def marks(self) -> list[Mark]:
+        """Everything that happened to the vehicle, in order of time; what was not within the session before or after."""
+        found = [placed for kind in self._kinds.values() for placed in kind.all()]
+        return [mark for _, mark in sorted(found, key=lambda placed: placed[0])]
+
+    def _event(self, vehicle: str, payload: bytes, at_ns: int) -> None:
+        if self._is_known(vehicle, payload, at_ns):
+            return
+        event = Event.model_validate_json(payload)
         if event.kind == "tripped":
             self.trips.append(event.text)
-        happening = Happening(published_ns, event.kind, event.role, event.text, event.session)
-        self._kinds[vehicle, event.role, event.kind].add(happening)
+        if vehicle != self._which[0] or self._is_a_change(event):
+            return
+        tick = event.tick if event.session == self._which[1] else None
+        self._add(event.kind, event.role, event.text, tick, event.session)
 
-    def status(self, vehicle: str, role: str, status: Status) -> None:
-        """A status of any role."""
-        self.statuses[vehicle, role] = status
-        if status.session is not None and role == "controller":
-            self._ages[vehicle, status.session].add(status)
-
-    def loss(self, vehicle: str, loss: Loss) -> None:
-        """What the recorder knows it has lost."""
+    def _loss(self, vehicle: str, payload: bytes, at_ns: int) -> None:
+        if vehicle != self._which[0] or self._is_known(vehicle, payload, at_ns):
+            return
+        loss = Loss.model_validate_json(payload)
         address = topics.read_key(loss.key)
         name = address.topic.name if address else loss.key
-        self._losses[vehicle][name] += loss.count
-        text = f"{loss.count} of {name} lost: {_WHERE[loss.reason]}"
-        self._kinds[vehicle, "recorder", f"loss of {name}"].add(Happening(loss.until_ns, "lost", "recorder", text))
+        self.losses[name] = self.losses.get(name, 0) + loss.count
+        self._add("lost", "recorder", f"{loss.count} of {name} lost: {_WHERE[loss.reason]}")
 
-    def losses(self, vehicle: str) -> dict[str, int]:
-        """Messages lost, by topic."""
-        return dict(self._losses[vehicle])
+    def _status(self, vehicle: str, role: str, payload: bytes, at_ns: int) -> None:
+        if at_ns <= self._status_ns.get((vehicle, role), 0):
+            return  # recorded again
+        self._status_ns[vehicle, role] = at_ns
+        status = self.statuses[vehicle, role] = Status.model_validate_json(payload)
+        if (vehicle, status.session) == self._which and role == "controller":
+            self._ages.add(status)
 
-    def age_us(self, which: Which) -> dict[str, float] | None:
-        """Age of measurements when they were used [µs]; None if it was not told."""
-        return self._ages[which].figures() if which in self._ages else None
+    def _is_known(self, vehicle: str, payload: bytes, at_ns: int) -> bool:
+        """Whether the very same message was recorded before."""
+        message = hash((vehicle, payload, at_ns))
+        if message in self._known:
+            return True
+        self._known[message] = None
+        if len(self._known) > _RECENT:
+            del self._known[next(iter(self._known))]
+        return False
 
-    def marks(self, which: Which, changes: Sequence[Change], period: float, clock: Clock) -> list[Mark]:
-        """Everything that happened to a vehicle, in order of time.
+    def _is_a_change(self, event: Event) -> bool:
+        """Whether it says in words what a change of the session says, too."""
+        return event.kind == "changed" and event.role == "controller" and event.session == self._which[1]
 
-        Args:
-            which: The session that is judged.
-            changes: What its controller followed from which tick on, in order.
-            period: Time between ticks [s].
-            clock: The session's clock [s] at a time of publication [ns].
-        """
-        vehicle, session = which
-        told = [
-            happening
-            for (whose, _, _), kind in self._kinds.items()
-            if whose == vehicle
-            for happening in kind.all()
-            # A controller tells of a change in words, too, but only the change itself has the tick.
-            if not (changes and happening.kind == "changed" and happening.session == session)
-        ]
-        placed = [
-            (happening.published_ns, Mark(time_s=clock(happening.published_ns), kind=happening.kind,
-                                          role=happening.role, text=happening.text))
-            for happening in sorted(told, key=lambda happening: happening.published_ns)
-        ]  # fmt: skip
-        within = [i for i, (_, mark) in enumerate(placed) if mark.time_s is not None]
-        first, end = (within[0], within[-1] + 1) if within else (len(placed), len(placed))
-        between = [mark for _, mark in placed[first:end]] + _changes(changes, period)
-        between.sort(key=lambda mark: mark.time_s if mark.time_s is not None else 0.0)
-        return [*(mark for _, mark in placed[:first]), *between, *(mark for _, mark in placed[end:])]
+    def _add(self, kind: str, role: str, text: str, tick: int | None = None, session: str | None = None) -> None:
+        reached = self._reached.get(self._which)
+        within = self._open.get(self._which[0]) == self._which[1] and session in (None, self._which[1])
+        if tick is None and (within or session == self._which[1]):
+            tick = reached or 0
+        time_s = None if tick is None else round(tick * self._period, 9)
+        place = (-1 if reached is None else 1, 0.0) if time_s is None else (0, time_s)
+        self._kinds[role, kind].add(place, Mark(time_s=time_s, kind=kind, role=role, text=text))
 
 
 _WHERE: Final = {
@@ -158,14 +189,6 @@ _WHERE: Final = {
     "queue": "they came faster than they could be written",
     "disk": "the log could not be written",
 }
-
-
-def _changes(changes: Sequence[Change], period: float) -> list[Mark]:
-    told = [(change.tick, described(change)) for change in changes[:MAX_MARKS]]
-    if len(changes) > MAX_MARKS:
-        last = changes[-1]
-        told.append((last.tick, f"{len(changes) - MAX_MARKS} more, the last: {described(last)}"))
-    return [Mark(time_s=round(k * period, 9), kind="change", role="controller", text=text) for k, text in told]
 
 
 def described(change: Change) -> str:

@@ -1,11 +1,10 @@
-"""What an observer counts with: durations in bins, values at a quantizer's limit, and what is told now and then.
+"""What an observer counts with: durations in bins, and values at a quantizer's limit.
 
 Each takes a block of a few thousand at once, by numpy, and holds no more however many blocks come.
 """
 
 from __future__ import annotations
 
-from math import nan
 from typing import Final
 
 import numpy as np
@@ -13,14 +12,10 @@ import numpy.typing as npt
 
 from protocol.wire import SignalSpec
 from service.logs.report import Array, Spread
-
-BLOCK: Final = 4096
-"""Ticks that are reduced at once."""
+from service.logs.traces import Integers
 
 _BINS_PER_OCTAVE: Final = 16
 _BINS: Final = 32 * _BINS_PER_OCTAVE  # 1 µs … 2^32 µs, as protocol.clock.Histogram
-
-Integers = npt.NDArray[np.int64]
 
 
 class Durations:
@@ -79,31 +74,3 @@ class Outermost:
     def share(self) -> float | None:
         """Of the valid values; None if there were none."""
         return self._saturated / self._values if self._values else None
-
-
-class Told:
-    """What is told less often than every tick: between two it is interpolated, after the last one it is held."""
-
-    def __init__(self, columns: int) -> None:
-        self._at: list[float] = []
-        self._values: list[tuple[float, ...]] = []
-        self._columns = columns
-
-    def add(self, at: float, values: tuple[float, ...]) -> None:
-        """Told at a place on an axis that rises."""
-        if self._at and at <= self._at[-1]:
-            return
-        if len(self._at) >= 2 * BLOCK:  # it goes on while there are no ticks: forget the older half
-            del self._at[:BLOCK], self._values[:BLOCK]
-        self._at.append(at)
-        self._values.append(values)
-
-    def on(self, at: Array) -> Array:
-        """The values at places that rise, NaN before the first; forgets what lies before them. Shape (n, columns)."""
-        if not self._at:
-            return np.full((len(at), self._columns), nan)
-        known, values = np.array(self._at), np.array(self._values)
-        columns = [np.interp(at, known, values[:, i], left=nan) for i in range(self._columns)]
-        past = max(0, int(np.searchsorted(known, at[-1], side="right")) - 1)
-        del self._at[:past], self._values[:past]
-        return np.stack(columns, axis=1)

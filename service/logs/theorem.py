@@ -22,8 +22,8 @@ from protocol.verbs import Change
 from service.law import LawSettings
 from service.logs.grounds import Grounds
 from service.logs.report import Array, LemmaCheck, TheoremFindings
-from service.logs.tallies import BLOCK, Integers
 from service.logs.ticks import Ticks
+from service.logs.traces import Integers
 from service.theorem.lemma import Inequality, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 
 Flags = npt.NDArray[np.bool_]
@@ -32,8 +32,8 @@ PREMISES: Final = ("C.28", "C.29")
 ERROR_PREMISE: Final = "Assumption 3"
 """That the attitude error is within what the certificate assumes."""
 
-COLUMNS: Final = 4
-"""Measured and true ‖z‖, measured and true V."""
+WAITING: Final = 8192
+"""Truths that may wait for the ticks that they are of."""
 
 
 class Truths(NamedTuple):
@@ -85,8 +85,6 @@ class Trial:
 
     Args:
         grounds: What it is held against.
-        changes: What its controller followed from which tick on, in order; the first is what it began with, unless the
-            log lacks that.
         period: Time between ticks [s].
         damping: θ of the plant, if that is known [N·m·s/rad].
 
@@ -94,24 +92,34 @@ class Trial:
         damping_known: Whether it is.
     """
 
-    def __init__(self, grounds: Grounds, changes: Sequence[Change], period: float, damping: Vector | None) -> None:
+    def __init__(self, grounds: Grounds, period: float, damping: Vector | None) -> None:
         self._grounds = grounds
         self._period = period
         self._damping = damping
         self.damping_known = damping is not None
-        self._since, self._until = _judged_ticks(changes, period)
-        self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=2 * BLOCK)
+        self._changes: list[Change] = []  # the first few
+        self._since, self._until = 0, inf
+        self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
         self._untold = 0  # truths that do not say of which tick they are
         self._before: Ticks | None = None  # the last block: a truth may come a little late
-        self._drawn = np.empty((0, 3))  # the last true state: its tick, ‖z‖ and V
+        self._drawn = np.empty((0, 4))  # the last true state: its tick, ‖z‖, V and the angle of its error [deg]
         self._tallies: dict[str, Tally] = {}
         self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
-        self._settled = self._since + transient(grounds.law) / period  # tick from which the transient is over
+        self._settled = transient(grounds.law) / period  # tick from which the transient is over
         self._seen: tuple[float, float] | None = None  # largest ‖z‖ and largest attitude error [rad] from then on
         self._true: tuple[float, float] | None = None  # the same of the true state
 
     # ── what it is told ──
+
+    def changed(self, changes: Sequence[Change]) -> None:
+        """What the controller followed from which tick on, in order, before those ticks are given.
+
+        The first is what the session began with, unless the log lacks that.
+        """
+        self._changes = [*self._changes, *changes][:3]
+        self._since, self._until = _judged_ticks(self._changes, self._period)
+        self._settled = self._since + transient(self._grounds.law) / self._period
 
     def truth(self, tick: int | None, attitude: Quaternion, rate: Vector) -> None:
         """What was true as a tick's measurement was taken; None if nobody says which."""
@@ -120,27 +128,31 @@ class Trial:
         elif not self._truths or tick > self._truths[-1][0]:
             self._truths.append((tick, attitude, rate))
 
-    def ticks(self, ticks: Ticks) -> Array:
-        """A block of ticks. Returns what is drawn of them, NaN where there is none. Shape (n, COLUMNS)."""
+    def ticks(self, ticks: Ticks) -> tuple[Array, Array]:
+        """A block of ticks.
+
+        Returns:
+            What is drawn of them, NaN where there is none: the true attitude error [deg], shape (n,); measured and true
+            ‖z‖, measured and true V, shape (n, 4).
+        """
         z, V = measured_norm(ticks, self._grounds.law)
-        drawn = np.column_stack([z, np.full(len(z), nan), V, np.full(len(z), nan)])
         self._settle(ticks, z)
+        true = np.full((3, len(z)), nan)
         before, self._before = self._before, ticks
-        if not self._truths or self._truths[0][0] > ticks.k[-1]:
-            return drawn
-        late = [] if before is None or before.k[-1] < self._truths[0][0] else [before]
-        both = Ticks.joined([*late, ticks])
-        truths = self._take_truths(int(both.k[0]), int(both.k[-1]))
-        place = np.searchsorted(both.k, truths.k)
-        there = both.k[place] == truths.k
-        if there.any():
-            at = both.where(place[there])
-            true = self._try(at, Truths(*(column[there] for column in truths)))
-            known = np.vstack([self._drawn, np.column_stack([at.k, *true])])
-            self._drawn = known[-1:]
-            for column, values in ((1, known[:, 1]), (3, known[:, 2])):  # a line is drawn from one to the next
-                drawn[:, column] = np.interp(ticks.k, known[:, 0], values, left=nan)
-        return drawn
+        if self._truths and self._truths[0][0] <= ticks.k[-1]:
+            late = [] if before is None or before.k[-1] < self._truths[0][0] else [before]
+            both = Ticks.joined([*late, ticks])
+            truths = self._take_truths(int(both.k[0]), int(both.k[-1]))
+            place = np.searchsorted(both.k, truths.k)
+            there = both.k[place] == truths.k
+            if there.any():
+                at = both.where(place[there])
+                found = self._try(at, Truths(*(column[there] for column in truths)))
+                known = np.vstack([self._drawn, np.column_stack([at.k, *found])])
+                self._drawn = known[-1:]
+                # A line is drawn from one to the next.
+                true = np.array([np.interp(ticks.k, known[:, 0], values, left=nan) for values in known.T[1:]])
+        return true[2], np.column_stack([z, true[0], V, true[1]])
 
     def _settle(self, ticks: Ticks, z: Array) -> None:
         """The largest ‖z‖ and attitude error after the transient."""
@@ -158,8 +170,8 @@ class Trial:
         k, attitude, rate = zip(*taken, strict=True) if taken else ((), (), ())
         return Truths(np.array(k, np.int64), np.array(attitude).reshape(-1, 4), np.array(rate).reshape(-1, 3))
 
-    def _try(self, at: Ticks, truths: Truths) -> tuple[Array, Array]:
-        """Judge the lemma at ticks of which the truth is known. Returns true ‖z‖ and V. Shapes (n,)."""
+    def _try(self, at: Ticks, truths: Truths) -> tuple[Array, Array, Array]:
+        """Judge the lemma at ticks of which the truth is known. Returns true ‖z‖, V and error [deg]. Shapes (n,)."""
         grounds = self._grounds
         law = grounds.law
         inertial = times(rotation(at.attitude), at.desired_rate)
@@ -176,7 +188,7 @@ class Trial:
             small = half_angle <= bounds.known.half_angle_e * (1 + 1e-9)
             time: Array = np.asarray(at.k * self._period, dtype=np.float64)
             self._judge(lemma_inequalities(samples, law, bounds.known, bounds.lemma), counts, small, time)
-        return b.norm, lyapunov(b, theta_error, law)
+        return b.norm, lyapunov(b, theta_error, law), np.degrees(2 * half_angle)
 
     def _judge(self, inequalities: Sequence[Inequality], counts: Flags, small: Flags, time: Array) -> None:
         """Count each inequality where every premise is met: where it counts, and the error is as small as assumed."""

@@ -17,8 +17,10 @@ import numpy as np
 from service.logs.report import Array, Line, Mark, Panel, Report
 
 SPREADS: Final = {
-    "latency": "Latency as published: from a measurement to its command",
-    "period": "Period as published: between measurements",
+    "latency": "Latency: from a measurement to the command that answers it",
+    "measurement_delay": "From the plant to the controller",
+    "command_delay": "From the controller to the plant",
+    "period": "Period between measurements",
 }
 """Which distributions are drawn, in this order, and what they are called."""
 

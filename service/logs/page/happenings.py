@@ -75,7 +75,7 @@ def timing(reports: Sequence[Report]) -> Html:
             if spread is not None:
                 points = (spread.p50, spread.p90, spread.p99, spread.p999, spread.max)
                 rows.append(
-                    [*run_cell(reports, index), f"{name} as published", *map(micros, points), f"{spread.count:,}"]
+                    [*run_cell(reports, index), name.replace("_", " "), *map(micros, points), f"{spread.count:,}"]
                 )
     for index, report in enumerate(reports):
         age = report.findings.age_us
