@@ -80,8 +80,8 @@ class Subscriptions:
         for expression, subscriber in self._topics.items():
             for miss in subscriber.missed():
                 source = miss.source.zid, miss.source.eid
-                self._reported[source] += miss.count
-                found.append(Lost(self._keys.get(source, expression), miss.count, "network"))
+                self._reported[source] += miss.missing
+                found.append(Lost(self._keys.get(source, expression), miss.missing, "network"))
         for source, gap in self._gaps.items():
             reported = min(gap, self._reported[source])
             self._reported[source] -= reported
