@@ -1,0 +1,291 @@
+"""Index of a run's traces: which batches its files hold and which rows they lack, from the batches' headers alone.
+
+Rows are numbered over the life of an end's process. So a gap in the numbers says how many rows are missing, a batch
+that was recorded twice is known by its first row, and every session's length is known before any of it is read.
+"""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterator
+from typing import Final, Literal, NamedTuple
+from zlib import crc32
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol.trace import NEVER, Batch, End, Header, Received, read_batch, read_columns, read_header
+
+Which = tuple[str, str]
+"""A vehicle and a session."""
+
+Key = tuple[int, bool, int, int]
+"""Place of a batch among those of its source: first row, whether it has rows, time and, where it has none, checksum."""
+
+NO_TICK: Final = -1
+
+Integers = npt.NDArray[np.int64]
+
+
+class Source(NamedTuple):
+    """A process of an end."""
+
+    vehicle: str
+    end: End
+    run: int
+
+
+class Missing(BaseModel):
+    """Rows of one end that the log lacks."""
+
+    model_config = ConfigDict(frozen=True)
+
+    vehicle: str
+    session: str
+    end: Literal["controller", "plant"]
+    first_tick: int = Field(description="the first tick of the session that may lack its row")
+    last_tick: int | None = Field(description="the last; null where the log does not say how long the session lasted")
+    rows: int = Field(description="how many are known to be missing; 0 where only the session's last batch is")
+
+    def __str__(self) -> str:
+        if self.last_tick is None:
+            what = f"{self.rows} or more" if self.rows else "the last"
+            return f"{what} of the {self.end}'s ticks in {self.session}, from tick {self.first_tick} on"
+        return f"{self.rows} of the {self.end}'s ticks in {self.session}, ticks {self.first_tick} to {self.last_tick}"
+
+
+class Batches:
+    """Batches of one source.
+
+    Attributes:
+        table: A row a batch, sorted and without duplicates, with the columns of `_FIELDS`; complete after `finish`.
+    """
+
+    def __init__(self) -> None:
+        self._values = array("q")
+        self.table: Integers = np.empty((0, len(_FIELDS)), dtype=np.int64)
+
+    def add(self, header: Header, payload: bytes, session: int) -> None:
+        """One batch that a file holds, of a session by its number."""
+        first, last, proof = _ticks(header, payload)
+        self._values.extend((*key_of(header, payload), session, header.rows, header.final, first, last, proof))
+
+    def finish(self) -> None:
+        """No more is to come."""
+        table = np.array(self._values, dtype=np.int64).reshape(-1, len(_FIELDS))
+        self._values = array("q")
+        table = np.unique(table, axis=0)  # sorted by the key, which comes first
+        same = (np.diff(table[:, :2], axis=0) == 0).all(axis=1) & (table[1:, 1] == 1)
+        self.table = table[np.append(True, ~same)] if len(table) else table
+
+    def column(self, name: str) -> Integers:
+        """A column of the table. Shape (batches,)."""
+        return self.table[:, _FIELDS.index(name)]
+
+
+_FIELDS: Final = ("first_row", "has_rows", "time", "checksum", "session", "rows", "final", "first", "last", "proof")
+
+
+class Extent(NamedTuple):
+    """What a log has of a session: the first and last tick and the rows of each end; a last tick of −1 is none."""
+
+    first: dict[End, int]
+    last: dict[End, int]
+    rows: dict[End, int]
+
+    @property
+    def ticks(self) -> int:
+        """Ticks from the first to the last row of the controller."""
+        return self.last["controller"] - self.first["controller"] + 1 if self.rows["controller"] else 0
+
+    def of(self, end: End) -> Extent:
+        """The same of one end alone."""
+        return self._replace(rows={other: rows if other == end else 0 for other, rows in self.rows.items()})
+
+
+class TraceIndex:
+    """All batches of a run.
+
+    Attributes:
+        sources: Batches by source.
+        extents: What there is of each session, in the order of recording; complete after `finish`.
+        missing: What is not; likewise.
+        malformed: Batches that cannot be read.
+    """
+
+    def __init__(self) -> None:
+        self.sources: dict[Source, Batches] = {}
+        self.extents: dict[Which, Extent] = {}
+        self.missing: list[Missing] = []
+        self.malformed = 0
+        self._names: dict[str, int] = {"": 0}
+
+    def add(self, vehicle: str, payload: bytes) -> None:
+        """A batch that a file holds."""
+        header = read_header(payload)
+        if header is None or read_columns(payload, header) is None:
+            self.malformed += 1
+            return
+        batches = self.sources.setdefault(Source(vehicle, header.end, header.run), Batches())
+        batches.add(header, payload, self._names.setdefault(header.session, len(self._names)))
+
+    def finish(self) -> None:
+        """No more is to come: find sessions, and what is missing of them."""
+        proofs: dict[tuple[Which, End], int] = {}
+        ended: set[tuple[Which, End]] = set()
+        names = list(self._names)
+        for (vehicle, end, _), batches in self.sources.items():
+            batches.finish()
+            session, rows, last = batches.column("session"), batches.column("rows"), batches.column("last")
+            other: End = "plant" if end == "controller" else "controller"
+            for number in dict.fromkeys(session.tolist()):
+                which, its = (vehicle, names[number]), session == number
+                if number and rows[its].any():
+                    extent = self.extents.setdefault(which, _nothing())
+                    extent.first[end] = int(batches.column("first")[its & (rows > 0)].min())
+                    extent.last[end], extent.rows[end] = int(last[its].max()), int(rows[its].sum())
+                    proofs[which, other] = int(batches.column("proof")[its].max())
+                if batches.column("final")[its].any():
+                    ended.add((which, end))
+        for source, batches in self.sources.items():
+            self._find_gaps(source, batches, names)
+        for which, extent in self.extents.items():
+            for end in ("controller", "plant"):
+                self._find_end(which, end, extent.last[end], proofs.get((which, end), NO_TICK), (which, end) in ended)
+
+    @property
+    def longest(self) -> Which | None:
+        """The session with the most ticks of a controller; None if there is none."""
+        return max(self.extents, key=lambda which: self.extents[which].ticks, default=None)
+
+    def _find_gaps(self, source: Source, batches: Batches, names: list[str]) -> None:
+        having = batches.table[batches.column("rows") > 0]
+        if not len(having):
+            return
+        column = {name: having[:, i] for i, name in enumerate(_FIELDS)}
+        first, session = column["first"], [names[number] for number in column["session"].tolist()]
+        if column["first_row"][0] and first[0] > 0:
+            self._lacks(source, session[0], 0, int(first[0]) - 1, min(int(column["first_row"][0]), int(first[0])))
+        after = column["first_row"] + column["rows"]
+        for i in np.flatnonzero(column["first_row"][1:] > after[:-1]).tolist():
+            rows, begins, ends = int(column["first_row"][i + 1] - after[i]), int(first[i + 1]), int(column["last"][i])
+            if session[i] == session[i + 1]:
+                self._lacks(source, session[i], ends + 1, begins - 1, rows)
+            elif begins > 0:
+                self._lacks(source, session[i + 1], 0, begins - 1, rows)
+            else:
+                self._lacks(source, session[i], ends + 1, None, rows)
+
+    def _find_end(self, which: Which, end: End, last: int, proof: int, ended: bool) -> None:
+        """What the other end proves to be missing after the last row, or that the session's end is."""
+        known = any((m.vehicle, m.session) == which and m.end == end and m.last_tick is None for m in self.missing)
+        if known:
+            return
+        if proof > last:
+            self._lacks(Source(which[0], end, 0), which[1], last + 1, proof, proof - last)
+        elif not ended:
+            self._lacks(Source(which[0], end, 0), which[1], last + 1, None, 0)
+
+    def _lacks(self, source: Source, session: str, first: int, last: int | None, rows: int) -> None:
+        self.missing.append(
+            Missing(
+                vehicle=source.vehicle, session=session, end=source.end, first_tick=first, last_tick=last, rows=rows
+            )
+        )
+
+
+class Arrived(NamedTuple):
+    """A batch in its place.
+
+    Attributes:
+        source: Whose.
+        batch: Its rows and tail.
+        after_gap: Whether rows before it are missing.
+        next_tick: No row of its session that comes later is of a tick before this one; None if none comes.
+    """
+
+    source: Source
+    batch: Batch
+    after_gap: bool
+    next_tick: int | None
+
+
+class InOrder:
+    """Puts batches in the order of their rows as they are read again, and drops those that come twice.
+
+    Args:
+        index: Of the same files.
+    """
+
+    def __init__(self, index: TraceIndex) -> None:
+        self._waiting: dict[Source, dict[Key, Batch]] = {source: {} for source in index.sources}
+        self._at = dict.fromkeys(index.sources, 0)
+        self._keys = {source: batches.table[:, :4].tolist() for source, batches in index.sources.items()}
+        self._next = {source: _next_ticks(batches) for source, batches in index.sources.items()}
+        self._after = dict.fromkeys(index.sources, 0)
+
+    def take(self, vehicle: str, payload: bytes) -> Iterator[Arrived]:
+        """A batch as a file holds it; then every batch whose turn it is."""
+        batch = read_batch(payload)
+        if batch is None:
+            return
+        source = Source(vehicle, batch.header.end, batch.header.run)
+        keys, waiting = self._keys[source], self._waiting[source]
+        place = bisect_left(keys, list(key_of(batch.header, payload)), lo=self._at[source])
+        if place == len(keys) or tuple(keys[place][:2]) != (batch.header.first_row, batch.header.rows > 0):
+            return
+        waiting.setdefault(tuple(keys[place]), batch)
+        while self._at[source] < len(keys):
+            batch = waiting.pop(tuple(keys[self._at[source]]), None)
+            if batch is None:
+                return
+            at, header = self._at[source], batch.header
+            gap = header.rows > 0 and header.first_row > self._after[source]
+            self._after[source] = header.first_row + header.rows
+            self._at[source] = at + 1
+            following = int(self._next[source][at])
+            yield Arrived(source, batch, gap, None if following == NO_TICK else following)
+
+
+def key_of(header: Header, payload: bytes) -> Key:
+    """Where a batch stands among those of its source; one without rows stands before the one that goes on there."""
+    return header.first_row, header.rows > 0, header.monotonic_ns, 0 if header.rows else crc32(payload)
+
+
+def _ticks(header: Header, payload: bytes) -> tuple[int, int, int]:
+    """The first and last tick of a batch, and the last tick of which its rows prove that the other end had it."""
+    columns = read_columns(payload, header)
+    if columns is None or not header.rows:
+        return NO_TICK, NO_TICK, NO_TICK
+    if header.end == "controller":
+        ticks = columns["tick"]
+        received = ticks[(columns["received_as"] == Received.FRAME) | (columns["received_as"] == Received.LATE)]
+        return int(ticks.min()), int(ticks.max()), int(received.max()) if len(received) else NO_TICK
+    ticks, answered = columns["session_tick"], columns["answered"]
+    proof = answered[answered != NEVER]
+    return int(ticks.min()), int(ticks.max()), int(proof.max()) if len(proof) else NO_TICK
+
+
+def _next_ticks(batches: Batches) -> Integers:
+    """After each batch, the lowest tick of any later one of its session; NO_TICK where there is none. Shape (batches,).
+
+    A session's batches stand together; a late row may be of an earlier tick than the row before it.
+    """
+    following = np.full(len(batches.table), NO_TICK)
+    session, first, rows = batches.column("session"), batches.column("first"), batches.column("rows")
+    lowest, of = NO_TICK, NO_TICK
+    for i in range(len(following) - 1, -1, -1):
+        if session[i] != of and rows[i]:
+            lowest, of = NO_TICK, int(session[i])
+        following[i] = lowest
+        if rows[i]:
+            lowest = int(first[i]) if lowest == NO_TICK else min(lowest, int(first[i]))
+    return following
+
+
+def _nothing() -> Extent:
+    return Extent(
+        {"controller": 0, "plant": 0}, {"controller": NO_TICK, "plant": NO_TICK}, {"controller": 0, "plant": 0}
+    )
