@@ -18,6 +18,7 @@ from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings, LoopTiming, TickGrid, prepare_process
 from protocol.links import Arrival
 from protocol.states import TripCause
+from protocol.trace import Outcome
 from protocol.transmit import SILENCE
 from protocol.wire import WireSpec
 
@@ -130,7 +131,11 @@ class Driver:
         """
         if frame and len(frame) != self._command_bytes:
             frame = self._malformed
-        return self.endpoint.tick(self._incoming(frame), k)
+        passed = self._incoming(frame)
+        measurement = self.endpoint.tick(passed, k)
+        if passed is None and frame is not None:
+            self.endpoint.outcome = Outcome.WITHHELD
+        return measurement
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """One tick on the network. Returns the counter that an answer to its measurement will echo, if one will."""

@@ -158,6 +158,20 @@ class TickCounter:
         self.tick = tick
         return tick
 
+    @property
+    def known(self) -> bool:
+        """Whether a frame has marked the grid; never in lockstep."""
+        return self._origin_ns is not None
+
+    def due_ns(self, tick: int) -> int:
+        """When the frame of a tick is due, had it been as fast as the fastest; only where `known` [ns]."""
+        assert self._origin_ns is not None
+        return self._origin_ns + tick * self._period_ns
+
+    def tick_at(self, now_ns: int) -> int:
+        """The last tick whose frame is due by now; only where `known`."""
+        return (now_ns - self.due_ns(0)) // self._period_ns
+
     def late_ns(self, tick: int, at_ns: int) -> int:
         """How much later than the fastest frames a tick's frame arrived [ns]; 0 in lockstep and before any frame.
 

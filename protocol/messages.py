@@ -76,6 +76,10 @@ class Contract(Message):
     versions: dict[str, str]
     facts: dict[str, str] = Field(default_factory=dict, description="the machine, and what of it bears on time")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
+    freshness_s: float | None = Field(
+        default=None,
+        description="2^counter_bits periods: a frame that is later than this may be taken for a newer one [s]",
+    )
     certificate: dict[str, Any] | None = Field(
         default=None,
         description="controller: what the theorem promises of it, as `aeroloop lab certify --json` says it",
@@ -154,7 +158,7 @@ class Status(Message):
     recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
     age_us: Percentiles | None = Field(
         default=None,
-        description="controller: how much later than the fastest a measurement was received, last 10 s [µs]",
+        description="controller: from a measurement received to the command that answers it sent, last 10 s [µs]",
     )
     timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")

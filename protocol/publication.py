@@ -88,11 +88,11 @@ class Missed(NamedTuple):
 
     Attributes:
         source: Their publisher.
-        count: How many.
+        missing: How many.
     """
 
     source: zenoh.EntityGlobalId
-    count: int
+    missing: int
 
 
 class RecoveringSubscriber:

@@ -23,13 +23,14 @@ import zenoh
 from pydantic import ValidationError
 
 from protocol import topics
-from protocol.clock import Throttle
+from protocol.clock import LoopSettings, Throttle
 from protocol.errors import AeroloopError
 from protocol.host import host_facts, versions
 from protocol.messages import PROTOCOL_VERSION, Contract, Event, EventKind, Status
 from protocol.network import NetworkSettings, join
 from protocol.publication import CachedPublisher
 from protocol.verbs import Answer, Message
+from protocol.wire import WireSpec
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -122,7 +123,16 @@ class Role:
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
 
     def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
-        """Answer questions for the contract with this configuration, and what is promised of it, from now on."""
+        """Publish the role's contract with this configuration, and what is promised of it, and answer queries with it.
+
+        Args:
+            config: The effective configuration.
+            certificate: What the theorem promises of it; of a controller.
+        """
+        freshness_s = None
+        if "wire" in config and "loop" in config:
+            period_ns = LoopSettings.model_validate(config["loop"]).period_ns
+            freshness_s = WireSpec.model_validate(config["wire"]).freshness_ns(period_ns) * 1e-9
         self._contract = Contract(
             protocol=PROTOCOL_VERSION,
             role=self.role,
@@ -131,6 +141,7 @@ class Role:
             versions=versions(),
             facts=host_facts(),
             config=config,
+            freshness_s=freshness_s,
             certificate=certificate,
         ).encode()
         self.publish_bytes("contract", self._contract)

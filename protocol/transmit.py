@@ -99,5 +99,8 @@ class Sender:
 
 
 def _same(codes: Sequence[float], said: Sequence[float]) -> bool:
-    """Whether two frames have the same bits: 0.0 and −0.0 are equal and have not."""
-    return codes == said and all(copysign(1, a) == copysign(1, b) for a, b in zip(codes, said, strict=True) if a == 0)
+    """Whether two frames have the same bits: 0.0 and −0.0 are equal and have not, NaN is not and has."""
+    return all(
+        copysign(1, a) == copysign(1, b) if a == b == 0 else a == b or (a != a and b != b)
+        for a, b in zip(codes, said, strict=True)
+    )

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self
@@ -95,17 +96,26 @@ class Bench:
             self.start("can-node")
         self.start("plant")
 
-    def start(self, role: RoleName) -> subprocess.Popen[bytes]:
-        """Start a role; it is not yet on the network when this returns."""
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
-        command = [sys.executable, "-m", "service.cli", role, "--config", str(self._config), "--with-parent", "--quiet"]
+    def start(
+        self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None
+    ) -> subprocess.Popen[bytes]:
+        """Start a role; it is not yet on the network when this returns.
+
+        Args:
+            role: Which.
+            arguments: For its command line, besides the configuration of all.
+            environment: For its environment, besides this process's.
+        """
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
+        own = ["--config", str(self._config), "--with-parent", "--quiet"]
+        command = [sys.executable, "-m", "service.cli", role, *own, *arguments]
         with self._log(role).open("ab") as stderr:
             child = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
-                env=environment,
+                env={**inherited, **(environment or {})},
                 start_new_session=True,
             )
         self._children[role] = child

@@ -18,7 +18,7 @@ from protocol.messages import Claim, Grant, Refusal, Release
 from protocol.role import Role
 from protocol.verbs import Answer
 from protocol.wire import WireSpec
-from service.hearing import MAILBOX
+from service.tick_source import MAILBOX
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -68,7 +68,6 @@ class Claimant:
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lossless=self._loop.lockstep,
             mailbox=Mailbox(depth=MAILBOX if self._wire.transmit.measurement == "on_change" else 1),
-            numbers=role.numbers,
         )
         answer = self._ask(claim)
         if isinstance(answer, Grant):

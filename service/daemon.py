@@ -1,13 +1,14 @@
 """The controller process: claim a vehicle, then wait → tick → send → account, until told to stop.
 
-What a tick is, hearing.py says; in lockstep the very same loop runs as fast as the plant asks. Whenever the daemon has
-no session it claims again, four times a second, so either end may start first and either may be restarted. When
-measurements stop coming for longer than `stale_s` it gives the session up and says nothing more; the plant's watchdog
-does the rest.
+What a tick is, tick_source.py says; in lockstep the very same loop runs as fast as the plant asks. Whenever the daemon
+has no session it claims again, four times a second, so either end may start first and either may be restarted. When
+measurements stop coming for longer than `stale_s` it gives the session up and sends nothing more; the plant's watchdog
+does the rest. Every tick is a row of the trace, which is published after the command.
 """
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -18,20 +19,21 @@ from pydantic import ValidationError
 from protocol import topics
 from protocol.clock import LoopSettings, LoopTiming, RollingHistogram, prepare_process
 from protocol.links import ZenohLink
-from protocol.messages import Lapse, Status, report, summary
+from protocol.messages import Status, report, summary
 from protocol.role import Role
 from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
+from protocol.trace import MAX_ROWS, Received, Sent, TraceWriter
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask, Reference
 from protocol.wire import WireSpec
 from service.assurance import Assurance, gains_of
 from service.claimant import Claimant, SessionLostError
 from service.controller import Controller
-from service.hearing import Heard, Hearing, Slip
 from service.law import LawSettings
 from service.live import Live
 from service.settings import ControllerSettings
 from service.telling import telemetry_of
+from service.tick_source import PlantTick, TickSource
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 CLAIM_PERIOD_S: Final = 0.25
@@ -77,14 +79,15 @@ class Daemon:
         self._controller = self._new_controller()
         self._claimant = Claimant(role, loop, wire, auto_arm=settings.auto_arm)
         self._assurance = Assurance(role, wire, law, reference, settings)
-        self._live = Live(role, law, reference, settings, self._assurance, rolls=wire.actuators == 3)
+        self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
+        self._live = Live(role, law, reference, settings, self._trace, self._assurance, rolls=wire.actuators == 3)
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
         self._recorders = 0
         self._plant: Status | None = None
         self._granted = False  # whether the plant's status has ever named this session
         self._lost = ""
-        self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = 0
+        self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = self._stale = 0
         self._notes: list[str] = []
         self._timing: LoopTiming | None = None
         self._age = RollingHistogram()
@@ -98,7 +101,9 @@ class Daemon:
         if not self._loop.lockstep:
             self._notes = prepare_process(self._loop)
             self._timing = LoopTiming()
-        role = self._role
+        role, loop = self._role, self._loop
+        role.declare("telemetry", self._settings.telemetry_rate_hz)
+        role.declare("trace", 1.2 * max(1 / loop.trace_s, loop.rate_hz / MAX_ROWS), lossless=loop.lockstep)
         self._live.serve()
         role.serve("stand_down", Ask, lambda _: self._stand_down)
         role.serve("recall", Ask, lambda _: self._recall)
@@ -131,54 +136,80 @@ class Daemon:
 
     def _run(self, link: ZenohLink) -> bool:
         """One session: a tick for every one of the plant's. True once the duration is over, False if it was lost."""
-        controller, live, timing = self._controller, self._live, self._timing
-        own_grid = self._settings.pace == "clock" and not self._loop.lockstep
-        hearing = Hearing(link, self._loop, self._wire, own_grid=own_grid)
+        controller, live, timing, lockstep = self._controller, self._live, self._timing, self._loop.lockstep
+        own_grid = self._settings.pace == "clock" and not lockstep
+        source = TickSource(link, self._loop, self._wire, own_grid=own_grid, stale_s=self._stale_s)
         k, last = -1, time.monotonic()
         while self._may_go_on() and (self._last_tick is None or k < self._last_tick):
-            heard = hearing.next(min(WAIT_S, self._stale_s))
-            if heard is None or heard.published_ns is None:
-                if (reason := self._is_lost(time.monotonic() - last)) is not None:
-                    return self._lose(reason)
-            else:
+            now = source.next(min(WAIT_S, self._stale_s))
+            if now is not None and now.fresh:
                 last = time.monotonic()
-                self._age.add(max(0, time.time_ns() - heard.published_ns))
-            if heard is None:
+            elif (reason := self._is_lost(time.monotonic() - last)) is not None:
+                return self._lose(reason)
+            if now is None:
+                self._publish_trace_when_due()
                 continue
-            if heard.late:
-                self._received += 1
-                self._tell(hearing.lapses(heard, k, used=controller.hold(heard.frame)))
+            if now.received_as is Received.LATE or now.tick == k:
+                self._take_late(now)
                 continue
             if timing:
-                timing.woke(heard.due_ns)
-            live.before_tick(heard.tick, heard.frame)
+                timing.woke(now.due_ns)
+            live.before_tick(now.tick, now.frame)
             if not self._may_go_on():
                 break
-            command = controller.tick(heard.frame, heard.tick)
-            if command or (command is not None and self._loop.lockstep):
+            command = controller.tick(now.frame, now.tick)
+            if command or (command is not None and lockstep):
                 link.send(command)
-            self._tell(hearing.lapses(heard, k, used=command is not None))
-            k = heard.tick
-            self._account(command, heard)
+            k = now.tick
+            sent_ns = time.monotonic_ns()
+            self._age.add(sent_ns - now.at_ns)
+            self._record(now, command, sent_ns)
+            self._account(command, now)
             if timing:
                 timing.done()
         return self._may_go_on()
 
+    def _take_late(self, late: PlantTick) -> None:
+        """A frame that is no tick of its own: its levels hold from the next tick on, if it has any."""
+        self._received += 1
+        self._controller.hold(late.frame)
+        if not late.fresh and late.received_as is Received.LATE:
+            self._stale += 1
+            text = f"measurements come {late.late_ns * 1e-6:.0f} ms later than the fastest: not answered"
+            self._role.warn("stale", "fault", text, self._claimant.session, late.tick)
+        self._record(late, None, 0)
+
+    def _record(self, now: PlantTick, command: bytes | None, sent_ns: int) -> None:
+        """Add a row to the trace. A command that repeats the last one is silent, in lockstep too."""
+        sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
+        self._trace.controller_row(
+            max(now.tick, 0),
+            now.received_as,
+            sent_as,
+            now.at_ns,
+            sent_ns if command is not None else 0,
+            now.frame,
+            command or b"",
+        )
+        self._publish_trace_when_due()
+
+    def _publish_trace_when_due(self) -> None:
+        now_ns = time.monotonic_ns()
+        if self._trace.due(now_ns):
+            self._role.publish_bytes("trace", self._trace.take(now_ns, time.time_ns()))
+            self._trace.state = self._controller.state.model_dump(mode="json")
+
     def _may_go_on(self) -> bool:
         return not self._role.stop.is_set() and self._machine.state not in (State.HOLDING, State.FAULTED)
 
-    def _tell(self, lapses: list[Slip]) -> None:
-        for kind, tick, ticks in lapses:
-            assert self._claimant.session is not None
-            self._role.publish("lapse", Lapse(session=self._claimant.session, kind=kind, tick=tick, ticks=ticks))
-
-    def _account(self, command: bytes | None, heard: Heard) -> None:
-        measured = heard.tick
+    def _account(self, command: bytes | None, now: PlantTick) -> None:
+        measured = now.tick
         self._ticks += 1
-        self._received += heard.frame != SILENCE
-        self._skipped += heard.missed
-        if heard.missed >= STALL_TICKS:
-            self._role.warn("stall", "fault", f"{heard.missed} ticks missed at once", self._claimant.session)
+        if now.frame != SILENCE:
+            self._received += 1
+        self._skipped += now.missed
+        if now.missed >= STALL_TICKS:
+            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self._claimant.session, measured)
         if command is not None:
             self._sent += command != SILENCE
             self._follow(measured)
@@ -192,16 +223,15 @@ class Daemon:
         if self._controller.failed:
             self._machine.fire(Trigger.FAULT)
             self._lost = "the law gave no number"
-            role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session)
+            role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session, measured)
         elif self._controller.tick_index != measured:
             if before is not State.READY:
                 self._machine.fire(Trigger.INVALID)
-                role.warn("invalid", "fault", "no valid measurement: commands no valid value", session)
+                role.warn("invalid", "fault", "no valid measurement: commands no valid value", session, measured)
         elif before is not State.RUNNING:
             self._machine.fire(Trigger.ANSWERED)
-            self._publish_telemetry()  # tells a log's reader which tick the first counter was
             if before is State.CLAIMED:
-                role.event("claimed", f"{role.name} has {role.vehicle}", session)
+                role.event("claimed", f"{role.name} has {role.vehicle}", session, measured)
         if self._machine.state is not before:
             self._status_due = 0
 
@@ -225,6 +255,8 @@ class Daemon:
         self._granted = self._plant is not None and self._plant.session == self._claimant.session
         self._machine.fire(Trigger.GRANT)
         assert self._claimant.session is not None
+        self._trace.session = self._claimant.session
+        self._trace.state = self._controller.state.model_dump(mode="json")
         self._live.begin(self._controller, self._claimant.session)
         return link
 
@@ -243,13 +275,14 @@ class Daemon:
         self._machine.fire(Trigger.LOST)
         self._lost = reason
         text = f"{reason}: stopped commanding, looking for {self._role.vehicle}"
-        self._role.event("lost", text, self._claimant.session)
+        self._role.event("lost", text, self._claimant.session, self._last_computed)
         return False
 
     def _end(self, link: ZenohLink) -> None:
         if self._timing:
             self._timing.pause()
         self._live.end()
+        self._role.publish_bytes("trace", self._trace.take(time.monotonic_ns(), time.time_ns(), final=True))
         self._claimant.release()
         link.close()
         self._status_due = 0
@@ -276,7 +309,8 @@ class Daemon:
             return Answer(done=False, text=f"{name} does not have {vehicle}")
         self._machine.fire(Trigger.STAND_DOWN)
         self._lost = "released by an operator"
-        self._role.event("released", f"{self._lost}: {name} holds until `aeroloop op arm`", self._claimant.session)
+        text = f"{self._lost}: {name} holds until `aeroloop op arm`"
+        self._role.event("released", text, self._claimant.session, self._last_computed)
         return Answer(done=True, text=f"{name} gives {vehicle} back and holds until `aeroloop op arm`")
 
     def _recall(self) -> Answer:
@@ -308,7 +342,12 @@ class Daemon:
         self._claimant.auto_arm = settings.auto_arm
         self._telemetry_every = max(1, round(self._loop.rate_hz / settings.telemetry_rate_hz))
 
-    # ── what it tells ──
+    @property
+    def _last_computed(self) -> int | None:
+        """The last tick that was answered; None before the first."""
+        return self._controller.tick_index if self._controller.tick_index >= 0 else None
+
+    # ── what it publishes ──
 
     def _publish_telemetry(self) -> None:
         assert self._claimant.session is not None
@@ -334,6 +373,7 @@ class Daemon:
                 received=self._received,
                 sent=self._sent,
                 refused=self._refused + self._controller.refused + self._live.refused,
+                stale=self._stale,
                 saturated=self._saturated + self._controller.saturated,
                 age_us=summary(self._age.recent()),
                 timing=report(self._timing) if self._timing else None,

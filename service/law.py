@@ -169,10 +169,9 @@ def received(eps: ca.SX, last: ca.SX) -> ca.SX:
         last: The q^Q before. Shape (4,).
     """
     square = ca.dot(eps, eps)
-    inside = square <= 1
-    eta = ca.if_else(inside, ca.sqrt(1 - square), 0)  # (C.11)
-    q = ca.vertcat(eta, eps / ca.if_else(inside, 1, ca.sqrt(square)))  # Remark 2
-    return q * ca.if_else(ca.dot(q, last) < 0, -1, 1)
+    eta = ca.sqrt(ca.fmax(0, 1 - square))  # (C.11)
+    q = ca.vertcat(eta, eps / ca.sqrt(ca.fmax(1, square)))  # Remark 2
+    return q * (1 - 2 * (ca.dot(q, last) < 0))
 
 
 class Steps(NamedTuple):
@@ -208,7 +207,7 @@ def law_steps(p: LawSettings, period: float) -> Steps:
     theta_next *= ca.fmin(1, p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
     errors = law.q, law.omega, law.q_d, law.omega_d
     return Steps(
-        ca.Function("attitude", [last, eps], [received(eps, last)]),
+        ca.Function("attitude", [last, eps], [received(eps, last)], ["last", "eps"], ["q"]),
         ca.Function("adaptation", [*errors, law.s, law.C1, law.C2, law.Gamma], [law.tau]),
         ca.Function("estimate", [law.theta, tau, law.Gamma], [theta_next]),
         ca.Function(

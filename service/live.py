@@ -1,8 +1,8 @@
 """What may change while the controller runs: its gains and its reference, at an operator's word.
 
 Requests come in threads of Zenoh's. What takes time is done there; what touches the controller waits for the loop,
-which takes it between two ticks. Every change is told on `change` with the tick from which it holds, so that a log can
-be computed again, and the next session starts with what the last one ended with.
+which takes it between two ticks. Every change is in the trace with the tick from which it holds, so that a log can be
+computed again, and the next session starts with what the last one ended with.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from protocol import topics
 from protocol.attitude import Vector, distance, to_euler
 from protocol.role import Role
+from protocol.trace import TraceWriter
 from protocol.verbs import Answer, Change, Gains, Hold, Points, Reference, Setpoint, Stream, Track
 from service.assurance import Assurance, gains_of
 from service.controller import Controller
@@ -51,6 +52,7 @@ class Live:
         law: The gains to begin with.
         reference: The reference to begin with.
         settings: How far a reference may go.
+        trace: Where changes are written down.
         assurance: What the theorem promises of it; nobody asks if None.
         rolls: Whether the vehicle can roll.
 
@@ -64,11 +66,13 @@ class Live:
         law: LawSettings,
         reference: Reference,
         settings: ControllerSettings,
+        trace: TraceWriter,
         assurance: Assurance | None = None,
         *,
         rolls: bool,
     ) -> None:
         self._role = role
+        self._trace = trace
         self._assurance = assurance
         self._rolls = rolls
         self._gains = gains_of(law)
@@ -127,7 +131,8 @@ class Live:
         controller.set_gains(self._gains)
         controller.motion.follow(Plan.of(self._reference), 0.0, 0.0)
         self._placed = False
-        self._role.publish("change", Change(session=session, tick=0, gains=self._gains, reference=self._reference))
+        first = Change(session=session, tick=0, gains=self._gains, reference=self._reference)
+        self._trace.changes.append(first)
 
     def end(self) -> None:
         """The session is over."""
@@ -163,7 +168,7 @@ class Live:
         controller.motion.follow(target, t, within_s, start=start)
         self._tell(reference=self._reference, within_s=within_s, start=start)
         text = f"begins {away:.0f}° away from its reference: goes there within {within_s:.1f} s"
-        self._role.event("changed", text, self._session)
+        self._role.event("changed", text, self._session, self._k)
 
     # ── what can be asked ──
 
@@ -211,7 +216,7 @@ class Live:
         self._gains = controller.gains
         self._tell(gains=gains)
         text = ", ".join(f"{name} = {list(value)}" for name, value in gains if value is not None)
-        self._role.event("changed", f"gains set: {text or 'nothing'}", self._session)
+        self._role.event("changed", f"gains set: {text or 'nothing'}", self._session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle}: {text or 'no gain was given, so none has changed'}")
 
     def track(self, reference: Reference, within_s: float) -> Callable[[], Answer]:
@@ -232,7 +237,7 @@ class Live:
             self._heard = time.monotonic()
             self._tell(reference=held, within_s=within_s)
             text = f"{_described(reference)} within {within_s:g} s"
-            self._role.event("changed", text, self._session)
+            self._role.event("changed", text, self._session, self._k)
             return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
         return follow
@@ -256,7 +261,7 @@ class Live:
             if self._heard and now - self._heard > stream.timeout_s:
                 self._heard = 0.0
                 text = f"no set-point for {stream.timeout_s:g} s: holds the last one"
-                self._role.event("lost", text, self._session)
+                self._role.event("lost", text, self._session, self._k)
             return
         (hold, plan), self._setpoint, self._heard = self._setpoint, None, now
         motion, t = self._running().motion, self._time
@@ -300,4 +305,4 @@ class Live:
             ease_s=ease_s,
             start=start,
         )
-        self._role.publish("change", change)
+        self._trace.changes.append(change)

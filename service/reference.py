@@ -33,6 +33,8 @@ _TURNS: Final = 8
 _MOST_SAMPLES: Final = 100_000
 _SLOWER: Final = 1.05
 _TRIES: Final = 8
+_LONGEST_S: Final = 3600.0
+"""A way that would take longer begins too fast for any: it is tried again with an ease."""
 
 
 class FollowError(AeroloopError):
@@ -337,7 +339,7 @@ class Motion:
                 fastest = target.joined(here, t, within_s, ease_s).fastest()
                 if fastest <= limits.rate:
                     return within_s, ease_s
-                within_s *= _SLOWER * fastest / limits.rate
+                within_s = min(within_s * _SLOWER * fastest / limits.rate, _LONGEST_S)
         return within_s, least
 
     def _here(self, t: float) -> Angles:

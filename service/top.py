@@ -105,7 +105,7 @@ def _flight(vehicle: Vehicle) -> Text:
 
 def _roles(vehicle: Vehicle) -> Table:
     table = Table(
-        "role", "state", "rate", "skipped", "latency", "sample age", "wake-up", "told", "", box=None, pad_edge=False
+        "role", "state", "rate", "skipped", "latency", "answers in", "wake-up", "told", "", box=None, pad_edge=False
     )
     for role, (heard, status) in sorted(vehicle.statuses.items()):
         latency, timing = status.latency_us, status.timing

@@ -63,7 +63,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
     link = CanLink(bus, wire, end, lockstep=lockstep)  # type: ignore[arg-type]  # is one of both
     try:
         with Stranger(bus) as stranger:
-            frame = bytes(2) if end == "plant" else bytes(7)
+            frame = bytes(3) if end == "plant" else bytes(7)
             identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
             stranger.say(identifier, frame)
             stranger.say(identifier, SILENCE)
@@ -155,7 +155,7 @@ def test_commands_that_stop_trip_the_bridge_though_the_last_is_held() -> None:
 
 
 def test_in_real_time_a_loop_over_a_bus_goes_on_with_fewer_frames(tmp_path: Path) -> None:
-    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
     with Hil(tmp_path, plant="can-node") as hil:
         hil.start(settings={**patient, "wire.transmit": "on_change"})
         hil.run(1.5)

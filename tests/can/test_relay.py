@@ -116,7 +116,7 @@ def test_measurements_of_before_the_session_are_dropped() -> None:
     assert it.refused == 0
 
 
-@pytest.mark.parametrize("frame", [b"", bytes(6), bytes(8), bytes(6) + b"\1"])
+@pytest.mark.parametrize("frame", [b"", bytes(6), bytes(8)])
 def test_a_malformed_measurement_is_counted_and_does_not_pass(frame: bytes) -> None:
     it = granted()
     assert it.measurement(measurement(0)) is not None
@@ -125,7 +125,7 @@ def test_a_malformed_measurement_is_counted_and_does_not_pass(frame: bytes) -> N
     assert it.measurement(measurement(1)) is not None
 
 
-@pytest.mark.parametrize("frame", [b"", bytes(1), bytes(3)])
+@pytest.mark.parametrize("frame", [b"", bytes(2), bytes(4), bytes(2) + b"\1"])
 def test_a_malformed_command_is_counted_and_neither_passes_nor_feeds_the_watchdog(frame: bytes) -> None:
     it = driven()
     assert it.command(frame, NOW + WATCHDOG_NS) is None
@@ -396,7 +396,7 @@ class Bus:
         def driven() -> bool:
             arrival = self.side.take()
             if arrival is not None:
-                self.side.send(command(arrival.frame[0] >> 4, code))
+                self.side.send(command(arrival.frame[0], code))
             return self.endpoint.state is PlantState.DRIVEN
 
         self.until("the first command", driven)
@@ -407,7 +407,7 @@ class Bus:
 
         def come() -> bool:
             messages = self.stranger.everything()
-            seen.extend(message.data[0] >> 4 for message in messages if message.arbitration_id == MEASUREMENT_ID + 1)
+            seen.extend(message.data[0] for message in messages if message.arbitration_id == MEASUREMENT_ID + 1)
             return len(seen) >= least
 
         self.until("measurements", come)
@@ -439,7 +439,7 @@ def test_a_session_begins_when_the_other_side_says_granted_and_counts_from_0(bus
     assert bus.front.link is not None
     bus.hears(PlantState.GRANTED)
     seen = bus.counters(40)
-    assert seen == [k % 16 for k in range(len(seen))]
+    assert seen == list(range(len(seen)))
 
 
 def test_a_command_drives_it_and_the_heartbeat_says_so_at_once(bus: Bus) -> None:
@@ -547,7 +547,7 @@ def test_another_number_is_another_session(bus: Bus) -> None:
     bus.hears(PlantState.GRANTED)
     seen = bus.counters(40)
     start = next(i for i in range(len(seen)) if seen[i : i + 16] == list(range(16)))
-    assert seen[start:] == [k % 16 for k in range(len(seen) - start)]
+    assert seen[start:] == list(range(len(seen) - start))
 
 
 def test_a_session_begins_afresh_with_counter_0_whatever_the_last_one_came_to(bus: Bus) -> None:

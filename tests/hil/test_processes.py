@@ -19,13 +19,13 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 from mcap.records import Channel
+from service.logs.mcap_file import records
 
 from protocol import topics
 from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
 from service.logs.files import ReviewError
-from service.logs.mcap_file import records
 from service.logs.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
@@ -35,7 +35,7 @@ START_S = 30.0
 """Slack for starting processes: each takes about 1 s of CPU here, and CI may have other work."""
 
 
-PATIENT = ("--set", "plant.watchdog_s=2", "--set", "controller.stale_s=2")
+PATIENT = ("--set", "plant.watchdog_s=2", "--set", "controller.stale_s=2", "--set", "wire.counter_bits=11")
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 
 

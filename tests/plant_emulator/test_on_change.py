@@ -12,12 +12,11 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.plant import Measurement
 from protocol.attitude import IDENTITY, Vector
-from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant
 from protocol.states import PlantState, TripCause
 from protocol.transmit import SILENCE, Policy, Transmit
 from protocol.wire import WireSpec
-from tests.plant_emulator.test_endpoint import OFF, PERIOD_NS, WATCHDOG_TICKS, Notebook
+from tests.plant_emulator.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, Notebook
 
 HEARTBEAT = 15
 """Ticks: 30 ms of 2 ms."""
@@ -87,9 +86,9 @@ def test_a_plant_at_rest_sends_heartbeats_only_and_a_change_at_once(lockstep: bo
             sent[k] = BOTH.measurement.unpack(frame)
     assert sent == {
         15: (15, (0,) * 6),
-        30: (14, (0,) * 6),
-        40: (8, (0, 0, 0, 64, 0, 0)),
-        55: (7, (0, 0, 0, 64, 0, 0)),
+        30: (30, (0,) * 6),
+        40: (40, (0, 0, 0, 64, 0, 0)),
+        55: (55, (0, 0, 0, 64, 0, 0)),
     }
 
 

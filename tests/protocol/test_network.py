@@ -134,13 +134,12 @@ def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:
         hears(Listener(alone, "t/word"), caller, b"found")
 
 
-@pytest.mark.parametrize("timestamps", [True, False])
-def test_messages_are_stamped_for_the_log_unless_told_otherwise(timestamps: bool) -> None:
+def test_messages_bear_no_time_of_zenohs() -> None:
+    """A frame carries what the loop needs and no more; a log's times are in attachments."""
     with Gathering() as gathering:
-        settings = gathering.settings.model_copy(update={"timestamps": timestamps})
-        speaker, ear = gathering.join(settings), Listener(gathering.join(settings), "t/word")
+        speaker, ear = gathering.join(gathering.settings), Listener(gathering.join(gathering.settings), "t/word")
         hears(ear, speaker, b"now")
-        assert set(ear.stamped) == {timestamps}
+        assert set(ear.stamped) == {False}
 
 
 @pytest.mark.parametrize("broken", [{"lease_ms": 99}, {"lease_ms": 60_001}, {"listen": "tcp/127.0.0.1:0"}, {"port": 1}])

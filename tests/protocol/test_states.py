@@ -22,7 +22,6 @@ from plant_emulator.plant import Measurement, Plant
 from protocol import clock
 from protocol.attitude import IDENTITY
 from protocol.clock import Throttle
-from protocol.frames import COUNTERS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import (
     CONTROLLER_TABLE,
@@ -119,6 +118,7 @@ def test_no_state_of_a_controller_is_without_a_way_back() -> None:
 # The plant end, foretold
 
 WIRE = WireSpec()
+COUNTERS: Final = WIRE.measurement.counters
 PERIOD_NS = 20_000_000
 WATCHDOG_PERIODS = 5
 """0.1 s of 20 ms."""

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.messages import model_of
-from protocol.topics import EVERYTHING, NAME, TOPICS, Address, Topic, key, read_key
+from protocol.topics import FRAMES, NAME, RECORDED, TOPICS, Address, Topic, key, read_key
 from protocol.verbs import Message
 
 every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS))
@@ -40,9 +40,10 @@ def test_what_is_left_out_of_a_key_is_a_wildcard(topic: Topic) -> None:
     assert not pattern.intersects(zenoh.KeyExpr(key(topic.name, "other", session="s1", role="plant")))
 
 
-@every_topic
-def test_the_recorder_s_key_includes_every_topic(topic: Topic) -> None:
-    assert zenoh.KeyExpr(EVERYTHING).includes(zenoh.KeyExpr(key(topic.name, "aero", session="s1", role="plant")))
+def test_what_is_published_is_either_recorded_or_a_frame() -> None:
+    published = [topic.name for topic in TOPICS.values() if topic.carries not in ("query", "token")]
+    assert sorted(RECORDED + FRAMES) == sorted(published)
+    assert FRAMES == ("measurement", "command")
 
 
 @every_topic

@@ -6,6 +6,7 @@ product of equal numbers.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,7 +15,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from service.law import Law, LawSettings, build_law, law_function, projection
+from protocol.attitude import IDENTITY, Quaternion, received_quaternion
+from protocol.symbolic import Compiled
+from service.law import Law, LawSettings, build_law, law_function, law_steps, projection
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of
@@ -34,6 +37,11 @@ class Point:
     omega_d_dot: Array
     theta: Array
     true_theta: Array
+
+
+def _sent(q: Array) -> Array:
+    """ε on the wire: of whichever of ±q has η ≥ 0."""
+    return q[1:] if q[0] >= 0 else -q[1:]
 
 
 def _unit(rng: np.random.Generator, size: int) -> Array:
@@ -175,7 +183,8 @@ def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -
         x = _point(rng, 0.5 * p.damping_bound)  # so far inside k_θ that a period does not lead out
         expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
         tick = law_function(p, period)(
-            q=x.q,
+            eps=_sent(x.q),
+            last=x.q,
             omega=x.omega,
             q_d=x.q_d,
             omega_d=x.omega_d,
@@ -317,7 +326,8 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
     for k in range(3000):
         if k % 300 == 0:
             x = _point(rng, p.damping_bound)  # another drive, kept long enough to press against the bound
-        theta = _array(tick(x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, theta, 1.0, p.C1, p.C2, p.Gamma)[1])
+        desired = x.q_d, x.omega_d, x.omega_d_dot
+        theta = _array(tick(x.q, theta, _sent(x.q), x.omega, *desired, 1.0, p.C1, p.C2, p.Gamma)[2])
         pressed += bool(np.linalg.norm(theta) > 0.95 * p.damping_bound)
         # scaling to a length of k_θ rounds in the last place
         assert np.linalg.norm(theta) <= p.damping_bound * (1 + 1e-15)
@@ -337,3 +347,19 @@ def test_an_allocation_without_inverse_is_refused(allocation: tuple[tuple[float,
         build_law(settings)
     with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
         law_function(settings, 0.002)
+
+
+def test_attitudes_are_received_to_the_bits_of_the_plain_function() -> None:
+    """Whether the last pointed away, along, or at a right angle, or ε was longer than 1, or −0."""
+    corners = [0.0, -0.0, 0.6, -0.6, 0.8, -0.8, 1.0, -1.0, 1.3, 1e200]
+    rng = np.random.default_rng(0)
+    step = Compiled(law_steps(LawSettings(), 0.002).attitude)
+    last, eps, q = step.inputs["last"], step.inputs["eps"], step.outputs["q"]
+    starts: list[Quaternion] = [IDENTITY, (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.6, -0.8)]
+    for before in starts:
+        now = before
+        for x, y, z in rng.choice(corners, size=(2000, 3), p=[0.25, 0.05, *[0.1] * 6, 0.05, 0.05]).tolist():
+            last[:], eps[:] = memoryview(array("d", now)), memoryview(array("d", (x, y, z)))
+            step()
+            now = received_quaternion(x, y, z, now)
+            assert q.tobytes() == array("d", now).tobytes()

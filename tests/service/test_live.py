@@ -6,21 +6,20 @@ through the callbacks that were declared. Time stands still unless the test move
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
 from math import acos, atan2, degrees, hypot, radians, sin
 from typing import Any, Final, TypeVar
 
 import pytest
-import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol import clock, role, topics
-from protocol.frames import COUNTERS
 from protocol.messages import Event
 from protocol.network import NetworkSettings
 from protocol.role import Role
+from protocol.trace import TraceWriter
 from protocol.verbs import (
     Answer,
     Change,
@@ -100,11 +99,6 @@ class Network:
         self.queryables: dict[str, Callable[[Any], None]] = {}
         self.subscribers: dict[str, Callable[[Any], None]] = {}
 
-    def declare_publisher(self, key: str, encoding: zenoh.Encoding) -> Publisher:
-        """Something to put on a key."""
-        assert encoding == zenoh.Encoding.APPLICATION_JSON
-        return Publisher(self, key)
-
     def declare_queryable(self, key: str, callback: Callable[[Any], None], *, complete: bool) -> None:
         """Keep the callback."""
         assert complete
@@ -130,6 +124,14 @@ class Publisher:
     def put(self, payload: bytes) -> None:
         """Keep the bytes."""
         self.network.put.append((self.key, payload))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def publishers() -> Iterator[None]:
+    """What a role publishes stays on the network of the test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(role, "CachedPublisher", lambda network, key, *_, **__: Publisher(network, key))
+        yield
 
 
 class FakeTime:
@@ -159,10 +161,11 @@ class Loop:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(role, "join", lambda _: self.network)
-            self.role = Role("controller", "aero", NetworkSettings(timestamps=False), {}, name="controller-7")
+            self.role = Role("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
         self.assurance = Assurance(self.role, wire or WIRE, LAW, reference, settings)
-        self.live = Live(self.role, LAW, reference, settings, self.assurance if wire else None, rolls=rolls)
+        self.trace = TraceWriter("controller", WIRE, 1, 10**8)
+        self.live = Live(self.role, LAW, reference, settings, self.trace, self.assurance if wire else None, rolls=rolls)
         self.live.serve()
         self.controller = self.fresh()
         self.k = 0
@@ -189,7 +192,7 @@ class Loop:
 
     def tick(self, codes: list[float] | None = None) -> bytes | None:
         """A measurement comes, at rest and level unless given, and is answered."""
-        frame = WIRE.measurement.pack(self.k % COUNTERS, codes or [0.0] * 6)
+        frame = WIRE.measurement.pack(self.k % WIRE.measurement.counters, codes or [0.0] * 6)
         self.live.before_tick(self.k, frame)
         command = self.controller.tick(frame, self.k)
         self.log[self.session].append((self.k, frame, command))
@@ -232,7 +235,7 @@ class Loop:
 
     def changes(self) -> list[Change]:
         """Every change of this session, as a log has it."""
-        return [change for change in self.told("change", Change) if change.session == self.session]
+        return [change for change in self.trace.changes if change.session == self.session]
 
     def events(self, kind: str) -> list[str]:
         """What was told of a kind."""
@@ -248,7 +251,7 @@ class Loop:
         """From the configuration, the frames and the changes, as the review does: byte for byte."""
         for session, ticks in self.log.items():
             again = self.fresh()
-            changes = [change for change in self.told("change", Change) if change.session == session]
+            changes = [change for change in self.trace.changes if change.session == session]
             for k, frame, command in ticks:
                 while changes and changes[0].tick <= k:
                     again.apply(changes.pop(0))
@@ -613,7 +616,7 @@ def test_the_next_session_begins_with_the_gains_and_the_reference_of_now(loop: L
     assert loop.changes() == [Change(session="s1", tick=0, gains=gains, reference=SWING)]
     expected = Controller(WIRE, LawSettings(C2=(0.4, 0.4, 0.4)), SWING, PERIOD)
     for k in range(100):
-        assert loop.tick() == expected.tick(WIRE.measurement.pack(k % COUNTERS, [0.0] * 6), k)
+        assert loop.tick() == expected.tick(WIRE.measurement.pack(k % WIRE.measurement.counters, [0.0] * 6), k)
 
 
 def test_the_next_session_waits_where_the_stream_has_left_it_and_goes_on_with_it(streaming: Loop) -> None:

@@ -58,7 +58,7 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
             event=Event(role="plant", kind="tripped", text="no fresh command for 100 ms: 0 V"),
         )
     )
-    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "28.0 + 8.0 kbit/s", "no fresh command for 100 ms"):
+    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "28.0 + 12.0 kbit/s", "no fresh command for 100 ms"):
         assert words in shown
 
 
@@ -68,12 +68,12 @@ def test_where_only_changes_are_sent_the_bits_are_those_of_the_frames_that_were(
     for uptime_s, sent in ((1.0, 40), (3.0, 440), (3.1, 441)):  # the last says nothing of a rate
         told = status("controller", "running").model_copy(update={"uptime_s": uptime_s, "sent": sent, "received": 10})
         top.hear("aeroloop/aero/status/controller", told.encode())
-    assert "28.0 + 3.2 kbit/s" in text(top)  # 500 measurements of 7 bytes, 200 commands of 2
+    assert "28.0 + 4.8 kbit/s" in text(top)  # 500 measurements of 7 bytes, 200 commands of 3
     again = status("controller", "running").model_copy(update={"uptime_s": 0.5, "sent": 3})
     after = again.model_copy(update={"uptime_s": 1.5, "sent": 103})
     for told in (again, after):  # started anew, and so are its counts
         top.hear("aeroloop/aero/status/controller", told.encode())
-    assert "28.0 + 1.6 kbit/s" in text(top)
+    assert "28.0 + 2.4 kbit/s" in text(top)
 
 
 def test_a_role_that_fell_silent_is_shown_so() -> None:

@@ -141,9 +141,9 @@ def test_values_at_the_outermost_level_are_counted_by_signal(whole: Path, tmp_pa
     def full(one: Said) -> Said:
         k = tick_of(one)
         if one.topic == "command" and k in (420, 421):
-            return one._replace(data=wire.command.pack(k % 16, (-31, 31 if k == 421 else 30)))
+            return one._replace(data=wire.command.pack(k % 256, (-31, 31 if k == 421 else 30)))
         if one.topic == "measurement" and 430 <= k < 440:
-            return one._replace(data=wire.measurement.pack(k % 16, (126, 0, 0, 0, 0, -127)))
+            return one._replace(data=wire.measurement.pack(k % 256, (126, 0, 0, 0, 0, -127)))
         return one
 
     clean, findings = found(whole), found(retell(whole, tmp_path / "a.mcap", full))
@@ -158,9 +158,9 @@ def test_frames_without_a_valid_value_are_counted_and_are_answered(whole: Path, 
     def dead(one: Said) -> Said:
         k = tick_of(one)
         if 430 <= k < 437 and one.topic == "measurement":
-            return one._replace(data=wire.measurement.pack(k % 16, (0, 0, 0, 0, -128, 0)))
+            return one._replace(data=wire.measurement.pack(k % 256, (0, 0, 0, 0, -128, 0)))
         if 430 <= k < 437 and one.topic == "command":
-            return one._replace(data=wire.command.pack(k % 16, (-32, -32)))
+            return one._replace(data=wire.command.pack(k % 256, (-32, -32)))
         return one
 
     findings = found(retell(whole, tmp_path / "a.mcap", dead))

@@ -1,0 +1,96 @@
+"""Cached publication: what a late, restarted or interrupted subscriber gets, between two Zenoh sessions on loopback."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from protocol.publication import CachedPublisher, Received, RecoveringSubscriber
+from tests.protocol.gathering import Gathering, eventually
+
+KEY = "aeroloop/aero/trace/plant"
+ANY = "aeroloop/*/trace/*"
+
+
+@pytest.fixture
+def network() -> Iterator[Gathering]:
+    with Gathering() as gathering:
+        yield gathering
+
+
+def payload(i: int) -> bytes:
+    return f"{i:06}".encode() + bytes(2000)
+
+
+def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Received]:
+    """What is received until there is so much of it."""
+    found: list[Received] = []
+    eventually("receiving", lambda: found.extend(subscriber.take()) or len(found) >= wanted)
+    time.sleep(0.05)  # a duplicate would follow at once
+    found.extend(subscriber.take())
+    return found
+
+
+def assert_complete(received: list[Received], count: int) -> None:
+    assert [int(each.payload[:6]) for each in received] == list(range(count))
+    assert [each.sequence for each in received] == list(range(count))
+    assert {each.key for each in received} == {KEY}
+    assert len({str(each.source) for each in received}) == 1
+
+
+def test_a_subscriber_that_comes_late_or_again_gets_everything_in_order_and_once(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(network.settings), KEY, per_s=10)
+    before_ns = time.time_ns()
+    for i in range(300):
+        publisher.put(payload(i))
+    for _ in range(2):
+        session = network.join(network.settings)
+        subscriber = RecoveringSubscriber(session, ANY)
+        received = collect(subscriber, 300)
+        assert_complete(received, 300)
+        stamps = [each.published_ns or 0 for each in received]
+        assert before_ns <= stamps[0]
+        assert stamps == sorted(stamps)
+        session.close()
+
+
+def test_a_cache_keeps_what_it_is_made_for_and_no_more(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(network.settings), KEY, per_s=2)
+    for i in range(1000):
+        publisher.put(payload(i))
+    received = collect(RecoveringSubscriber(network.join(network.settings), ANY), 130)
+    assert [each.sequence for each in received] == list(range(870, 1000))  # 65 s of 2 a second
+
+
+def test_what_finds_no_room_to_wait_shows_as_a_gap_in_the_sequence(network: Gathering) -> None:
+    """The newest are kept."""
+    publisher = CachedPublisher(network.join(network.settings), KEY, per_s=1)
+    subscriber = RecoveringSubscriber(network.join(network.settings), ANY, waiting=10)
+    for i in range(3):
+        publisher.put(payload(i))
+    assert_complete(collect(subscriber, 3), 3)
+    for i in range(3, 40):  # the ring of the subscriber holds ten
+        publisher.put(payload(i))
+    found: list[Received] = []
+    time.sleep(0.2)  # nothing is taken meanwhile, so the ring overflows
+    eventually("receiving", lambda: found.extend(subscriber.take()) or (bool(found) and found[-1].sequence == 39))
+    assert [each.sequence for each in found] == list(range(40 - len(found), 40))
+
+
+def test_a_plain_publisher_is_received_too_and_says_no_time(network: Gathering) -> None:
+    session = network.join(network.settings)
+    subscriber = RecoveringSubscriber(network.join(network.settings), ANY)
+    found: list[Received] = []
+
+    def received() -> bool:
+        session.put(KEY, b"plain")
+        found.extend(subscriber.take())
+        return bool(found)
+
+    eventually("receiving", received)
+    assert found[0][:2] == (KEY, b"plain")
+    assert found[0].published_ns is None
+    assert isinstance(session, zenoh.Session)
