@@ -1,29 +1,152 @@
-"""A log made without a network: a closed loop in lockstep, its messages written as the recorder writes them."""
+"""Logs made without a network: a controller and an emulated plant, their traces written as the recorder writes them.
+
+Both ends are the project's own parts: the emulator with its trace, the controller with its tick source and its trace.
+Only the network and the clocks are made up, so what the log should say is known.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
+import random
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final, NamedTuple
+from unittest.mock import patch
 
-from plant_emulator.emulator import truth_of
-from plant_emulator.endpoint import Endpoint
+import zenoh
+
+from plant_emulator.emulator import Emulator, truth_of
+from plant_emulator.faults import Fault
+from plant_emulator.plant_trace import PlantTrace
 from protocol import topics
-from protocol.messages import Claim, Contract
+from protocol.links import Arrival, Link
+from protocol.messages import PROTOCOL_VERSION, Claim, Contract, Event, Grant
+from protocol.publication import Received as Message
+from protocol.trace import End, Received, Sent, TraceWriter, read_batch
+from protocol.transmit import SILENCE
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
-from service.recording.intake import Taken
-from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from service.logs.mcap_file import CONTRACT_METADATA
 from service.recording.log_file import LogFile
-from service.reference import Plan
 from service.telling import telemetry_of
+from service.tick_source import MAILBOX, PlantTick, TickSource
 
-START_NS = 1_800_000_000_000_000_000
+START_NS: Final = 1_800_000_000_000_000_000
+"""When tick 0 is measured, on the plant's wall clock."""
 VEHICLE, SESSION = "aero", "s1"
+MONOTONIC_NS: Final[dict[End, int]] = {"plant": 3_600_000_000_000, "controller": 86_400_000_000_000}
+"""The same instant on either end's monotonic clock: they were booted at different times."""
+AHEAD_NS: Final = 10_000_000_000
+"""The controller's wall clock is so far ahead of the plant's."""
+ONE_WAY_NS: Final = 150_000
+"""What a frame takes either way, where nothing goes wrong."""
+RUNS: Final[dict[End, int]] = {"plant": 0x1111, "controller": 0x2222}
+
+Changes = dict[int, tuple[Gains | None, Reference | None]]
 
 
 def lockstep() -> Settings:
     return load(overrides=["loop.lockstep=true"])
+
+
+class Clock:
+    """One end's clocks, as `time` for its modules."""
+
+    def __init__(self, end: End, drift: float = 0.0) -> None:
+        self.now_ns = 0  # since tick 0, for everybody
+        self._monotonic_ns = MONOTONIC_NS[end]
+        self._wall_ns = START_NS + (AHEAD_NS if end == "controller" else 0)
+        self._rate = 1.0 + drift
+
+    def at(self, now_ns: int) -> int:
+        """Its monotonic clock at an instant [ns]."""
+        return self._monotonic_ns + round(now_ns * self._rate)
+
+    def monotonic_ns(self) -> int:
+        return self.at(self.now_ns)
+
+    def time_ns(self) -> int:
+        return self._wall_ns + self.now_ns
+
+
+class Logged(NamedTuple):
+    """A message, when it was recorded, and when it was published on its publisher's wall clock [ns]."""
+
+    at_ns: int
+    key: str
+    payload: bytes
+    published_ns: int
+
+
+class Messages:
+    """What is to be recorded, in order."""
+
+    def __init__(self) -> None:
+        self.all: list[Logged] = []
+
+    def add(self, name: str, payload: bytes, clock: Clock, role: str = "controller") -> None:
+        key = topics.key(name, VEHICLE, session=SESSION, role=role)
+        self.all.append(Logged(START_NS + clock.now_ns, key, payload, clock.time_ns()))
+
+
+def contract(settings: Settings, role: str) -> Contract:
+    return Contract(
+        protocol=PROTOCOL_VERSION, role=role, vehicle=VEHICLE, host="h", versions={}, config=settings.contract()
+    )
+
+
+def write(
+    path: Path, settings: Settings, messages: list[Logged], chunk_every: int = 50, roles: tuple[str, ...] = ("controller", "plant")
+) -> Path:
+    """Write a log with both roles' contracts and these messages."""
+    path.unlink(missing_ok=True)
+    log = LogFile(path)
+    for role in roles:
+        key = topics.key("contract", VEHICLE, role=role)
+        log.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract(settings, role).model_dump_json()})
+    numbers: Counter[str] = Counter()
+    for i, (at_ns, key, payload, published_ns) in enumerate(messages):
+        log.add(Message(key, payload, numbers[key], published_ns, None), at_ns)
+        numbers[key] += 1
+        if i % chunk_every == chunk_every - 1:
+            log.commit()
+    log.end()
+    return path
+
+
+class ControllerEnd:
+    """The controller and its trace, as the daemon runs them."""
+
+    def __init__(self, settings: Settings, messages: Messages, clock: Clock, session: str = SESSION, run: int = RUNS["controller"]) -> None:
+        self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self.trace = TraceWriter("controller", settings.wire, run, round(settings.loop.trace_s * 1e9))
+        self.trace.session = session
+        self._messages, self._clock, self._period = messages, clock, settings.loop.period
+        self.trace.state = self.controller.state.model_dump(mode="json")
+        first = Change(session=session, tick=0, gains=self.controller.gains, reference=settings.reference)
+        self.trace.changes.append(first)
+
+    def follow(self, k: int, gains: Gains | None, reference: Reference | None) -> None:
+        change = Change(session=self.trace.session, tick=k, gains=gains, reference=reference, within_s=1.0)
+        self.controller.apply(change)
+        self.trace.changes.append(change)
+
+    def record(self, tick: PlantTick, command: bytes | None, sent_ns: int) -> None:
+        sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
+        self.trace.controller_row(
+            max(tick.tick, 0), tick.received_as, sent_as, tick.at_ns, sent_ns if command is not None else 0,
+            tick.frame, command or b"",
+        )  # fmt: skip
+        if self.trace.due(self._clock.monotonic_ns()):
+            self.publish()
+            self.trace.state = self.controller.state.model_dump(mode="json")
+
+    def publish(self, *, final: bool = False) -> None:
+        payload = self.trace.take(self._clock.monotonic_ns(), self._clock.time_ns(), final=final)
+        self._messages.add("trace", payload, self._clock, "controller")
 
 
 def make_log(
@@ -32,78 +155,76 @@ def make_log(
     *,
     settings: Settings | None = None,
     begin: int = 0,
-    changes: dict[int, tuple[Gains | None, Reference | None]] | None = None,
+    changes: Changes | None = None,
     spoil: int | None = None,
     chunk_every: int = 100,
     truth_every: int = 0,
 ) -> None:
-    """Write a log.
+    """Write a log of a loop in which nothing goes wrong.
 
     Args:
         path: Where.
         ticks: How many ticks the loop runs.
         settings: Its configuration.
-        begin: The tick at which the recorder comes.
+        begin: Batches before this tick are not recorded.
         changes: Gains and reference that an operator sets, by tick.
         spoil: The tick whose command is not logged as it was sent.
-        chunk_every: Close a chunk after so many ticks.
-        truth_every: Tell the true state every so many ticks; 0 is never.
+        chunk_every: Close a chunk after so many messages.
+        truth_every: Publish the true state every so many ticks; 0 is never.
     """
     settings = settings or lockstep()
     wire, loop, changes = settings.wire, settings.loop, changes or {}
-    plant = settings.plant.build(loop.period)
-    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True)
-    endpoint.claim(
-        Claim(controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
-    )
-    controller = Controller(wire, settings.law, settings.reference, loop.period)
-    path.unlink(missing_ok=True)
-    log = LogFile(path)
-    sequences: Counter[str] = Counter()
-
-    def write(name: str, payload: bytes, at_ns: int) -> None:
-        key = topics.key(name, VEHICLE, session=SESSION, role="controller")
-        sequences[key] += 1
-        log.add(Taken(key, payload, at_ns, at_ns), sequences[key])
-
-    contract = Contract(role="controller", vehicle=VEHICLE, host="h", versions={}, config=settings.contract())
-    key = topics.key("contract", VEHICLE, role="controller")
-    log.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract.model_dump_json()})
-    first = Change(session=SESSION, tick=0, gains=controller.gains, reference=settings.reference)
-    if begin:  # as in a file that another one has gone before
-        key = topics.key("change", VEHICLE)
-        log.add_metadata(CHANGE_METADATA, {"key": key, "json": first.model_dump_json()})
-    else:
-        write("change", first.encode(), START_NS - 1)
-    measurement = endpoint.tick(None, 0)
-    for k in range(ticks):
-        assert measurement is not None
-        at = START_NS + k * loop.period_ns
-        if k in changes:
-            gains, reference = changes[k]
-            change = Change(session=SESSION, tick=k, gains=gains, reference=reference, within_s=1.0)
-            if gains is not None:
-                controller.set_gains(gains)
-            if reference is not None:
-                controller.motion.follow(Plan.of(reference), k * loop.period, 1.0)
-            write("change", change.encode(), at)
-        command = controller.tick(measurement, k)
-        assert command is not None
-        if k >= begin:
-            write("measurement", measurement, at)
+    messages = Messages()
+    clocks: dict[End, Clock] = {"plant": Clock("plant"), "controller": Clock("controller")}
+    plant_clock, clock = clocks["plant"], clocks["controller"]
+    emulator = Emulator(loop, wire, settings.plant, threading.Event())
+    endpoint = emulator.endpoint
+    with patch("plant_emulator.plant_trace.time", plant_clock):
+        trace = PlantTrace(loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"])
+        claim = Claim(
+            controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
+        )
+        assert isinstance(endpoint.claim(claim), Grant)
+        trace.follow(endpoint)
+        end = ControllerEnd(settings, messages, clock)
+        arrival: Arrival | None = None
+        for k in range(ticks):
+            at_ns = plant_clock.now_ns = k * loop.period_ns
+            measurement = emulator.tick(arrival.frame if arrival else None, k)
+            assert measurement is not None, endpoint.notices
+            trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
             if truth_every and k % truth_every == 0:
-                write("truth", truth_of(plant, endpoint).encode(), at + 1)
-            logged = bytes([command[0], command[1] ^ 0x01]) if k == spoil else command
-            write("command", logged, at + 300_000)
-            if k % 10 == 0:
-                write("telemetry", telemetry_of(controller, SESSION).encode(), at + 300_001)
-        measurement = endpoint.tick(command, k + 1)
-        if k % chunk_every == chunk_every - 1:
-            log.commit()
-    log.end()
+                messages.add("truth", truth_of(emulator._emulated, endpoint).encode(), plant_clock, "plant")
+            clock.now_ns = at_ns + ONE_WAY_NS
+            if k in changes:
+                end.follow(k, *changes[k])
+            command = end.controller.tick(measurement, k)
+            received_as = Received.FRAME if measurement else Received.SILENT
+            now_ns = clock.monotonic_ns()
+            logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
+            end.record(PlantTick(k, measurement, received_as, now_ns, now_ns), logged, now_ns)
+            if k % 10 == 0 and end.controller.tick_index == k:
+                messages.add("telemetry", telemetry_of(end.controller, SESSION).encode(), clock)
+            arrival = None if command is None or (not command and not loop.lockstep) else Arrival(
+                command, plant_clock.at(at_ns + 2 * ONE_WAY_NS)
+            )  # fmt: skip
+        end.publish(final=True)
+        endpoint.release(SESSION)
+        trace.follow(endpoint)
+    kept = [message for message in messages.all if not _before(message, begin)] if begin else messages.all
+    write(path, settings, kept, chunk_every)
 
 
-AN_OPERATORS_WORDS: dict[int, tuple[Gains | None, Reference | None]] = {
+def _before(message: Logged, begin: int) -> bool:
+    """Whether a message is a batch with rows of ticks before this one."""
+    batch = read_batch(message.payload) if "/trace/" in message.key else None
+    if batch is None:
+        return (message.at_ns - START_NS) // 2_000_000 < begin
+    ticks = batch.columns["tick" if batch.header.end == "controller" else "session_tick"]
+    return not len(ticks) or int(ticks[0]) < begin
+
+
+AN_OPERATORS_WORDS: Changes = {
     120: (Gains(C2=(0.2, 0.2, 0.2)), None),
     250: (None, Hold(attitude=(0.0, 5.0, -10.0))),
     400: (Gains(Gamma=(0.01, 0.01, 0.01)), load().reference),

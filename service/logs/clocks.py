@@ -1,0 +1,61 @@
+"""One-way delays: how long a frame took each way, from the four times of a tick on two unrelated clocks.
+
+    forward  = received by the controller − sent by the plant      = delay of the measurement + offset
+    backward = received by the plant − sent by the controller      = delay of the command     − offset
+
+The offset (controller's monotonic clock minus the plant's) is half their difference if both ways are equally fast. It
+is fitted by a straight line over windows of 512 ticks, through the half with the shortest round trips: queues and
+hitches make a way slow, never fast. What is unequal at the median stays in both delays, with opposite signs.
+"""
+
+from __future__ import annotations
+
+from math import nan
+
+import numpy as np
+
+from service.logs.report import Array
+
+WINDOW = 512
+"""Ticks of a fit; two crystals part by less than a microsecond in a second."""
+_LEAST = 16
+
+
+class ClockOffset:
+    """Estimates the offset between two ends' clocks as their ticks come.
+
+    Attributes:
+        first_ns: The offset at the first tick [ns]; NaN before any.
+        last_ns: The same at the last.
+    """
+
+    def __init__(self) -> None:
+        self.first_ns = self.last_ns = nan
+
+    def at(self, forward: Array, backward: Array) -> Array:
+        """The offset at ticks in order [ns]; NaN while nothing is known. Shapes (n,).
+
+        Args:
+            forward: As above, NaN where a time is unknown [ns].
+            backward: Likewise.
+        """
+        found = np.full(len(forward), self.last_ns)
+        edges = [*range(0, max(1, len(forward) - WINDOW // 2), WINDOW), len(forward)]
+        for begin, end in zip(edges, edges[1:], strict=False):
+            there, back = forward[begin:end], backward[begin:end]
+            known = np.flatnonzero(~np.isnan(there + back))
+            if len(known) >= _LEAST:
+                # Differences of the base stay small: times since a boot have more digits than a product of them keeps.
+                base = there[known[0]]
+                trip = (there - base) + (back + base)
+                quick = known[trip[known] <= np.median(trip[known])]
+                offset = ((there - base) - (back + base))[quick] / 2
+                slope, at_zero = np.polyfit(quick, offset, 1) if np.ptp(quick) >= WINDOW // 4 else (0.0, offset.mean())
+                found[begin:end] = base + at_zero + slope * np.arange(end - begin)
+                self.last_ns = float(found[end - 1])
+            else:
+                found[begin:end] = self.last_ns
+        known_ns = found[~np.isnan(found)]
+        if self.first_ns != self.first_ns and len(known_ns):
+            self.first_ns = float(known_ns[0])
+        return found

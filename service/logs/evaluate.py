@@ -1,0 +1,125 @@
+"""What the controller computed, from its own rows: every tick again, bit for bit.
+
+A row says what the controller had at a tick: a frame; silence, for which the levels of the last frame stand; or a frame
+that came late, whose levels hold from the next tick on. Where rows are missing, the next batch has the controller's state.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.trace import Received
+from protocol.verbs import Change
+from service.config import Settings
+from service.controller import Codes, ControllerState
+from service.logs.batch import BatchController, Commands, Computed
+from service.logs.codes import codes_in
+from service.logs.report import Array
+from service.logs.runs import Block
+from service.logs.traces import Integers
+
+
+class Used(NamedTuple):
+    """Ticks that the controller computed.
+
+    Attributes:
+        rows: Indices of their rows in the block. Shape (n,).
+        k: The ticks. Shape (n,).
+        codes: Of the measurements that it used. Shape (n, 6).
+    """
+
+    rows: Integers
+    k: Integers
+    codes: Array
+
+
+class Evaluator:
+    """Computes the rows of one session's controller again.
+
+    Args:
+        settings: Its configuration.
+        own_gains: Keep the gains of the configuration, whatever the log's changes say.
+        own_reference: The same of the reference.
+        resumes: Go on from the recorded state where rows are missing within the session.
+    """
+
+    def __init__(
+        self, settings: Settings, *, own_gains: bool = False, own_reference: bool = False, resumes: bool = True
+    ) -> None:
+        self._settings = settings
+        self._controller = self._new_controller()
+        self._beside: BatchController | None = None
+        self._dropped = [*(["gains"] if own_gains else []), *(["reference"] if own_reference else [])]
+        self._resumes = resumes
+        self._holds = settings.wire.transmit.measurement == "on_change"
+        self._changes: deque[Change] = deque()
+        self._held: Codes | None = None
+        self._begun = False
+
+    def used(self, block: Block) -> Used:
+        """What the controller used at the ticks of the next block; `compute` is to be called with it next."""
+        if block.state is not None and (self._resumes or not self._begun):
+            state = ControllerState.model_validate(block.state)
+            self._controller.restore(state)
+            self._held = state.held
+        self._changes += [
+            change.model_copy(update=dict.fromkeys(self._dropped)) if self._dropped else change
+            for change in block.changes
+        ]
+        rows = block.controller
+        if not rows:
+            none = np.empty(0, dtype=np.int64)
+            return Used(none, none, np.empty((0, 6)))
+        self._begun = True
+        received_as = rows["received_as"]
+        framed = (received_as == Received.FRAME) | (received_as == Received.LATE)
+        known = np.cumsum(framed) > 0 if self._held is None else np.ones(len(framed), dtype=np.bool_)
+        codes = codes_in(self._settings.wire.measurement, rows["measurement"][framed])
+        held, self._held = held_codes(framed, codes, self._held)
+        silent = (received_as == Received.SILENT) & known & self._holds
+        computed = np.flatnonzero((received_as == Received.FRAME) | silent)
+        return Used(computed, rows["tick"][computed], held[computed])
+
+    def compute(self, used: Used) -> Computed:
+        """What the controller made of it."""
+        return self._controller.compute_all(used.k, used.codes, self._changes)
+
+    def commands(self, used: Used, computed: Computed) -> Commands:
+        """What it sent then; to be called for every block, or for none."""
+        return self._controller.commands(used.k, computed.voltages)
+
+    def beside(self, k: Integers, codes: Array) -> Computed:
+        """What it would make of other measurements from here on; it goes on as if not asked. Its θ̂ means nothing.
+
+        Args:
+            k: Ticks, rising. Shape (n,).
+            codes: Of the measurements. Shape (n, 6).
+        """
+        self._beside = self._beside or self._new_controller()
+        self._beside.follow(self._controller)
+        return self._beside.compute_all(k, codes, deque(self._changes))
+
+    def _new_controller(self) -> BatchController:
+        settings = self._settings
+        return BatchController(settings.wire, settings.law, settings.reference, settings.loop.period)
+
+
+def held_codes(framed: npt.NDArray[np.bool_], codes: Array, before: Codes | None) -> tuple[Array, Codes | None]:
+    """Codes that hold at each row: its frame's, or those of the last frame before it.
+
+    Args:
+        framed: Which rows have a frame. Shape (n,).
+        codes: Of their frames. Shape (frames, columns).
+        before: Those that hold before the first row; None for none.
+
+    Returns:
+        Codes, NaN before the first frame, of shape (n, columns); and those that hold after the last row.
+    """
+    first = np.full((1, codes.shape[1]), np.nan) if before is None else np.array([before])
+    held = np.vstack([first, codes])[np.cumsum(framed)]
+    known = before is not None or len(codes) > 0
+    return held, tuple(held[-1].tolist()) if known and len(held) else before

@@ -1,0 +1,331 @@
+"""A run as its two ends recorded it: sessions in blocks of ticks, each tick with the rows of both ends that belong to it.
+
+The join key is (vehicle, session, session tick). The files are read twice: first the headers of the trace's batches
+(traces.py), then the rows. A block is yielded once both ends have reached its last tick, so memory stays bounded however
+long a session is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.topics import Address
+from protocol.trace import NEVER, Batch, End, Outcome, Received
+from protocol.verbs import Change
+from service.logs.files import LogFiles, Progress, ReviewError
+from service.logs.traces import Arrived, Extent, InOrder, Integers, Missing, TraceIndex, Which
+
+BLOCK: Final = 4096
+"""Ticks of a block, about: numpy is quick with so many, and they stay in the cache."""
+
+ANSWER_S: Final = 1.2
+"""A command acts this long after the measurement that it answers at the latest: a session's first has a second [s]."""
+
+_INDEXING: Final = 0.15
+"""Share of reading that the first pass takes."""
+
+Taker = Callable[[bytes, int], None]
+"""Takes a JSON message: its content, and when it was published [ns]."""
+
+Rows = dict[str, npt.NDArray[Any]]
+"""Rows of one end, by column: those of its trace, but times in ns on its monotonic clock, −1 for none; and `wall`, what
+to add to such a time for its wall clock [ns]."""
+
+
+class Block(NamedTuple):
+    """Ticks of a session, in order, and rows of both ends.
+
+    Attributes:
+        which: The session.
+        k: Session ticks that an end has a row of. Shape (n,).
+        controller: The controller's rows in their order, those that are no tick of their own included.
+        plant: The plant's rows; behind those of this block, rows that act on commands that answer its ticks.
+        at_controller: Index of the row that computed each tick, or −1. Shape (n,).
+        at_plant: Index of the plant's row of each tick, or −1. Shape (n,).
+        acted: Index of the plant's row that first acted on the command that answers each tick, or −1. Shape (n,).
+        changes: What the controller followed from which tick on, up to here.
+        state: Where rows before this block's are missing, the controller's state before its first row; else None.
+    """
+
+    which: Which
+    k: Integers
+    controller: Rows
+    plant: Rows
+    at_controller: Integers
+    at_plant: Integers
+    acted: Integers
+    changes: list[Change]
+    state: dict[str, Any] | None
+
+
+class Run:
+    """The traces of a run.
+
+    Args:
+        paths: Logs, folders of logs, or the files of a rotated run.
+        progress: Called now and then with the share of everything that is done, 0…1.
+
+    Attributes:
+        files: What the files say of themselves.
+        extents: What there is of each session.
+        missing: What is not.
+        reached: The last tick of each session that `read` has come to.
+        open_sessions: The session of each vehicle that has begun there and not ended.
+
+    Raises:
+        ReviewError: Not a log of this version.
+    """
+
+    def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
+        self.files = LogFiles(paths)
+        self._progress = progress
+        index = TraceIndex()
+        for found in self.files.routed(lambda address: partial(index.add, address.vehicle)
+                                       if address.topic.name == "trace" else None, self._share(0.0, _INDEXING)):  # fmt: skip
+            found.answer(found.data)
+        index.finish()
+        self._index = index
+        self.extents: dict[Which, Extent] = index.extents
+        self.missing: list[Missing] = index.missing
+        self.reached: dict[Which, int] = {}
+        self.open_sessions: dict[str, str] = {}
+
+    @property
+    def longest(self) -> Which:
+        """The session with the most ticks. Raises ReviewError if there is none."""
+        which = self._index.longest
+        if which is None:
+            raise ReviewError(f"{self.files.name} holds no session: no trace of a controller or a plant was recorded")
+        return which
+
+    def batches(self, route: Callable[[Address], Taker | None] = lambda _: None) -> Iterator[Arrived]:
+        """Batches of the traces, each end's in the order of its rows and none twice.
+
+        Args:
+            route: Who takes the messages of a key that is no trace's; called once for every key of a file.
+        """
+        order = InOrder(self._index)
+
+        def of(address: Address) -> tuple[str, Taker | None] | None:
+            if address.topic.name == "trace":
+                return address.vehicle, None
+            taker = route(address)
+            return None if taker is None else (address.vehicle, taker)
+
+        for found in self.files.routed(of, self._share(_INDEXING, 1.0)):
+            vehicle, taker = found.answer
+            if taker is not None:
+                taker(found.data, found.publish_time)
+                continue
+            yield from order.take(vehicle, found.data)
+
+    def read(
+        self,
+        sessions: Collection[Which],
+        route: Callable[[Address], Taker | None] = lambda _: None,
+        block: int = BLOCK,
+    ) -> Iterator[Block]:
+        """Blocks of some sessions; those of one session in order.
+
+        Args:
+            sessions: Which.
+            route: As for `batches`.
+            block: Ticks of a block, about.
+        """
+        joins = {which: Join(which, self._margin(which), self.extents[which], block) for which in sessions}
+        for arrived in self.batches(route):
+            header = arrived.batch.header
+            which = arrived.source.vehicle, header.session
+            self._follow(which, arrived)
+            if (join := joins.get(which)) is not None:
+                yield from join.add(arrived)
+        for join in joins.values():
+            yield from join.finish()
+
+    def _follow(self, which: Which, arrived: Arrived) -> None:
+        """Keep how far the plant's trace has come; the controller's, where the log has none of the plant."""
+        vehicle, session = which
+        header = arrived.batch.header
+        if header.end == "controller" and which in self.extents and self.extents[which].rows["plant"]:
+            return
+        if header.rows:
+            ticks = arrived.batch.columns["session_tick" if header.end == "plant" else "tick"]
+            self.reached[which], self.open_sessions[vehicle] = int(ticks[-1]), session
+        if header.final or not session:
+            self.open_sessions.pop(vehicle, None)
+
+    def _margin(self, which: Which) -> int:
+        """Ticks after which no command can still act on what answers a tick."""
+        return self.files.settings(which[0]).loop.ticks(ANSWER_S)
+
+    def _share(self, begin: float, end: float) -> Progress | None:
+        progress = self._progress
+        return None if progress is None else lambda share: progress(begin + share * (end - begin))
+
+
+class _Segment:
+    """Rows of one end that wait, with none missing between them.
+
+    Args:
+        end: Which end.
+        state: The controller's state before the first of them, where rows before that are missing.
+    """
+
+    def __init__(self, end: End, state: dict[str, Any] | None = None) -> None:
+        self.state = state
+        self._column = "tick" if end == "controller" else "session_tick"
+        self._batches: list[Batch] = []
+        self._rows: Rows = {}
+
+    def add(self, batch: Batch) -> None:
+        """Rows that follow."""
+        self._batches.append(batch)
+
+    @property
+    def rows(self) -> Rows:
+        """All of them; empty if there are none."""
+        if self._batches:
+            known = [self._rows] if self._rows else []
+            parts = [*known, _joined(self._batches)]
+            self._rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            self._batches.clear()
+        return self._rows
+
+    @property
+    def ticks(self) -> Integers:
+        """The tick that each has reached, which a late row does not lower. Shape (rows,)."""
+        rows = self.rows
+        return np.maximum.accumulate(rows[self._column]) if rows else np.empty(0, dtype=np.int64)
+
+    def drop(self, n: int) -> None:
+        """Forget the first."""
+        self._rows = {name: column[n:] for name, column in self.rows.items()}
+        if n:
+            self.state = None
+
+
+class Join:
+    """Puts the rows of one session's two ends together.
+
+    Args:
+        which: The session.
+        margin: Ticks of the plant to wait for after a tick, before it is known whether a command acts on its answer.
+        extent: What there is of it.
+        block: Ticks of a block, about.
+    """
+
+    def __init__(self, which: Which, margin: int, extent: Extent, block: int) -> None:
+        self._which = which
+        self._margin = margin
+        self._block = block
+        self._controller: deque[_Segment] = deque()
+        self._plant = _Segment("plant")
+        self._changes: list[Change] = []
+        # Up to which tick each end has been read; infinity where nothing more comes.
+        self._settled: dict[End, float] = {
+            end: extent.first[end] - 1 if extent.rows[end] else inf for end in extent.rows
+        }
+        self._yielded: float = min(self._settled.values())
+
+    def add(self, arrived: Arrived) -> Iterator[Block]:
+        """A batch of it; blocks that are complete now."""
+        batch, end = arrived.batch, arrived.source.end
+        if end == "controller":
+            if batch.header.rows:
+                if arrived.after_gap or not self._controller:
+                    self._controller.append(_Segment(end, batch.tail.state))
+                self._controller[-1].add(batch)
+            self._changes += batch.tail.changes
+        elif batch.header.rows:
+            self._plant.add(batch)
+        self._settled[end] = inf if arrived.next_tick is None else arrived.next_tick - 1
+        yield from self._cut()
+
+    def finish(self) -> Iterator[Block]:
+        """No more is to come."""
+        self._settled = {"controller": inf, "plant": inf}
+        yield from self._cut()
+
+    def _cut(self) -> Iterator[Block]:
+        """Blocks up to where both ends have been read."""
+        limit = min(self._settled["controller"], self._settled["plant"] - self._margin)
+        if limit - self._yielded < self._block:
+            return
+        while len(self._controller) > 1:  # a block has no gap within it
+            last = float(self._controller[0].ticks[-1])
+            if last > limit:
+                break
+            yield from self._until(last)
+            self._controller.popleft()
+        yield from self._until(limit)
+        self._yielded = limit
+
+    def _until(self, limit: float) -> Iterator[Block]:
+        plant, p = self._plant.rows, int(np.searchsorted(self._plant.ticks, limit, side="right"))
+        segment = self._controller[0] if self._controller else _Segment("controller")
+        n = int(np.searchsorted(segment.ticks, limit, side="right"))
+        if n or p:
+            controller = {name: column[:n] for name, column in segment.rows.items()}
+            changes, self._changes = self._changes, []
+            yield _block(self._which, controller, plant, p, changes, segment.state)
+            segment.drop(n)
+            self._plant.drop(p)
+
+
+def _block(
+    which: Which, controller: Rows, plant: Rows, p: int, changes: list[Change], state: dict[str, Any] | None
+) -> Block:
+    """The block of these rows of the controller and the first p rows of the plant."""
+    none = np.empty(0, dtype=np.int64)
+    computed = measured = acting = answers = none
+    if controller:
+        received_as = controller["received_as"]
+        computed = np.flatnonzero((received_as == Received.FRAME) | (received_as == Received.SILENT))
+    if plant:
+        measured = plant["session_tick"][:p]
+        acting = np.flatnonzero((plant["outcome"] == Outcome.ACTED) & (plant["answered"] != NEVER))
+        answers, first = np.unique(plant["answered"][acting], return_index=True)
+        acting = acting[first]
+    ticks = controller["tick"][computed] if controller else none
+    k = np.union1d(ticks, measured)
+    return Block(
+        which,
+        k,
+        controller,
+        plant,
+        *(_places(*pair, k) for pair in ((ticks, computed), (measured, np.arange(len(measured))), (answers, acting))),
+        changes,
+        state,
+    )
+
+
+def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
+    """Of each k, the place of the row with that tick, or −1. Ticks rise."""
+    if not len(ticks):
+        return np.full(len(k), -1)
+    at = np.minimum(np.searchsorted(ticks, k), len(ticks) - 1)
+    return np.where(ticks[at] == k, places[at], -1)
+
+
+def _joined(batches: Sequence[Batch]) -> Rows:
+    """Rows of batches of one end, one after another."""
+    counts = [batch.header.rows for batch in batches]
+    names = batches[0].columns.dtype.names or ()
+    rows: Rows = {name: np.concatenate([batch.columns[name] for batch in batches]) for name in names}
+    base = np.repeat([batch.header.monotonic_ns for batch in batches], counts)
+    for name in ("received", "sent"):
+        known = rows[name] != NEVER
+        rows[name] = np.where(known, rows[name].astype(np.int64) * 1000 + base, -1)
+    for name in ("tick", "session_tick", "answered"):
+        if name in rows:
+            rows[name] = rows[name].astype(np.int64)
+    rows["wall"] = np.repeat([batch.header.wall_ns - batch.header.monotonic_ns for batch in batches], counts)
+    return rows

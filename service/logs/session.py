@@ -1,0 +1,110 @@
+"""One session under review: its ticks are scored, observed and held against the theorem."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from protocol.attitude import Quaternion, Vector
+from protocol.trace import Outcome, Received
+from protocol.verbs import Change
+from service.config import Settings
+from service.figures import Score
+from service.logs.observe import Observer
+from service.logs.runs import Block
+from service.logs.theorem import WAITING, Trial
+from service.logs.tick_reader import TickReader
+from service.logs.ticks import Ticks
+from service.logs.traces import Missing
+
+_OUTCOMES: Final = {
+    "stale": [Outcome.STALE],
+    "repeated": [Outcome.REPEATED],
+    "refused": [Outcome.MALFORMED, Outcome.INVALID],
+    "withheld": [Outcome.WITHHELD],
+}
+
+
+class Session:
+    """Reviews one session.
+
+    Args:
+        settings: The configuration of its controller.
+        watchdog_s: How long its plant holds a command that no other follows [s].
+        trial: Makes what holds it against the theorem, given the changes that it began with.
+        missing: What the log lacks of it.
+        watch: Called with every block of ticks, in order.
+
+    Attributes:
+        score: Its figures of merit.
+        lapses: How many ticks were late, missed and so on; see `Findings`.
+        reader: Reads its ticks.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        watchdog_s: float,
+        trial: Callable[[Sequence[Change]], Trial],
+        missing: Sequence[Missing] = (),
+        watch: Callable[[Ticks], None] | None = None,
+    ) -> None:
+        self.settings = settings
+        self.score = Score(settings.wire, settings.loop.period, watchdog_s)
+        self.lapses: Counter[str] = Counter()
+        self.reader = TickReader(settings)
+        self._trial = trial
+        self._gaps = [(gap.first_tick, gap.last_tick) for gap in missing if gap.end == "controller" and gap.rows]
+        self._watch = watch
+        self._observer: Observer | None = None
+        self._early: deque[tuple[int | None, Quaternion, Vector]] = deque(maxlen=WAITING)
+
+    @property
+    def observer(self) -> Observer:
+        """What was observed beside the figures."""
+        self._observer = self._observer or self._new_observer(())
+        return self._observer
+
+    def truth(self, tick: int | None, attitude: Quaternion, rate: Vector) -> None:
+        """What was true as a tick's measurement was taken; None if nothing says which."""
+        if self._observer is None:
+            self._early.append((tick, attitude, rate))
+        else:
+            self._observer.trial.truth(tick, attitude, rate)
+
+    def take(self, block: Block) -> None:
+        """Review the next block."""
+        observer = self._observer = self._observer or self._new_observer(block.changes)
+        observer.trial.changed(block.changes)
+        self._count(block)
+        found = self.reader.take(block)
+        for tick in found.missed.tolist():
+            self.lapses["missed"] += not any(a <= tick and (b is None or tick <= b) for a, b in self._gaps)
+        observer.frames(found.measurements, found.commands)
+        self.score.errors(found.judged.k, found.judged.attitude_error)
+        self.score.commands(found.answered, found.voltages)
+        self.score.unsent(*found.unsent)
+        observer.answered(found.answered)
+        observer.ticks(found.judged)
+        if self._watch is not None and len(found.judged.k):
+            self._watch(found.judged)
+
+    def _new_observer(self, changes: Sequence[Change]) -> Observer:
+        observer = Observer(self.settings, self._trial(changes))
+        for truth in self._early:
+            observer.trial.truth(*truth)
+        self._early.clear()
+        return observer
+
+    def _count(self, block: Block) -> None:
+        """Count what went otherwise than one frame each way a tick."""
+        if rows := block.controller:
+            for name, kind in (("late", Received.LATE), ("malformed", Received.MALFORMED)):
+                self.lapses[name] += int((rows["received_as"] == kind).sum())
+        if block.plant:
+            outcomes = block.plant["outcome"][: int((block.at_plant >= 0).sum())]
+            for name, kinds in _OUTCOMES.items():
+                self.lapses[name] += int(np.isin(outcomes, kinds).sum())
