@@ -18,7 +18,7 @@ from service.hil import Hil, HilLog
 
 SLACK_S = 0.3
 WATCHDOG_S = 0.1
-PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
 """For what does not try the watchdog."""
 
 

@@ -38,7 +38,7 @@ WATCHDOG_S: Final = 0.1
 SILENT_S: Final = 0.5
 SLACK_S: Final = 0.3
 """For a loop that other work on the machine keeps waiting, in five processes on two cores."""
-PATIENT: Final = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+PATIENT: Final = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 FD_WIRE: Final = {"can.fd": True, "wire.attitude.bits": 12, "wire.rate.bits": 12}
 """Ten bytes, which travel as twelve."""

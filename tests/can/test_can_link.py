@@ -42,7 +42,9 @@ UNSENT = 20
 """So many frames in a row that are not taken make a fault."""
 
 
-def wire(attitude: int | None, rate: int | None, voltage: int | None, actuators: int = 2) -> WireSpec:
+def wire(
+    attitude: int | None, rate: int | None, voltage: int | None, actuators: int = 2, counter_bits: int = 8
+) -> WireSpec:
     """A spec of these bits."""
     return WireSpec.model_validate(
         {
@@ -50,21 +52,22 @@ def wire(attitude: int | None, rate: int | None, voltage: int | None, actuators:
             "rate": {"bits": rate, "limit": 1.0},
             "voltage": {"bits": voltage, "limit": 24.0},
             "actuators": actuators,
+            "counter_bits": counter_bits,
         }
     )
 
 
 # By hand from SPEC.md: bits of a frame, then bytes, then the next length that CAN FD has. 24 and 48 do not come about.
 LENGTHS = [
-    pytest.param(PAPER, False, (7, 7), (2, 2), id="8-6"),
-    pytest.param(wire(10, 10, 16), False, (8, 8), (5, 5), id="10-16"),
-    pytest.param(wire(2, 2, 2, 3), False, (2, 2), (2, 2), id="2-2-three-motors"),
-    pytest.param(wire(8, 8, 6, 3), True, (7, 7), (3, 3), id="8-6-three-motors-FD"),
-    pytest.param(wire(11, 11, 6), True, (9, 12), (2, 2), id="11-6"),
-    pytest.param(wire(14, 16, 16), True, (12, 12), (5, 5), id="14+16-16"),
-    pytest.param(wire(16, 16, None), True, (13, 16), (17, 20), id="16-cont"),
+    pytest.param(PAPER, False, (7, 7), (3, 3), id="8-6"),
+    pytest.param(wire(10, 10, 16, 2, 4), False, (8, 8), (5, 5), id="10-16-counter-4"),
+    pytest.param(wire(2, 2, 2, 3), False, (3, 3), (2, 2), id="2-2-three-motors"),
+    pytest.param(wire(8, 8, 6, 3), True, (7, 7), (4, 4), id="8-6-three-motors-FD"),
+    pytest.param(wire(10, 10, 6), True, (9, 12), (3, 3), id="10-6"),
+    pytest.param(wire(14, 16, 16), True, (13, 16), (5, 5), id="14+16-16"),
+    pytest.param(wire(16, 16, None, 2, 10), True, (14, 16), (18, 20), id="16-cont-counter-10"),
     pytest.param(wire(None, 8, None, 3), True, (28, 32), (25, 32), id="cont+8-cont-three-motors"),
-    pytest.param(wire(None, None, 6), True, (49, 64), (2, 2), id="cont-6"),
+    pytest.param(wire(None, None, 6), True, (49, 64), (3, 3), id="cont-6"),
 ]
 
 
@@ -117,7 +120,7 @@ def test_ids_are_those_of_the_specification(node: int) -> None:
     with both_ends(virtual(node=node)) as (plant, controller, stranger):
         plant.send(bytes(7))
         plant.beat(Heartbeat(PlantState.IDLE, 0, MARK))
-        controller.send(bytes(2))
+        controller.send(bytes(3))
         controller.beat(Heartbeat(PlantState.IDLE, 0, MARK))
         assert [stranger.hear().arbitration_id for _ in range(4)] == [
             0x100 + node,
@@ -138,7 +141,7 @@ def test_two_nodes_on_one_bus_do_not_hear_each_other() -> None:
     second = second.model_copy(update={"channel": first.channel})
     with both_ends(first) as (plant_1, controller_1, near_1), both_ends(second) as (plant_2, controller_2, near_2):
         plant_1.send(b"\x10" + bytes(6))
-        controller_1.send(b"\x10\0")
+        controller_1.send(b"\x10\0\0")
         plant_1.beat(Heartbeat(PlantState.DRIVEN, 0, MARK))
         controller_1.beat(Heartbeat(PlantState.GRANTED, 5, MARK))
         near_1.settle(plant_1, controller_1)
@@ -200,7 +203,7 @@ def test_who_waits_for_more_than_one_thing_is_told_of_a_frame() -> None:
         pytest.param(PAPER, True, bytes(12), id="long-on-an-FD-bus"),
         pytest.param(wire(11, 11, 6), True, bytes(8), id="FD-short"),
         pytest.param(wire(16, 16, 6), True, bytes(12), id="FD-short-by-a-byte"),
-        pytest.param(wire(11, 11, 6), True, bytes(9) + b"\1\0\0", id="FD-first-byte-of-the-pad"),
+        pytest.param(wire(10, 10, 6), True, bytes(9) + b"\1\0\0", id="FD-first-byte-of-the-pad"),
         pytest.param(wire(11, 11, 6), True, bytes(11) + b"\1", id="FD-last-byte-of-the-pad"),
         pytest.param(wire(16, 16, 6), True, bytes(13) + b"\0\x80\0", id="FD-middle-of-the-pad"),
         pytest.param(wire(None, None, 6), True, bytes(63) + b"\xff", id="FD-64"),
@@ -338,7 +341,8 @@ def test_a_malformed_heartbeat_is_refused_and_the_last_one_stands() -> None:
 WIDTHS = st.one_of(st.none(), st.integers(MIN_BITS, MAX_BITS))
 ADVICE = re.compile(
     r"a (?P<frame>\w+) frame has (?P<size>\d+) bytes, and a classic CAN frame holds 8: set can\.fd = true, "
-    r"or wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most$"
+    r"or wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
+    r"(?P<shorter>, or wire\.counter_bits = 4 with can\.short_counter = true)?$"
 )
 
 
@@ -350,33 +354,36 @@ def _refusal(spec: WireSpec, *, fd: bool) -> str | None:
     return None
 
 
-def _size(frame: str, bits: dict[str, int | None], actuators: int) -> int:
-    size: int = getattr(wire(**bits, actuators=actuators), frame).size
+def _size(frame: str, bits: dict[str, int | None], actuators: int, counter_bits: int) -> int:
+    size: int = getattr(wire(**bits, actuators=actuators, counter_bits=counter_bits), frame).size
     return size
 
 
 @settings(max_examples=60)
-@given(attitude=WIDTHS, rate=WIDTHS, voltage=WIDTHS, actuators=st.sampled_from([2, 3]))
+@given(
+    attitude=WIDTHS, rate=WIDTHS, voltage=WIDTHS, actuators=st.sampled_from([2, 3]), counted=st.sampled_from([4, 8, 16])
+)
 def test_a_spec_that_does_not_fit_is_refused_with_the_widths_that_would(
-    attitude: int | None, rate: int | None, voltage: int | None, actuators: int
+    attitude: int | None, rate: int | None, voltage: int | None, actuators: int, counted: int
 ) -> None:
     bits = {"attitude": attitude, "rate": rate, "voltage": voltage}
-    assert _refusal(wire(**bits, actuators=actuators), fd=True) is None
-    while (said := _refusal(wire(**bits, actuators=actuators), fd=False)) is not None:
+    assert _refusal(wire(**bits, actuators=actuators, counter_bits=counted), fd=True) is None
+    while (said := _refusal(wire(**bits, actuators=actuators, counter_bits=counted), fd=False)) is not None:
         advice = ADVICE.match(said)
         assert advice is not None, said
         frame, size, widest = advice["frame"], int(advice["size"]), int(advice["widest"])
-        assert _size(frame, bits, actuators) == size > 8
+        assert _size(frame, bits, actuators, counted) == size > 8
+        assert (advice["shorter"] is not None) == (_size(frame, bits, actuators, 4) <= 8)
         signals = [name for name in (advice["first"], advice["second"]) if name is not None]
         bits |= dict.fromkeys(signals, widest)
-        assert _size(frame, bits, actuators) <= 8
+        assert _size(frame, bits, actuators, counted) <= 8
         if widest < MAX_BITS:
-            assert _size(frame, {**bits, **dict.fromkeys(signals, widest + 1)}, actuators) > 8
-    assert all(_size(frame, bits, actuators) <= 8 for frame in ("measurement", "command"))
+            assert _size(frame, {**bits, **dict.fromkeys(signals, widest + 1)}, actuators, counted) > 8
+    assert all(_size(frame, bits, actuators, counted) <= 8 for frame in ("measurement", "command"))
 
 
 def test_a_link_is_not_opened_for_frames_that_do_not_fit() -> None:
-    with pytest.raises(CanError, match=r"a measurement frame has 9 bytes.*to 10 at the most"):
+    with pytest.raises(CanError, match=r"a measurement frame has 10 bytes.*to 9 at the most$"):
         CanLink(virtual(), wire(11, 11, 6), "plant")
     with pytest.raises(CanError, match=r"a command frame has 17 bytes.*wire\.voltage\.bits to 16 at the most"):
         CanLink(virtual(), wire(8, 8, None), "controller")
@@ -386,13 +393,13 @@ def test_the_fingerprint_is_the_one_of_the_specification() -> None:
     """Seven bytes of SHA-256 over this very text; another implementation must come to the same."""
     text = (
         '{"lockstep": false, "period_ns": 2000000, "wire": {"actuators": 2, '
-        '"attitude": {"bits": 8, "deadzone": null, "limit": 1.0}, '
+        '"attitude": {"bits": 8, "deadzone": null, "limit": 1.0}, "counter_bits": 8, '
         '"rate": {"bits": 8, "deadzone": null, "limit": 1.0}, '
         '"voltage": {"bits": 6, "deadzone": null, "limit": 24.0}}}'
     )
     ours = fingerprint(PAPER, PERIOD_NS, lockstep=False)
     assert ours == sha256(text.encode()).digest()[:7]
-    assert ours.hex() == "80eb4b19022b60"
+    assert ours.hex() == "094b8ce4a32f59"
 
 
 def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on() -> None:
@@ -407,7 +414,7 @@ def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on()
         for signal in ("attitude", "rate", "voltage")
         for field, other in (others | kinds).items()
     }
-    changes["actuators"] = 3
+    changes |= {"actuators": 3, "counter_bits": 10}
     changes |= {"transmit.measurement": "on_change", "transmit.command": "on_change", "transmit.heartbeat_s": 0.02}
     plain = PAPER.model_dump()
     leaves = {
@@ -501,7 +508,7 @@ def test_other_error_frames_are_only_counted() -> None:
         stranger.settle(plant)
         assert plant.errors == 5
         assert plant.fault is None
-        stranger.say(COMMAND_ID + 1, bytes(2))
+        stranger.say(COMMAND_ID + 1, bytes(3))
         assert plant.wait(PATIENCE_S) is not None
 
 
@@ -530,10 +537,10 @@ def test_a_link_works_again_once_it_is_reopened(flaws: Flaws, flawed: tuple[CanL
             link.send(b"\x20" + bytes(6))
         assert link.fault is None
         assert bytes(stranger.hear().data) == b"\x20" + bytes(6)
-        stranger.say(COMMAND_ID + 1, b"\x50\0")
+        stranger.say(COMMAND_ID + 1, b"\x50\0\0")
         arrival = link.wait(PATIENCE_S)
         assert arrival is not None
-        assert arrival.frame == b"\x50\0"
+        assert arrival.frame == b"\x50\0\0"
         stranger.settle(link)
 
 
@@ -568,7 +575,7 @@ def test_closing_twice_does_no_harm_and_nothing_is_sent_or_heard_afterwards(
         link.send(bytes(7))
         link.beat(Heartbeat(PlantState.IDLE, 0, MARK))
         assert flaws.sent == asked
-        stranger.say(COMMAND_ID + 1, bytes(2))
+        stranger.say(COMMAND_ID + 1, bytes(3))
         assert link.wait(0.05) is None
 
 

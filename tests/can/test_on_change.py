@@ -155,7 +155,7 @@ def test_commands_that_stop_trip_the_bridge_though_the_last_is_held() -> None:
 
 
 def test_in_real_time_a_loop_over_a_bus_goes_on_with_fewer_frames(tmp_path: Path) -> None:
-    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+    patient = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
     with Hil(tmp_path, plant="can-node") as hil:
         hil.start(settings={**patient, "wire.transmit": "on_change"})
         hil.run(1.5)

@@ -28,7 +28,7 @@ WATCHDOG_S = 0.1
 SLACK_S = 0.15
 """For a loop that other work on the machine keeps waiting: it must run to notice anything."""
 TOLD = {"plant.truth_rate_hz": 500}
-PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 
 

@@ -119,7 +119,7 @@ def test_a_configuration_read_again_changes_what_can_change_live_and_names_the_r
     config = tmp_path / "a.toml"
     config.write_text("[law]\nC2 = [0.15, 0.15, 0.15]\n")
     hil.start(settings=PATIENT, drive=False)
-    ours = [f"network.rendezvous={hil.settings.network.rendezvous}", "controller.stale_s=2"]
+    ours = [f"network.rendezvous={hil.settings.network.rendezvous}", "controller.stale_s=2", "wire.counter_bits=11"]
     overrides = [word for setting in ours for word in ("--set", setting)]
     controller = subprocess.Popen([*AEROLOOP, "controller", "--config", str(config), *overrides])
     try:

@@ -34,7 +34,7 @@ START_S = 30.0
 """Slack for starting processes: each takes about 1 s of CPU here, and CI may have other work."""
 
 
-PATIENT = ("--set", "plant.watchdog_s=2", "--set", "controller.stale_s=2")
+PATIENT = ("--set", "plant.watchdog_s=2", "--set", "controller.stale_s=2", "--set", "wire.counter_bits=11")
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 
 

@@ -26,7 +26,7 @@ from service.logs.replay import replay
 from service.logs.review import review
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
 
-PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2}
+PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
 """As in test_processes.py: a machine that stalls for over 100 ms must not end the session."""
 
 SLACK_S = 1.0

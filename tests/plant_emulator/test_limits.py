@@ -13,10 +13,12 @@ from plant_emulator.endpoint import Endpoint
 from plant_emulator.limits import Guard, LimitSettings
 from plant_emulator.plant import Measurement, Plant
 from protocol.attitude import IDENTITY
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState
 from protocol.wire import WireSpec
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 WIRE = WireSpec()
 PERIOD_NS = 2_000_000

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from protocol.can_link import Heartbeat, number_of
 from protocol.dbc import dbc
-from protocol.frames import COUNTERS, FrameFormat
+from protocol.frames import FrameFormat
 from protocol.quantizer import UniformQuantizer
 from protocol.states import PlantState, TripCause
 from protocol.wire import SignalSpec, WireSpec
@@ -37,14 +37,18 @@ UNITS: Final = {"eps": None, "omega": "rad/s", "u": "V"}
 FD_LENGTHS: Final = {12, 16, 20, 24, 32, 48, 64}
 
 
-def wire(out: int | None, inp: int | None, actuators: int = 2) -> WireSpec:
+def wire(out: int | None, inp: int | None, actuators: int = 2, counter_bits: int = 8) -> WireSpec:
     """The default wire with other bits."""
-    return WireSpec.model_validate({**WireSpec().with_bits(out, inp).model_dump(), "actuators": actuators})
+    changed = {"actuators": actuators, "counter_bits": counter_bits}
+    return WireSpec.model_validate({**WireSpec().with_bits(out, inp).model_dump(), **changed})
 
 
 WIRES: Final = {
     "8/6": wire(8, 6),
-    "10/10, eight bytes": wire(10, 10),
+    "10/10, eight bytes": wire(10, 10, counter_bits=4),
+    "10/10, FD": wire(10, 10),
+    "8/6 and 11 bits of counter": wire(8, 6, counter_bits=11),
+    "cont/cont and 10 bits of counter": wire(None, None, counter_bits=10),
     "16/16, FD": wire(16, 16),
     "2/2": wire(2, 2),
     "three actuators": wire(8, 6, 3),
@@ -197,7 +201,7 @@ def test_every_code_of_every_signal_decodes_and_leaves_the_others_alone(spec: Wi
         around = some_codes(of)
         for i, signal in enumerate(of):
             for n, code in enumerate(codes_to_try(signal)):
-                assert_decodes(message, layout, of, n % COUNTERS, [*around[:i], code, *around[i + 1 :]])
+                assert_decodes(message, layout, of, n % layout.counters, [*around[:i], code, *around[i + 1 :]])
 
 
 @pytest.mark.parametrize("bits", range(2, 17))
@@ -208,7 +212,7 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
     half = 2 ** (bits - 1)
     quantizer = spec.voltage.quantizer()
     for code in range(-half, half):
-        told = message.decode(layout.pack(code % COUNTERS, (code, -1 - code)).ljust(message.length, b"\0"))
+        told = message.decode(layout.pack(code % layout.counters, (code, -1 - code)).ljust(message.length, b"\0"))
         assert isinstance(told, dict)
         for name, one in (("u2", code), ("u3", -1 - code)):
             if one == -half:
@@ -217,26 +221,28 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
                 value, level = told[name], quantizer.decode(one)
                 assert isinstance(value, (int, float))  # an int where the step is
                 assert abs(value - level) <= ROUNDING * abs(level)
-        assert told["echo"] == code % COUNTERS
+        assert told["echo"] == code % layout.counters
 
 
 @settings(max_examples=60)
-@given(spec=specs, counter=st.integers(0, COUNTERS - 1), data=st.data())
-def test_any_codes_of_any_wire_decode(spec: WireSpec, counter: int, data: st.DataObject) -> None:
+@given(spec=specs, data=st.data())
+def test_any_codes_of_any_wire_decode(spec: WireSpec, data: st.DataObject) -> None:
     for message, layout, of in frames(spec):
+        counter = data.draw(st.integers(0, 2**spec.counter_bits - 1))
         assert_decodes(message, layout, of, counter, data.draw(codes_of(layout.widths)))
 
 
 @pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)
 def test_the_golden_frames_of_the_spec_decode_to_their_codes(row: Row) -> None:
-    frame, bits, actuators, counter, codes, text = row
+    frame, counter_bits, bits, actuators, counter, codes, text = row
     widths = [as_bits(cell.strip()) for cell in bits.split(",")]
+    changed: dict[str, object] = {"counter_bits": int(counter_bits)}
     if frame == "measurement":
-        changed = {"attitude": {"bits": widths[0], "limit": 1.0}, "rate": {"bits": widths[1], "limit": 1.0}}
+        changed |= {"attitude": {"bits": widths[0], "limit": 1.0}, "rate": {"bits": widths[1], "limit": 1.0}}
         spec, (name, first) = WireSpec.model_validate(changed), ("Measurement", "counter")
     else:
-        changed = {"voltage": {"bits": widths[0], "limit": 24.0}}
-        spec = WireSpec.model_validate({**changed, "actuators": int(actuators)})
+        changed |= {"voltage": {"bits": widths[0], "limit": 24.0}, "actuators": int(actuators)}
+        spec = WireSpec.model_validate(changed)
         name, first = "Command", "echo"
     message = read(spec).get_message_by_name(name)
     payload = bytes.fromhex(text)
@@ -269,7 +275,8 @@ def test_signals_have_names_units_bounds_and_comments(spec: WireSpec) -> None:
     assert [signal.name for signal in command.signals] == ["echo", *commanded]
     for message, _, of in frames(spec):
         first, *others = message.signals
-        assert (first.start, first.length, first.is_signed, first.minimum, first.maximum) == (7, 4, False, 0, 15)
+        assert (first.start, first.length, first.is_signed) == (7, spec.counter_bits, False)
+        assert (first.minimum, first.maximum) == (0, 2**spec.counter_bits - 1)
         assert all(signal.comment and signal.byte_order == "big_endian" for signal in message.signals)
         for signal, one in zip(others, of, strict=True):
             quantizer = quantizer_of(one)
@@ -288,6 +295,12 @@ def test_signals_have_names_units_bounds_and_comments(spec: WireSpec) -> None:
                 else:
                     assert isinstance(quantizer, UniformQuantizer)
                     assert signal.scale == quantizer.step
+
+
+@pytest.mark.parametrize("bits", [4, 8, 16])
+def test_the_counters_comment_says_modulo_what_it_counts(bits: int) -> None:
+    measurement = read(wire(8, 6, counter_bits=bits)).get_message_by_name("Measurement")
+    assert f"modulo {2**bits};" in (measurement.signals[0].comment or "")
 
 
 @pytest.mark.parametrize("off", [1.0, 1 + 2.0**-50, 1 - 1e-14])
@@ -326,13 +339,16 @@ def test_a_node_that_has_no_identifiers_is_refused(node: int) -> None:
 @pytest.mark.parametrize(
     ("name", "lengths"),
     [
-        ("8/6", (7, 2)),
+        ("8/6", (7, 3)),
         ("10/10, eight bytes", (8, 3)),
+        ("10/10, FD", (12, 4)),  # 9 and 4
+        ("8/6 and 11 bits of counter", (8, 3)),
         ("16/16, FD", (16, 5)),  # 13 and 5
-        ("2/2", (2, 1)),
-        ("three actuators", (7, 3)),
+        ("2/2", (3, 2)),
+        ("three actuators", (7, 4)),
         ("cont/cont", (64, 20)),  # 49 and 17
-        ("cont and 8", (32, 2)),  # 28
+        ("cont/cont and 10 bits of counter", (64, 20)),  # 50 and 18
+        ("cont and 8", (32, 3)),  # 28
     ],
 )
 def test_payloads_have_these_lengths(name: str, lengths: tuple[int, int]) -> None:

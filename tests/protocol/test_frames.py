@@ -436,11 +436,11 @@ PERIOD_NS = 2_000_000
 class Run(NamedTuple):
     """Measurements as they arrive: (tick, time of arrival), in order of arrival, on a clock with any offset and drift.
 
-    What the receiver's clock makes of the plant's period differs from it by up to 1 %. Frames are dropped, ticks are
-    skipped, frames overtake each other, and each is held up for less than 3/4 of the counter's range; the clocks' 1 %, of
-    a gap before the frame and of the ticks that overtook it, counts towards that. The first frame, and one in every `counters` ticks, is late by an
-    eighth of the range at the most, so that the mark, which moves by 3 % of a tick against the true grid, cannot be
-    more than a quarter of the range late.
+    The receiver's clock sees periods that are longer or shorter by up to 1 %. Frames are dropped, ticks are skipped,
+    frames overtake each other, and each is held up for less than 3/4 of the counter's range. Towards that counts what
+    the clocks drift, 1 %, over a gap before the frame and over the ticks that overtook it. The first frame, and one in
+    every `counters` ticks, is late by an eighth of the range at the most, so that the mark, which moves by 3 % of a
+    period a tick against the true grid, is never a quarter of the range late.
     """
 
     counters: int

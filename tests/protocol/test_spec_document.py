@@ -25,9 +25,9 @@ SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
 
 QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
 KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes | levels |"
-FRAMES: Final = "| frame | bits of ε, ω / u | actuators | counter | codes | hex |"
-SENT: Final = "| heartbeat_s | period in ms | codes | ticks that send |"
-REFUSED: Final = "| frame | bits of ε, ω / u | actuators | hex | why |"
+FRAMES: Final = "| frame | counter bits | bits of ε, ω / u | actuators | counter | codes | hex |"
+SENT: Final = "| heartbeat_s | period in ms | counter bits | codes | ticks that send | their counters |"
+REFUSED: Final = "| frame | counter bits | bits of ε, ω / u | actuators | hex | why |"
 
 Row = tuple[str, ...]
 
@@ -69,17 +69,17 @@ def number(text: str) -> int:
     return int(found[1].replace("−", "-"))
 
 
-def form(frame: str, bits: str, actuators: str) -> FrameFormat:
+def form(frame: str, counter_bits: str, bits: str, actuators: str) -> FrameFormat:
     """The format that the first cells of a row describe."""
     widths = [cell.strip() for cell in bits.split(",")]
-    wire: dict[str, object]
+    wire: dict[str, object] = {"counter_bits": int(counter_bits)}
     if frame == "measurement":
         attitude, rate = widths
-        wire = {"attitude": {"bits": as_bits(attitude), "limit": 1.0}, "rate": {"bits": as_bits(rate), "limit": 1.0}}
+        wire |= {"attitude": {"bits": as_bits(attitude), "limit": 1.0}, "rate": {"bits": as_bits(rate), "limit": 1.0}}
         return WireSpec.model_validate(wire).measurement
     assert frame == "command", f"{frame!r} is neither a measurement nor a command"
     (voltage,) = widths
-    wire = {"voltage": {"bits": as_bits(voltage), "limit": 24.0}, "actuators": int(actuators)}
+    wire |= {"voltage": {"bits": as_bits(voltage), "limit": 24.0}, "actuators": int(actuators)}
     return WireSpec.model_validate(wire).command
 
 
@@ -93,7 +93,7 @@ def as_bits(text: str) -> int | str:
     [
         pytest.param(QUANTIZER_ROWS, 6, id="quantizer"),
         pytest.param(KIND_ROWS, 14, id="kinds"),
-        pytest.param(FRAME_ROWS, 8, id="frames"),
+        pytest.param(FRAME_ROWS, 14, id="frames"),
         pytest.param(REFUSED_ROWS, 4, id="refused"),
         pytest.param(SENT_ROWS, 8, id="sent"),
     ],
@@ -135,8 +135,8 @@ def test_the_other_kinds_give_their_golden_vectors(row: Row) -> None:
 
 @pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)
 def test_frames_are_their_golden_vectors(row: Row) -> None:
-    frame, bits, actuators, counter, codes, text = row
-    layout = form(frame, bits, actuators)
+    frame, counter_bits, bits, actuators, counter, codes, text = row
+    layout = form(frame, counter_bits, bits, actuators)
     expected = [
         float(code) if width is None else int(code) for width, code in zip(layout.widths, codes.split(), strict=True)
     ]
@@ -146,22 +146,26 @@ def test_frames_are_their_golden_vectors(row: Row) -> None:
     assert arrived is not None
     assert arrived[0] == int(counter)
     assert [repr(code) for code in arrived[1]] == [repr(code) for code in expected]  # repr: NaN equals itself
+    assert layout.counter(bytes.fromhex(text)) == int(counter)
 
 
 @pytest.mark.parametrize("row", REFUSED_ROWS, ids=" ".join)
 def test_golden_vectors_that_must_be_refused_are_refused(row: Row) -> None:
-    frame, bits, actuators, text, why = row
+    frame, counter_bits, bits, actuators, text, why = row
     assert why
-    assert form(frame, bits, actuators).unpack(bytes.fromhex(text)) is None
+    assert form(frame, counter_bits, bits, actuators).unpack(bytes.fromhex(text)) is None
 
 
 @pytest.mark.parametrize("row", SENT_ROWS, ids=" ".join)
 def test_frames_are_sent_as_their_golden_vectors_say(row: Row) -> None:
-    heartbeat_s, period_ms, codes, ticks = row
-    heartbeat = Transmit(heartbeat_s=float(heartbeat_s)).heartbeat_ticks(int(period_ms) * 1_000_000)
-    sender, invalid = Sender("on_change", heartbeat), [nan]  # an end has one list that says no valid value
+    heartbeat_s, period_ms, counter_bits, codes, ticks, counted = row
+    counters = 2 ** int(counter_bits)
+    heartbeat = Transmit(heartbeat_s=float(heartbeat_s)).heartbeat_ticks(int(period_ms) * 1_000_000, counters)
+    sender, invalid = Sender("on_change", heartbeat, counters), [nan]  # an end has one list that says no valid value
     computed = [(k, invalid if code == "NaN" else [float(code)]) for k, code in enumerate(codes.split()) if code != "."]
-    assert [k for k, code in computed if sender.due(k, code)] == [int(tick) for tick in ticks.split()]
+    sent = [k for k, code in computed if sender.due(k, code)]
+    assert sent == [int(tick) for tick in ticks.split()]
+    assert [k % counters for k in sent] == [int(counter) for counter in counted.split()]
 
 
 def test_the_table_of_topics_is_that_of_the_code() -> None:

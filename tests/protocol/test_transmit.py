@@ -6,20 +6,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.frames import COUNTERS
-from protocol.transmit import MOST_TICKS, Sender, Transmit
+from protocol.transmit import Sender, Transmit
 from protocol.wire import WireSpec
 
 PERIOD_NS = 2_000_000
-HEARTBEATS = st.integers(1, MOST_TICKS)
+COUNTERS = 16
+HEARTBEATS = st.integers(1, COUNTERS // 2 - 1)
 CODES = st.tuples(st.integers(-1, 1), st.integers(0, 1))  # few, so that most ticks repeat the last
 RUN = st.lists(CODES, min_size=1, max_size=100)
-STEPS = st.lists(st.tuples(st.sampled_from((1, 1, 1, 2, 15, 16, 17, 32)), CODES), min_size=1, max_size=60)
+STEPS = st.lists(
+    st.tuples(st.sampled_from((1, 1, 1, 2, COUNTERS - 1, COUNTERS, COUNTERS + 1, 2 * COUNTERS)), CODES),
+    min_size=1,
+    max_size=60,
+)
 
 
 @given(RUN, HEARTBEATS)
 def test_whoever_hears_the_frames_knows_the_codes_of_every_tick(run: list[tuple[int, int]], heartbeat: int) -> None:
-    sender, held = Sender("on_change", heartbeat), None
+    sender, held = Sender("on_change", heartbeat, COUNTERS), None
     for k, codes in enumerate(run):
         if sender.due(k, codes):
             held = codes
@@ -30,7 +34,7 @@ def test_whoever_hears_the_frames_knows_the_codes_of_every_tick(run: list[tuple[
 def test_without_a_change_a_frame_is_sent_exactly_a_heartbeat_after_the_last(
     run: list[tuple[int, int]], heartbeat: int
 ) -> None:
-    sender = Sender("on_change", heartbeat)
+    sender = Sender("on_change", heartbeat, COUNTERS)
     sent = [k for k, codes in enumerate(run) if sender.due(k, codes)]
     assert sent[0] == 0
     for last, k in zip(sent, [*sent[1:], len(run)], strict=True):
@@ -43,7 +47,7 @@ def test_without_a_change_a_frame_is_sent_exactly_a_heartbeat_after_the_last(
 def test_where_ticks_are_missed_a_change_still_reaches_who_takes_a_repeated_counter_for_a_repetition(
     steps: list[tuple[int, tuple[int, int]]], heartbeat: int
 ) -> None:
-    sender, k = Sender("on_change", heartbeat), -1
+    sender, k = Sender("on_change", heartbeat, COUNTERS), -1
     echo, held, ticks_wrong = -1, None, 0
     for ahead, codes in steps:
         k += ahead
@@ -56,12 +60,12 @@ def test_where_ticks_are_missed_a_change_still_reaches_who_takes_a_repeated_coun
 
 @given(RUN)
 def test_a_periodic_sender_sends_at_every_tick(run: list[tuple[int, int]]) -> None:
-    sender = Sender("periodic", 3)
+    sender = Sender("periodic", 3, COUNTERS)
     assert all(sender.due(k, codes) for k, codes in enumerate(run))
 
 
 def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None:
-    sender = Sender("on_change", 15)
+    sender = Sender("on_change", 7, COUNTERS)
     assert [sender.due(k, (1, 2)) for k in range(3)] == [True, False, False]
     sender.forget()
     assert [sender.due(k, (1, 2)) for k in range(3, 6)] == [True, False, False]
@@ -79,38 +83,40 @@ def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None
     ],
 )
 def test_a_frame_whose_bits_differ_is_sent(before: tuple[float, ...], now: tuple[float, ...], sent: bool) -> None:
-    sender = Sender("on_change", 15)
+    sender = Sender("on_change", 7, COUNTERS)
     assert sender.due(0, before)
     assert sender.due(1, now) == sent
 
 
 def test_no_valid_value_is_said_once_and_repeated_by_heartbeat_only() -> None:
     for invalid in ([-32, -32], [float("nan")] * 2):
-        sender = Sender("on_change", 15)
-        assert [k for k in range(40) if sender.due(k, invalid)] == [0, 15, 30]
+        sender = Sender("on_change", 7, COUNTERS)
+        assert [k for k in range(20) if sender.due(k, invalid)] == [0, 7, 14]
 
 
 @pytest.mark.parametrize(
-    ("heartbeat_s", "period_ns", "ticks"),
+    ("heartbeat_s", "period_ns", "bits", "ticks"),
     [
-        (0.03, PERIOD_NS, 15),
-        (0.03, 1_000_000, 15),  # four bits of counter allow no more
-        (0.03, 20_000_000, 1),
-        (0.03, 200_000_000, 1),  # a period alone is longer
-        (1.0, 100_000, 15),
-        (0.0059, PERIOD_NS, 2),
+        (0.03, PERIOD_NS, 8, 15),
+        (0.03, PERIOD_NS, 4, 7),  # four bits of counter allow no more
+        (0.03, 20_000_000, 8, 1),
+        (0.03, 200_000_000, 8, 1),  # a period alone is longer
+        (1.0, PERIOD_NS, 8, 127),
+        (1.0, PERIOD_NS, 10, 500),
+        (1.0, 100_000, 16, 10_000),
+        (0.0059, PERIOD_NS, 8, 2),
     ],
 )
 def test_the_heartbeat_in_ticks_is_what_fits_into_its_time_and_the_counter(
-    heartbeat_s: float, period_ns: int, ticks: int
+    heartbeat_s: float, period_ns: int, bits: int, ticks: int
 ) -> None:
-    assert Transmit(heartbeat_s=heartbeat_s).heartbeat_ticks(period_ns) == ticks
+    assert Transmit(heartbeat_s=heartbeat_s).heartbeat_ticks(period_ns, 2**bits) == ticks
 
 
-@given(HEARTBEATS, st.integers(100, 66_000))
+@given(st.integers(1, 127), st.integers(10, 7_800))
 def test_a_heartbeat_of_so_many_periods_is_as_many_ticks(ticks: int, period_us: int) -> None:
     """However the binary fraction of it is rounded."""
-    assert Transmit(heartbeat_s=ticks * period_us / 1e6).heartbeat_ticks(period_us * 1000) == ticks
+    assert Transmit(heartbeat_s=ticks * period_us / 1e6).heartbeat_ticks(period_us * 1000, 256) == ticks
 
 
 def test_one_word_stands_for_both_directions() -> None:

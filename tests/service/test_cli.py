@@ -91,7 +91,7 @@ def test_a_log_that_cannot_be_written_exits_with_1(capfd: pytest.CaptureFixture[
 
 def test_the_shown_configuration_read_back_is_the_same(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
-    overrides = ("--set", "wire.attitude.bits=cont", "--set", "loop.rate_hz=1000", "--set", "controller.stale_s=0.2")
+    overrides = ("--set", "wire.attitude.bits=cont", "--set", "loop.rate_hz=1000", "--set", "controller.stale_s=0.05")
     assert run(["show", "config", *overrides]) == 0
     path.write_text(capfd.readouterr().out)
     shown = load(path)

@@ -14,7 +14,7 @@ import pytest
 from plant_emulator.endpoint import Endpoint
 from plant_emulator.settings import IDEAL_AERO, PlantSettings
 from protocol.attitude import Quaternion, Vector, sent_vector
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Claim, Grant
 from protocol.verbs import Sinusoid
 from protocol.wire import WireSpec
@@ -23,6 +23,8 @@ from service.law import LawSettings
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD = 0.002
 PERIOD_NS = 2_000_000
@@ -101,10 +103,14 @@ def test_nothing_in_gives_nothing_out() -> None:
 
 @pytest.mark.parametrize("wire", [QUANTIZED, CONTINUOUS], ids=["8/6 bits", "cont"])
 def test_malformed_bytes_are_counted_and_give_nothing_out(wire: WireSpec) -> None:
+    quantized, wire = (
+        wire is QUANTIZED,
+        WireSpec.model_validate({**wire.model_dump(), "counter_bits": 4}),
+    )  # has padding
     controller, untouched = _controller(wire), _controller(wire)
     frame = _frame(wire, 7, _yawed(0.3), (0.1, 0.2, 0.3))
     # 8 bits: the padding's last bit is set; cont: a bit of the gap after the counter is
-    padding = frame[:-1] + bytes([frame[-1] | 1]) if wire is QUANTIZED else bytes([frame[0] | 1]) + frame[1:]
+    padding = frame[:-1] + bytes([frame[-1] | 1]) if quantized else bytes([frame[0] | 1]) + frame[1:]
     for k, junk in enumerate((b"", frame[:-1], frame + b"\0", padding)):
         assert controller.tick(junk, k) is None
         assert controller.refused == k + 1

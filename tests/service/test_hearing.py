@@ -11,13 +11,15 @@ from collections.abc import Iterable, Mapping
 import pytest
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.links import Arrival
 from protocol.transmit import SILENCE, Sender
 from protocol.wire import WireSpec
 from service import hearing
 from service.hearing import Heard, Hearing
 from tests.service.logs.silent_loop import LOOP, PERIOD_NS, START_NS, Wire, wire_of
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 WIRE = wire_of("on_change", "on_change")
 DELAY_NS = 200_000
@@ -78,7 +80,7 @@ def until(k: int) -> int:
 
 def heartbeats(last: int, codes: Mapping[int, int] | None = None) -> list[Arrival]:
     """Arrivals of a plant whose code becomes what `codes` say at their ticks."""
-    sender, code, sent = Sender("on_change", 15), 0, []
+    sender, code, sent = Sender("on_change", 15, COUNTERS), 0, []
     for k in range(last + 1):
         code = (codes or {}).get(k, code)
         if sender.due(k, (code,)):
@@ -179,7 +181,7 @@ def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(
     assert not any(each.late or each.missed for each in heard)
 
 
-@pytest.mark.parametrize("nonsense", [SILENCE, b"\0", frame(5)[:-1] + b"\1"], ids=["empty", "short", "padding"])
+@pytest.mark.parametrize("nonsense", [SILENCE, b"\0", frame(5) + b"\0"], ids=["empty", "short", "long"])
 def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     ear = Ear([arrival(0), *(arrival(k, content=nonsense) for k in range(1, 9))], monkeypatch)
     heard = ear.listen(until(8))

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol import clock, role, topics
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.messages import Event
 from protocol.network import NetworkSettings
 from protocol.role import Role
@@ -41,6 +41,8 @@ from service.controller import Controller
 from service.law import LawSettings
 from service.live import Live
 from service.settings import ControllerSettings
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD = 0.002
 LAW = LawSettings()

@@ -9,7 +9,7 @@ import pytest
 
 import service.examples
 from protocol.attitude import sent_vector
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.transmit import SILENCE, Policy, Transmit
 from protocol.verbs import Sinusoid
 from protocol.wire import WireSpec
@@ -18,6 +18,8 @@ from service.controller import Controller
 from service.figures import Figures
 from service.lab.experiment import run_experiment
 from service.law import LawSettings
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD = 0.002
 DURATION = 1.5
@@ -99,7 +101,7 @@ def test_a_command_is_sent_when_its_codes_change_or_the_heartbeat_is_due() -> No
     for k in range(200):
         frame = periodic.tick(measurement(k), k)
         assert frame is not None
-        codes = bytes([frame[0] & 0x0F]) + frame[1:]
+        codes = frame[1:]
         due = codes != last or k - sent_at == 15
         assert sparse.tick(measurement(k), k) == (frame if due else SILENCE)
         if due:
@@ -142,7 +144,11 @@ def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_ho
         (("plant.watchdog_s=0.05",), "plant.watchdog_s, which is 50 ms"),
         (("controller.stale_s=0.059",), "controller.stale_s, which is 59 ms"),
         (("wire.transmit.heartbeat_s=0.06", "loop.rate_hz=100"), "60 ms pass without a command"),
-        (("loop.rate_hz=250", "wire.transmit.heartbeat_s=1"), "60 ms pass without a command"),
+        (("loop.rate_hz=250", "wire.transmit.heartbeat_s=1"), "508 ms pass without a command"),  # 127 ticks
+        (
+            ("loop.rate_hz=100", "wire.transmit.heartbeat_s=1", "wire.counter_bits=5"),
+            "150 ms pass without a command",  # 15 ticks
+        ),
     ],
 )
 def test_a_heartbeat_that_cannot_keep_both_ends_alive_is_refused_in_one_line(
@@ -159,7 +165,7 @@ def test_a_heartbeat_that_cannot_keep_both_ends_alive_is_refused_in_one_line(
     "overrides",
     [
         ("plant.watchdog_s=0.06", "controller.stale_s=0.06"),
-        ("loop.rate_hz=1000", "plant.watchdog_s=0.03", "controller.stale_s=0.03"),  # 15 ticks are 15 ms
+        ("loop.rate_hz=1000", "wire.transmit.heartbeat_s=0.05"),  # half the watchdog, 50 ticks
         ("loop.rate_hz=5",),  # a period alone is longer, and every tick has a frame as ever
         ("loop.rate_hz=100", "wire.transmit.heartbeat_s=0.05"),
         ("loop.lockstep=true", "plant.watchdog_s=0.01"),  # silence travels there, and is an answer

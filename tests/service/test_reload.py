@@ -40,7 +40,7 @@ def test_a_configuration_that_is_the_same_says_nothing(role: str) -> None:
             "reference.amplitude=[0.0, 0.0, 1.0]",
             "reference.amplitude: [0.0, 40.0, 100.0] → [0.0, 0.0, 1.0]",
         ),
-        ("controller", "controller.stale_s=0.5", "controller.stale_s: 0.1 → 0.5"),
+        ("controller", "controller.stale_s=0.2", "controller.stale_s: 0.1 → 0.2"),
         ("controller", "controller.telemetry_rate_hz=5", "controller.telemetry_rate_hz: 50.0 → 5.0"),
         ("controller", "controller.max_reference_rate=2", "controller.max_reference_rate: 1.0 → 2.0"),
         ("controller", "controller.max_reference_tilt_deg=9", "controller.max_reference_tilt_deg: 60.0 → 9.0"),
@@ -91,7 +91,7 @@ def test_what_does_not_is_told_to_need_a_restart(role: str, override: str, line:
         ("wire.rate.bits=10", {"controller", "plant"}),
         ("law.C1=[1.0, 1.0, 1.0]", {"controller"}),
         ("reference.kind=hold", {"controller"}),
-        ("controller.stale_s=0.5", {"controller"}),
+        ("controller.stale_s=0.2", {"controller"}),
         ("plant.watchdog_s=0.2", {"plant"}),
         ("recorder.chunk_s=2", {"recorder"}),
     ],
@@ -114,9 +114,9 @@ def test_another_kind_of_reference_is_told_key_by_key_and_takes_effect_at_once()
 
 
 def test_several_differences_are_told_a_line_each_in_order_and_each_for_itself() -> None:
-    lines = changed("controller", "law.mass=2", "law.C1=[1.0, 1.0, 1.0]", "controller.stale_s=0.5")
+    lines = changed("controller", "law.mass=2", "law.C1=[1.0, 1.0, 1.0]", "controller.stale_s=0.2")
     assert lines == [
-        "controller.stale_s: 0.1 → 0.5",
+        "controller.stale_s: 0.1 → 0.2",
         "law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]",
         "law.mass: 1.075 → 2.0, after a restart",
     ]

@@ -53,13 +53,15 @@ def test_the_grid_is_every_combination_and_float64_once_for_each_of_the_sensors(
 
 
 def test_a_cell_is_the_configuration_with_its_own_wire_and_sensors() -> None:
-    wire_overrides = ["wire.rate.limit=2.5", "wire.rate.deadzone=0.01", "wire.transmit=on_change"]
+    wire_overrides = [
+        "wire.rate.limit=2.5", "wire.rate.deadzone=0.01", "wire.transmit=on_change", "wire.counter_bits=10"
+    ]  # fmt: skip
     mine = load(overrides=[*wire_overrides, "plant.sensors.gyro_bias=[0.1, 0, 0]"])
     cell = next(cell for cell in grid(mine, ["9/7"], ["uniform"], ["gyro"]) if cell.quantizer)
     settings = cell_settings(mine, cell)
     wire, sensors = settings.wire, settings.plant.sensors
     assert (wire.attitude.bits, wire.rate.bits, wire.voltage.bits) == (9, 9, 7)
-    assert (wire.rate.limit, wire.rate.deadzone) == (2.5, 0.01)
+    assert (wire.rate.limit, wire.rate.deadzone, wire.counter_bits) == (2.5, 0.01, 10)
     assert (wire.transmit.measurement, wire.transmit.command) == ("periodic", "periodic")
     assert (sensors.rate, sensors.gyro_noise, sensors.gyro_bias) == ("gyro", 0.002, (0.1, 0.0, 0.0))
     assert settings.law == mine.law
@@ -140,7 +142,7 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
 
 def test_the_command_tells_every_point_beside_float64(document: tuple[str, Path]) -> None:
     told = json.loads(document[0])
-    assert (told["duration_s"], told["rate_hz"], told["heartbeat_s"]) == (4.0, 500.0, 0.03)
+    assert [told[name] for name in ("duration_s", "rate_hz", "heartbeat_s", "counter_bits")] == [4.0, 500.0, 0.03, 8]
     assert list(told["sensors"]) == ["encoders"]
     points = {(point["bits_out"], point["transmit"]): point for point in told["points"]}
     assert len(points) == len(told["points"]) == 6
@@ -149,14 +151,14 @@ def test_the_command_tells_every_point_beside_float64(document: tuple[str, Path]
     baseline = points[None, "periodic"]
     assert always["z_track"] == changed["z_track"] > baseline["z_track"] > 0
     assert always["measurement"]["bits_per_s"] == 28000
-    assert always["command"]["can_bits_per_s"] == 500 * 75
-    assert always["can_load"] == pytest.approx(0.1)
+    assert always["command"]["can_bits_per_s"] == 500 * 85
+    assert always["can_load"] == pytest.approx(0.105)
     assert changed["bits_per_s"] < always["bits_per_s"]
     assert changed["against_float64"]["bits_per_s"] == pytest.approx(changed["bits_per_s"] / 264000)
     assert set(baseline["against_float64"].values()) == {1.0}
     assert changed["pareto"]
     assert not always["pareto"]
-    for direction, size in (("measurement", 7), ("command", 2)):
+    for direction, size in (("measurement", 7), ("command", 3)):
         most, least = always["zenoh_bytes_per_s"][direction], changed["zenoh_bytes_per_s"][direction]
         assert most > least > changed[direction]["frames_per_s"] * size
 
@@ -189,3 +191,15 @@ def test_the_markdown_is_a_table_with_a_row_for_each_experiment(document: tuple[
     assert "★" in rows[2]
     assert any("voltage limit" in line for line in lines)
     assert any(line.startswith("Counted on a Zenoh link") for line in lines)
+
+
+def test_the_table_says_what_the_counter_costs_and_what_a_bare_frame_saves(document: tuple[str, Path]) -> None:
+    burden = Burden.model_validate_json(document[0])
+    for bits, line in (
+        (8, "500 + 500 frames/s carry 8 kbit/s of it; 4 bits would carry 4, padding apart."),
+        (10, "500 + 500 frames/s carry 10 kbit/s of it; 4 bits would carry 4, padding apart."),
+        (4, "500 + 500 frames/s carry 4 kbit/s of it, padding apart."),
+    ):
+        text = markdown(burden.model_copy(update={"counter_bits": bits}))
+        assert f"The counter has {bits} bits: at every tick {line}" in text
+        assert "47 bytes on a Zenoh link: every tick, that saves 23.5 + 23.5 kB/s." in text

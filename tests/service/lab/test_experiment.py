@@ -78,8 +78,8 @@ def test_every_tick_is_judged_and_traffic_is_that_of_the_frames() -> None:
     assert quantized.duration_s == 2.0
     assert quantized.skipped_ticks == 0
     assert (quantized.measurement.frames_per_s, quantized.command.frames_per_s) == (500.0, 500.0)
-    # 4 + 6·8 = 52 bits are 7 bytes; 4 + 2·6 = 16 bits are 2 bytes
-    assert (quantized.measurement.bits_per_s, quantized.command.bits_per_s) == (28_000.0, 8_000.0)
+    # 8 + 6·8 = 56 bits are 7 bytes; 8 + 2·6 = 20 bits are 3 bytes
+    assert (quantized.measurement.bits_per_s, quantized.command.bits_per_s) == (28_000.0, 12_000.0)
     assert set(quantized.reasons) == {"latency_us", "log"}  # what is null says why
     assert (quantized.latency_us, quantized.log) == (None, None)
 

@@ -11,18 +11,18 @@ from service.lab.burden import POLICIES, observe
 from service.lab.experiment import run_experiment
 from service.lab.traffic import codes_of, sent_ticks, traffic
 
-KIND = FrameFormat([6, 6])
+KIND = FrameFormat([6, 6], 4)
 CODES = [(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)]
 PERIOD = 0.01
 
 
 def test_every_tick_is_sent_when_periodic() -> None:
-    assert sent_ticks(CODES, "periodic", 4) == list(range(10))
+    assert sent_ticks(CODES, "periodic", 4, 16) == list(range(10))
 
 
 def test_on_change_sends_what_is_new_and_a_heartbeat_after_so_many_ticks() -> None:
-    assert sent_ticks(CODES, "on_change", 4) == [0, 2, 3, 7]
-    assert sent_ticks(CODES, "on_change", 15) == [0, 2, 3]
+    assert sent_ticks(CODES, "on_change", 4, 16) == [0, 2, 3, 7]
+    assert sent_ticks(CODES, "on_change", 7, 16) == [0, 2, 3]
 
 
 def test_rates_are_over_all_ticks_and_intervals_between_frames_sent() -> None:
@@ -46,7 +46,7 @@ def test_changes_do_not_depend_on_what_was_sent() -> None:
 
 
 def test_a_frame_longer_than_a_classic_one_counts_as_several() -> None:
-    floats = FrameFormat([None, None])
+    floats = FrameFormat([None, None], 4)
     seen = traffic([(0.0, 1.0)] * 4, floats, range(4), PERIOD)
     assert floats.size == 17
     assert seen.can_frames == 3
@@ -81,10 +81,11 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
     assert seen.figures is not None
     assert (seen.figures.z_track, seen.figures.u_total) == (figures.z_track, figures.u_total)
     assert list(seen.traffic) == list(POLICIES)
-    heartbeat = settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns)
     wire = settings.wire
+    counters = wire.measurement.counters
+    heartbeat = wire.transmit.heartbeat_ticks(settings.loop.period_ns, counters)
     for i, (kind, told) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
-        sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat)
+        sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat, counters)
         assert [k for k, frames in enumerate(heard) if frames[i] != SILENCE] == sent
         assert [heard[k][i] for k in sent] == [said[k][i] for k in sent]
         reckoned = seen.traffic["on_change"][i]

@@ -14,12 +14,14 @@ from typing import Literal
 import pytest
 
 from protocol.clock import LoopSettings
-from protocol.frames import COUNTERS
+from protocol.frames import DEFAULT_COUNTER_BITS
 from protocol.links import Arrival, Link
 from protocol.messages import Lapse, Telemetry
 from protocol.transmit import SILENCE, Policy, Sender, Transmit
 from protocol.wire import WireSpec
 from service import hearing
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
 PERIOD_NS = 2_000_000
 START_NS = 1_800_000_000_000_000_000
@@ -115,7 +117,7 @@ def run(seed: int, wire: WireSpec, monkeypatch: pytest.MonkeyPatch, *, own_grid:
         link.now_ns = chance.randrange(PERIOD_NS)
         monkeypatch.setattr("protocol.clock.time", link)
     heard_by = hearing.Hearing(link, LOOP, wire, own_grid=own_grid)
-    sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(PERIOD_NS))
+    sender = Sender(wire.transmit.command, wire.transmit.heartbeat_ticks(PERIOD_NS, COUNTERS), COUNTERS)
     k = -1
     held: Codes = ()
     said: Codes = (0, 0)
@@ -148,7 +150,7 @@ def run(seed: int, wire: WireSpec, monkeypatch: pytest.MonkeyPatch, *, own_grid:
 
 
 def _plant(wire: WireSpec, ticks: int, takes, chance: random.Random, logged: Logged) -> list[Arrival]:  # type: ignore[no-untyped-def]
-    sender = Sender(wire.transmit.measurement, wire.transmit.heartbeat_ticks(PERIOD_NS))
+    sender = Sender(wire.transmit.measurement, wire.transmit.heartbeat_ticks(PERIOD_NS, COUNTERS), COUNTERS)
     garbled, lost = chance.choice([0.0, 0.05]), chance.choice([0.0, 0.05])  # lost on the way to the controller only
     number = 0
     codes: Codes = (0,) * 6
