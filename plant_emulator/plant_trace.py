@@ -93,7 +93,7 @@ class PlantTrace:
             end.operations.clear()
         session = end.session or ""
         if session != writer.session:
-            if not writer.empty:
+            if writer.session or not writer.empty:  # a session's last batch says so, with or without rows
                 self._take(final=bool(writer.session))
             writer.session = session
         elif not session and not writer.empty:
@@ -101,7 +101,7 @@ class PlantTrace:
 
     def finish(self) -> None:
         """The process ends: publish all that waits."""
-        if not self._writer.empty:
+        if self._writer.session or not self._writer.empty:
             self._take(final=bool(self._writer.session))
 
     def _take(self, *, final: bool) -> None:
