@@ -1,4 +1,4 @@
-"""The plant's trace as a driver's loop writes it: a row for every tick of a session, and what was done between ticks."""
+"""The plant's trace as a driver's loop writes it: a row for every tick of a session, what was done between ticks."""
 
 from __future__ import annotations
 
