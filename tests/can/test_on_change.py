@@ -63,7 +63,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
     link = CanLink(bus, wire, end, lockstep=lockstep)  # type: ignore[arg-type]  # is one of both
     try:
         with Stranger(bus) as stranger:
-            frame = bytes(2) if end == "plant" else bytes(7)
+            frame = bytes((wire.command if end == "plant" else wire.measurement).size)
             identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
             stranger.say(identifier, frame)
             stranger.say(identifier, SILENCE)

@@ -126,7 +126,7 @@ def test_a_trip_is_the_sessions_last_row_with_its_cause(
 @pytest.mark.parametrize(
     ("frame", "received_as", "outcome"),
     [
-        (b"\1" * (WIRE.command.size + 1), Sent.MALFORMED, Outcome.MALFORMED),
+        (WIRE.command.pack(38, (3, -3)) + b"\0", Sent.MALFORMED, Outcome.MALFORMED),  # the rest would be fresh
         (b"\1", Sent.MALFORMED, Outcome.MALFORMED),
         (SILENCE, Sent.SILENT, Outcome.MALFORMED),
         (b"\xff" * WIRE.command.size, Sent.FRAME, Outcome.MALFORMED),
