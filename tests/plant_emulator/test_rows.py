@@ -1,4 +1,4 @@
-"""The plant's trace as a driver's loop writes it: a row for every tick of a session, and what was done between ticks."""
+"""The plant's trace as a driver's loop writes it: a row for every tick of a session, what was done between ticks."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_a_trip_is_the_sessions_last_row_with_its_cause(
 @pytest.mark.parametrize(
     ("frame", "received_as", "outcome"),
     [
-        (b"\1" * (WIRE.command.size + 1), Sent.MALFORMED, Outcome.MALFORMED),
+        (WIRE.command.pack(38, (3, -3)) + b"\0", Sent.MALFORMED, Outcome.MALFORMED),  # the rest would be fresh
         (b"\1", Sent.MALFORMED, Outcome.MALFORMED),
         (SILENCE, Sent.SILENT, Outcome.MALFORMED),
         (b"\xff" * WIRE.command.size, Sent.FRAME, Outcome.MALFORMED),
