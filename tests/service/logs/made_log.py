@@ -12,8 +12,8 @@ from protocol.messages import Claim, Contract
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
-from service.recording.intake import Taken
 from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from service.recording.intake import Taken
 from service.recording.log_file import LogFile
 from service.reference import Plan
 from service.telling import telemetry_of

@@ -21,11 +21,11 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
-from service.recording import rolling
 from service.logs.export import export
-from service.recording.intake import Taken
 from service.logs.mcap_file import records
 from service.logs.recover import RecoverError, recover
+from service.recording import rolling
+from service.recording.intake import Taken
 from service.settings import RecorderSettings
 from tests.service.logs.made_log import make_log
 

@@ -1,0 +1,123 @@
+"""Copies the records of MCAP files, whole or broken, into one new file, with ids of its own.
+
+Messages keep their topic, schema, times and sequence. What several files repeat is written once: schemas, channels,
+attachments, and a metadata record that says what the last one of its name and key has said.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import Writer
+
+from service.logs.mcap_file import CHUNK_BYTES, Damage, records
+
+Follow = Callable[[Message], None]
+"""Called with each message of a channel after it was copied."""
+
+
+def _only_copy(_: Message) -> None:
+    """Nothing follows a message."""
+
+
+class McapCopy:
+    """A new file, and what has been copied into it.
+
+    Args:
+        out: The file, empty.
+        library: Its writer's name.
+
+    Attributes:
+        messages: Messages written.
+        topics: Topics of the channels written.
+    """
+
+    def __init__(self, out: BinaryIO, library: str) -> None:
+        self.messages = 0
+        self.topics: set[str] = set()
+        self._writer = Writer(out, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        self._schemas: dict[Hashable, int] = {}
+        self._channels: dict[Hashable, int] = {}
+        self._attachments: set[Hashable] = set()
+        self._metadata: dict[Hashable, dict[str, str]] = {}  # the last of each name and key
+        self._writer.start(profile="aeroloop", library=library)
+
+    def file(
+        self,
+        path: Path,
+        damages: list[Damage],
+        progress: Callable[[int], None],
+        follow: Callable[[str], Follow | None] = lambda _: _only_copy,
+    ) -> None:
+        """Copy what a file holds.
+
+        Args:
+            path: The file.
+            damages: What could not be read is appended.
+            progress: Called after each chunk with the bytes read so far.
+            follow: Called with the topic of each channel: what follows its messages, or None to leave them out.
+
+        Raises:
+            NotMcapError: It is no MCAP file.
+            OSError: It cannot be read, or the new one cannot be written.
+        """
+        schemas = {0: 0}  # of the new file, by the ids of this one
+        channels: dict[int, tuple[int, Follow] | None] = {}
+        for record in records(path, damages, progress):
+            if isinstance(record, Message):
+                if (known := channels[record.channel_id]) is not None:
+                    channel, follower = known
+                    self.add(channel, record.log_time, record.publish_time, record.data, record.sequence)
+                    follower(record)
+            elif isinstance(record, Schema):
+                schemas[record.id] = self.schema(record.name, record.encoding, record.data)
+            elif isinstance(record, Channel) and record.id not in channels:
+                follower_or_none = follow(record.topic)
+                schema = schemas.get(record.schema_id, 0)
+                channels[record.id] = follower_or_none and (
+                    self.channel(record.topic, record.message_encoding, schema, record.metadata),
+                    follower_or_none,
+                )
+            elif isinstance(record, Metadata):
+                which = record.name, record.metadata.get("key")
+                if self._metadata.get(which) != record.metadata:
+                    self._metadata[which] = record.metadata
+                    self._writer.add_metadata(record.name, record.metadata)
+            elif isinstance(record, Attachment):
+                self._attach(record)
+
+    def add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int = 0) -> None:
+        """Add a message; times in ns since 1970."""
+        self._writer.add_message(channel, log_time, data, publish_time, sequence)
+        self.messages += 1
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Id of a schema in the new file."""
+        what = name, encoding, data
+        if what not in self._schemas:
+            self._schemas[what] = self._writer.register_schema(name, encoding, data)
+        return self._schemas[what]
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str] | None = None) -> int:
+        """Id of a channel in the new file; schema 0 is none."""
+        what = topic, encoding, schema, tuple((metadata or {}).items())
+        if what not in self._channels:
+            self._channels[what] = self._writer.register_channel(topic, encoding, schema, metadata or {})
+            self.topics.add(topic)
+        return self._channels[what]
+
+    def finish(self) -> None:
+        """Write the index. Nothing more can be added."""
+        self._writer.finish()
+
+    def _attach(self, record: Attachment) -> None:
+        what = record.name, hashlib.sha256(record.data).digest()
+        if what not in self._attachments:
+            self._attachments.add(what)
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
