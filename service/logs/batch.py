@@ -1,8 +1,8 @@
 """The controller over thousands of ticks at once, bit for bit what it computes a tick at a time.
 
-A log has all the measurements, so only the attitude's sign and θ̂ go from tick to tick. The law and the reference are the
-loop's own CasADi instructions, run over columns with a row a tick (protocol/symbolic.py, `law_of_many`), so the bits are the
-loop's (tests/service/logs/test_batch.py); a tick costs a microsecond instead of 15.
+A log has all the measurements, so only the attitude's sign and θ̂ go from tick to tick. The law and the reference are
+the loop's own CasADi instructions, run over columns with a row a tick (protocol/symbolic.py, `law_of_many`), so the
+bits are the loop's (tests/service/logs/test_batch.py); a tick costs a microsecond instead of 15.
 """
 
 from __future__ import annotations

@@ -103,7 +103,9 @@ def test_a_whole_file_gives_what_mcaps_own_reader_has(whole: Path, everything: l
     damages: list[Damage] = []
     assert read(whole, damages) == everything
     assert damages == []
-    named = [(one.answer, one.data) for one in messages(whole, lambda channel: channel.topic.endswith("/change") or None)]
+    named = [
+        (one.answer, one.data) for one in messages(whole, lambda channel: channel.topic.endswith("/change") or None)
+    ]
     assert named == [(True, one[-1]) for one in everything if one[0].endswith("/change")]
 
 
@@ -114,7 +116,10 @@ def test_a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut(
     ends = [part.offset + len(part.bytes) for part in parts_of_log(data) if part.opcode == Opcode.CHUNK]
     end = next(part.offset + len(part.bytes) for part in parts_of_log(data) if part.opcode == Opcode.DATA_END)
     of_chunk = len(everything) / len(ends)
-    for size in {*(rng.randrange(8, len(data)) for _ in range(300)), *(place + d for place in (*ends, end) for d in (-1, 0, 1))}:
+    for size in {
+        *(rng.randrange(8, len(data)) for _ in range(300)),
+        *(place + d for place in (*ends, end) for d in (-1, 0, 1)),
+    }:
         cut.write_bytes(data[:size])
         damages: list[Damage] = []
         got = read(cut, damages)
@@ -221,7 +226,9 @@ LIES: Final[dict[str, Callable[[], bytes]]] = {
     "a chunk with less than it claims": lambda: chunk_of(_unsized(bytes(100)), MAX_CHUNK),
     "a chunk that is not compressed, with less": lambda: chunk_of(bytes(100), 1000, ""),
     "an unknown compression": lambda: chunk_of(bytes(100), 100, "rar"),
-    "a record in a chunk that is longer than it": lambda: chunk_of(HEAD.pack(Opcode.MESSAGE, 1 << 60) + bytes(50), 59, ""),
+    "a record in a chunk that is longer than it": lambda: chunk_of(
+        HEAD.pack(Opcode.MESSAGE, 1 << 60) + bytes(50), 59, ""
+    ),
     "a message in a chunk that is too short": lambda: chunk_of(HEAD.pack(Opcode.MESSAGE, 2) + bytes(2), 11, ""),
 }
 
@@ -311,7 +318,9 @@ def test_a_damaged_chunk_that_the_index_steps_over_is_still_named_by_who_reads_t
     whole: Path, tmp_path: Path
 ) -> None:
     data = bytearray(whole.read_bytes())
-    chunk = [part.offset for part in parts_of_log(bytes(data)) if part.opcode == Opcode.CHUNK][-1]  # after the last change
+    chunk = [part.offset for part in parts_of_log(bytes(data)) if part.opcode == Opcode.CHUNK][
+        -1
+    ]  # after the last change
     data[chunk + 100] ^= 0xFF
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
