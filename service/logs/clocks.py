@@ -10,15 +10,17 @@ hitches make a way slow, never fast. What is unequal at the median stays in both
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import nan
+from typing import Final
 
 import numpy as np
 
 from service.logs.report import Array
 
-WINDOW = 512
+WINDOW: Final = 512
 """Ticks of a fit; two crystals part by less than a microsecond in a second."""
-_LEAST = 16
+_LEAST: Final = 16
 
 
 class ClockOffset:
@@ -41,7 +43,7 @@ class ClockOffset:
         """
         found = np.full(len(forward), self.last_ns)
         edges = [*range(0, max(1, len(forward) - WINDOW // 2), WINDOW), len(forward)]
-        for begin, end in zip(edges, edges[1:], strict=False):
+        for begin, end in pairwise(edges):
             there, back = forward[begin:end], backward[begin:end]
             known = np.flatnonzero(~np.isnan(there + back))
             if len(known) >= _LEAST:

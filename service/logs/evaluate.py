@@ -1,7 +1,8 @@
 """What the controller computed, from its own rows: every tick again, bit for bit.
 
 A row says what the controller had at a tick: a frame; silence, for which the levels of the last frame stand; or a frame
-that came late, whose levels hold from the next tick on. Where rows are missing, the next batch has the controller's state.
+that came late, whose levels hold from the next tick on. Where rows are missing, the next batch has the controller's
+state.
 """
 
 from __future__ import annotations

@@ -22,9 +22,9 @@ from protocol.topics import Address
 from service.config import ConfigError, Settings
 from service.logs.files import LogFiles, Progress, ReviewError
 from service.logs.runs import Block, Run, Taker
-from service.logs.tick_reader import TickReader
 from service.logs.table import Rows, Truths, groups
 from service.logs.table_files import FILES, ExportError, TableFile
+from service.logs.tick_reader import TickReader
 from service.logs.traces import Integers, Which
 
 Format = Literal["parquet", "csv", "mat", "mcap"]

@@ -14,8 +14,19 @@ from plant_emulator.settings import PlantSettings
 from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.messages import PROTOCOL_VERSION, Contract
+from protocol.verbs import Change
 from service.config import Settings, from_contract
-from service.logs.mcap_file import CONTRACT_METADATA, Damage, Logged, NotMcapError, messages, records, skim
+from service.logs.mcap_file import (
+    CHANGE_METADATA,
+    CONTRACT_METADATA,
+    Damage,
+    Logged,
+    NotMcapError,
+    messages,
+    records,
+    skim,
+)
+from service.logs.traces import Which
 
 METADATA_PREFIX: Final = "aeroloop."
 
@@ -38,6 +49,7 @@ class LogFiles:
         paths: The files, in the order of their first messages.
         contracts: Who took part, by vehicle and role; the last of each.
         first_contracts: The first of each.
+        changes: What controllers followed when a file began, by vehicle and session.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
 
@@ -48,6 +60,7 @@ class LogFiles:
     def __init__(self, paths: Sequence[Path]) -> None:
         self.contracts: dict[tuple[str, str], Contract] = {}
         self.first_contracts: dict[tuple[str, str], Contract] = {}
+        self.changes: dict[Which, list[Change]] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
         starts = {path: self._prelude(path) for path in _files(paths)}
@@ -126,6 +139,8 @@ class LogFiles:
                     said = json.loads(record.metadata.get("json", "{}"))
                     if record.name == CONTRACT_METADATA:
                         self._add_contract(record.metadata["json"].encode(), path)
+                    elif record.name == CHANGE_METADATA:
+                        self._add_change(record.metadata["key"], Change.model_validate(said))
                     elif record.name.startswith(METADATA_PREFIX):
                         self.metadata[record.name.removeprefix(METADATA_PREFIX)] = (
                             said if isinstance(said, dict) else {}
@@ -139,6 +154,12 @@ class LogFiles:
         if damages:
             self.damages[path] = damages
         return first
+
+    def _add_change(self, key: str, change: Change) -> None:
+        if (address := topics.read_key(key)) is not None:
+            known = self.changes.setdefault((address.vehicle, change.session), [])
+            if change not in known:  # every file of a rotated run repeats it
+                known.append(change)
 
     def _add_contract(self, text: bytes, path: Path) -> None:
         said = json.loads(text)

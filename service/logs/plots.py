@@ -37,7 +37,7 @@ def draw_figures(settings: Settings, blocks: Sequence[Ticks], folder: Path) -> l
     if ticks is None or not len(ticks.k):
         raise ReviewError("the log has no answered measurement to draw")
     case, wire = case_of(settings), settings.wire
-    t = ticks.k * settings.loop.period
+    t = np.asarray(ticks.k * settings.loop.period, dtype=np.float64)
     q = "" if case == "continuous" else "^Q"
     first_motor = 3 - wire.actuators + 1
 

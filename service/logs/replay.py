@@ -1,7 +1,8 @@
 """Replay: what both ends did, computed again from a log's traces and compared byte for byte.
 
 The controller is sans-I/O, and its rows hold all that it had, so the same rows must give the same commands: which were
-sent, which silence stood for, and every bit of them. The emulated plant is replayed from its own rows (plant_replay.py).
+sent, which silence stood for, and every bit of them. The emulated plant is replayed from its own rows
+(plant_replay.py).
 With another configuration it says what would have been commanded instead; the plant of the log does not follow that, so
 it is no simulation.
 """
@@ -27,7 +28,7 @@ from service.logs.evaluate import Evaluator, held_codes
 from service.logs.files import Progress, ReviewError
 from service.logs.plant_replay import PlantReplay, PlantReplayed, why_not
 from service.logs.report import Array
-from service.logs.runs import BLOCK, Block, Join, Run, Taker
+from service.logs.runs import Block, Join, Run, Taker
 from service.logs.traces import Source, Which
 
 
@@ -256,7 +257,7 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
             settings = load_over(run.files.settings(source.vehicle), overrides)
             evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
             replayers[which] = Replayer(which, evaluator, settings)
-            joins[which] = Join(which, 0, run.extents[which].of("controller"), BLOCK)
+            joins[which] = run.join(which, alone=True)
         for block in joins[which].add(arrived):
             replayers[which].take(block)
     sessions = [replayer.result() for replayer in replayers.values()]

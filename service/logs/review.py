@@ -28,6 +28,7 @@ from service.logs.story import Story
 from service.logs.theorem import Trial
 from service.logs.ticks import Ticks
 from service.logs.traces import Which
+from service.logs.wire_check import WireCheck
 
 
 class Review(NamedTuple):
@@ -97,13 +98,14 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         vehicle, files = which[0], run.files
         settings, plant = files.settings(vehicle), files.plant(vehicle)
         contract = files.contracts.get((vehicle, "controller"))
-        library, damping = Library(settings, contract and contract.certificate), damping_of(plant)
+        library, damping = Library(settings, contract.certificate if contract else None), damping_of(plant)
 
         def trial(changes: Sequence[Change]) -> Trial:
             return Trial(library.of(changes), settings.loop.period, damping)
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
         session = Session(settings, plant.watchdog_s, trial, missing, watch)
+        frames = WireCheck(which, settings.wire, run.reached)
         story = Story(which, settings.loop.period, run.reached, run.open_sessions)
 
         def truth(payload: bytes, _: int) -> None:
@@ -114,15 +116,17 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         def route(address: Address) -> Taker | None:
             if address.topic.name == "truth":
                 return truth if address.vehicle == vehicle else None
-            return story.route(address)
+            return frames.route(address) or story.route(address)
 
         for block in run.read([which], route):
             story.changed(block.changes)
+            frames.take(block)
             session.take(block)
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
     figures = _figures(session, story, run, which)
     findings = findings_of(figures, which, session, story, run)
+    findings = findings.model_copy(update={"frames": frames.findings()})
     return Review(figures, findings, session, which, name_of(paths), facts_of(run, story, vehicle))
 
 

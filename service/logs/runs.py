@@ -1,15 +1,14 @@
-"""A run as its two ends recorded it: sessions in blocks of ticks, each tick with the rows of both ends that belong to it.
+"""A run as its two ends recorded it: sessions in blocks of ticks, each tick with the rows of both ends.
 
 The join key is (vehicle, session, session tick). The files are read twice: first the headers of the trace's batches
-(traces.py), then the rows. A block is yielded once both ends have reached its last tick, so memory stays bounded however
-long a session is.
+(traces.py), then the rows. A block is yielded once both ends have reached its last tick, so memory stays bounded
+however long a session is.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -88,9 +87,12 @@ class Run:
         self.files = LogFiles(paths)
         self._progress = progress
         index = TraceIndex()
-        for found in self.files.routed(lambda address: partial(index.add, address.vehicle)
-                                       if address.topic.name == "trace" else None, self._share(0.0, _INDEXING)):  # fmt: skip
-            found.answer(found.data)
+
+        def of(address: Address) -> str | None:
+            return address.vehicle if address.topic.name == "trace" else None
+
+        for found in self.files.routed(of, self._share(0.0, _INDEXING)):
+            index.add(found.answer, found.data)
         index.finish()
         self._index = index
         self.extents: dict[Which, Extent] = index.extents
@@ -140,7 +142,7 @@ class Run:
             route: As for `batches`.
             block: Ticks of a block, about.
         """
-        joins = {which: Join(which, self._margin(which), self.extents[which], block) for which in sessions}
+        joins = {which: self.join(which, block) for which in sessions}
         for arrived in self.batches(route):
             header = arrived.batch.header
             which = arrived.source.vehicle, header.session
@@ -149,6 +151,20 @@ class Run:
                 yield from join.add(arrived)
         for join in joins.values():
             yield from join.finish()
+
+    def join(self, which: Which, block: int = BLOCK, *, alone: bool = False) -> Join:
+        """What joins the rows of a session.
+
+        Args:
+            which: The session.
+            block: Ticks of a block, about.
+            alone: Join the controller's rows with none of the plant.
+        """
+        extent = self.extents[which]
+        begins = extent.first["controller"]
+        before = [change for change in self.files.changes.get(which, ()) if change.tick < begins]
+        margin = self.files.settings(which[0]).loop.ticks(ANSWER_S)
+        return Join(which, margin, extent.of("controller") if alone else extent, block, before)
 
     def _follow(self, which: Which, arrived: Arrived) -> None:
         """Keep how far the plant's trace has come; the controller's, where the log has none of the plant."""
@@ -161,10 +177,6 @@ class Run:
             self.reached[which], self.open_sessions[vehicle] = int(ticks[-1]), session
         if header.final or not session:
             self.open_sessions.pop(vehicle, None)
-
-    def _margin(self, which: Which) -> int:
-        """Ticks after which no command can still act on what answers a tick."""
-        return self.files.settings(which[0]).loop.ticks(ANSWER_S)
 
     def _share(self, begin: float, end: float) -> Progress | None:
         progress = self._progress
@@ -220,15 +232,16 @@ class Join:
         margin: Ticks of the plant to wait for after a tick, before it is known whether a command acts on its answer.
         extent: What there is of it.
         block: Ticks of a block, about.
+        changes: What the controller followed before its first row.
     """
 
-    def __init__(self, which: Which, margin: int, extent: Extent, block: int) -> None:
+    def __init__(self, which: Which, margin: int, extent: Extent, block: int, changes: Sequence[Change] = ()) -> None:
         self._which = which
         self._margin = margin
         self._block = block
         self._controller: deque[_Segment] = deque()
         self._plant = _Segment("plant")
-        self._changes: list[Change] = []
+        self._changes: list[Change] = list(changes)
         # Up to which tick each end has been read; infinity where nothing more comes.
         self._settled: dict[End, float] = {
             end: extent.first[end] - 1 if extent.rows[end] else inf for end in extent.rows
@@ -296,15 +309,8 @@ def _block(
         acting = acting[first]
     ticks = controller["tick"][computed] if controller else none
     k = np.union1d(ticks, measured)
-    return Block(
-        which,
-        k,
-        controller,
-        plant,
-        *(_places(*pair, k) for pair in ((ticks, computed), (measured, np.arange(len(measured))), (answers, acting))),
-        changes,
-        state,
-    )
+    at_controller, at_plant = _places(ticks, computed, k), _places(measured, np.arange(len(measured)), k)
+    return Block(which, k, controller, plant, at_controller, at_plant, _places(answers, acting, k), changes, state)
 
 
 def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:

@@ -1,15 +1,15 @@
 """What happened, as roles published it: events, changes, losses, and how old measurements were when they were used.
 
-What carries a session tick stands there; the rest stands at the tick that the plant's trace had reached in the file when
-it was recorded. Of each kind the first few hundred become marks and the rest are counted, so that a log with a storm of
-them can be read and held in memory.
+What carries a session tick stands there; the rest stands at the tick that the plant's trace had reached in the file
+when it was recorded. Of each kind the first few hundred become marks and the rest are counted, so that a log with a
+storm of them can be read and held in memory.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from protocol import topics
 from protocol.clock import Histogram
@@ -128,7 +128,7 @@ class Story:
         return self._ages.figures()
 
     def marks(self) -> list[Mark]:
-        """Everything that happened to the vehicle, in order of time; what was not within the session before or after."""
+        """Everything that happened to the vehicle, in order of time; what was outside the session before or after."""
         found = [placed for kind in self._kinds.values() for placed in kind.all()]
         return [mark for _, mark in sorted(found, key=lambda placed: placed[0])]
 

@@ -88,7 +88,7 @@ def groups(wire: WireSpec, period: float) -> list[Group]:
         _one(Column("tick", "", "tick k of the law", "int64"), lambda rows: rows.ticks.k),
         _one(Column("time_s", "s", "the law's time, k times the period"), lambda rows: rows.ticks.k * period),
         _one(
-            Column("published_ns", "ns", "when the measurement was sent, on the plant's clock, since 1970, UTC", "int64"),
+            Column("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970", "int64"),
             lambda rows: rows.ticks.wall_ns,
         ),
         _one(Column("vehicle", "", "name of the vehicle", "text"), lambda rows: _text(rows, rows.vehicle)),
@@ -105,8 +105,10 @@ def groups(wire: WireSpec, period: float) -> list[Group]:
         ),
         _vector("rate_error_{}_rad_s", "rad/s", "ω_e, body frame, about {}", lambda rows: rows.ticks.rate_error),
         _one(Column("error_angle_deg", "deg", "angle of the attitude error"), _angle_deg),
-        _vector("voltage_{}_V", "V", "u{} as commanded; none where no command answered", lambda rows: rows.ticks.voltages,
-                motors),
+        _vector(
+            "voltage_{}_V", "V", "u{} as commanded; none where no command answered",
+            lambda rows: rows.ticks.voltages, motors,
+        ),
         _one(
             Column("latency_us", "µs", "from the measurement to the command that answers it, on the plant's clock"),
             lambda rows: rows.ticks.latency_ns * 1e-3,

@@ -195,7 +195,10 @@ def _column(rows: Rows, at: Integers, name: str) -> Integers:
 def _is(rows: Rows, at: Integers, name: str, *kinds: int) -> Flags:
     """Whether a column's value at places of rows is one of these; not where the place is −1. Shape (n,)."""
     values = _column(rows, at, name)
-    return np.any([values == kind for kind in kinds], axis=0)
+    found = values == kinds[0]
+    for kind in kinds[1:]:
+        found |= values == kind
+    return found
 
 
 def _since(begin: Integers, end: Integers) -> Array:

@@ -99,7 +99,11 @@ def contract(settings: Settings, role: str) -> Contract:
 
 
 def write(
-    path: Path, settings: Settings, messages: list[Logged], chunk_every: int = 50, roles: tuple[str, ...] = ("controller", "plant")
+    path: Path,
+    settings: Settings,
+    messages: list[Logged],
+    chunk_every: int = 50,
+    roles: tuple[str, ...] = ("controller", "plant"),
 ) -> Path:
     """Write a log with both roles' contracts and these messages."""
     path.unlink(missing_ok=True)
@@ -120,7 +124,14 @@ def write(
 class ControllerEnd:
     """The controller and its trace, as the daemon runs them."""
 
-    def __init__(self, settings: Settings, messages: Messages, clock: Clock, session: str = SESSION, run: int = RUNS["controller"]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        messages: Messages,
+        clock: Clock,
+        session: str = SESSION,
+        run: int = RUNS["controller"],
+    ) -> None:
         self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
         self.trace = TraceWriter("controller", settings.wire, run, round(settings.loop.trace_s * 1e9))
         self.trace.session = session

@@ -74,7 +74,10 @@ class World(Link):
     def takes(self, usual_ns: int, worst: float = 20.0) -> int:
         """How long something takes: usually so long, now and then much longer."""
         longer = self._chance.random() < self._hitch
-        return round(self._chance.uniform(0.7, 1.3) * usual_ns + (self._chance.uniform(0, worst) * self._period_ns if longer else 0))
+        return round(
+            self._chance.uniform(0.7, 1.3) * usual_ns
+            + (self._chance.uniform(0, worst) * self._period_ns if longer else 0)
+        )
 
     def pass_time(self, until_ns: int) -> None:
         while self._due_ns <= until_ns:
@@ -96,8 +99,19 @@ class World(Link):
             at_ns, frame = self._to_plant.pop(0)
             arrival = Arrival(frame, self._plant_clock.at(at_ns))
         if self._chance.random() < 0.002:
-            self.emulator.inject(Fault.parse(self._chance.choice(["measurement:drop=0.3@0..0.1", "command:duplicate=0.2@0..0.1",
-                "command:delay=0.006@0..0.05", "rate.z:bias=0.05@0..0.1", "measurement:garble=0.1@0..0.1"])))
+            self.emulator.inject(
+                Fault.parse(
+                    self._chance.choice(
+                        [
+                            "measurement:drop=0.3@0..0.1",
+                            "command:duplicate=0.2@0..0.1",
+                            "command:delay=0.006@0..0.05",
+                            "rate.z:bias=0.05@0..0.1",
+                            "measurement:garble=0.1@0..0.1",
+                        ]
+                    )
+                )
+            )
             self.trace.follow(endpoint)
         measurement = self.emulator.tick(arrival.frame if arrival else None, tick)
         session_tick = endpoint.session_tick
@@ -173,7 +187,9 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
         patch("protocol.clock.time", world),
     ):
         endpoint, loop, wire = world.emulator.endpoint, settings.loop, settings.wire
-        claim = Claim(controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=False, auto_arm=True, wire=wire)
+        claim = Claim(
+            controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=False, auto_arm=True, wire=wire
+        )
         assert isinstance(endpoint.claim(claim), Grant)
         world.trace.follow(endpoint)
         end = ControllerEnd(settings, known.messages, clock)
@@ -190,7 +206,9 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
                 continue
             if chance.random() < 0.003:
                 gains = Gains(C2=(chance.choice([0.1, 0.15, 0.2]),) * 3)
-                reference = chance.choice([None, Hold(attitude=(0.0, 5.0, chance.uniform(-20, 20))), settings.reference])
+                reference = chance.choice(
+                    [None, Hold(attitude=(0.0, 5.0, chance.uniform(-20, 20))), settings.reference]
+                )
                 end.follow(now.tick, chance.choice([None, gains]) if reference else gains, reference)
             world.pass_time(world.now_ns + world.takes(200_000))
             command = end.controller.tick(now.frame, now.tick)
