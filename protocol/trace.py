@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError
 
+from protocol.clock import LoopSettings
 from protocol.messages import PROTOCOL_VERSION, Claim
 from protocol.states import TripCause
 from protocol.verbs import Change, Message
@@ -34,11 +35,17 @@ MAX_ROWS: Final = 256
 """Rows of a batch at the most."""
 
 STEPS: Final = ("tick", "session_tick", "answered", "received", "sent")
-"""Columns that hold steps from row to row, modulo their type's range: ticks and times rise evenly, so that they compress
+"""Columns that hold steps from row to row, modulo their type's range: ticks and times rise evenly, so they compress
 to a fifth. The first row's step is from 0."""
 
 NEVER: Final = 0xFFFF_FFFF
 """In a column of times or of session ticks: there is none."""
+
+_BATCHES_BEYOND: Final = 1.25
+"""Batches beyond those of a steady loop: sessions that begin and end, operations between them."""
+
+_FASTEST_HZ: Final = 10_000.0
+"""In lockstep ticks come as fast as they are computed, whatever the grid's rate."""
 
 _HEADER: Final = struct.Struct("<BBBBHHIIQQqq64s")
 HEADER_BYTES: Final = _HEADER.size
@@ -417,6 +424,12 @@ class TraceWriter:
         self.rows = 0
         self.state, self.changes, self.operations = None, [], []
         return b"".join([header, *columns, text])
+
+
+def batches_per_s(loop: LoopSettings) -> float:
+    """Batches that an end publishes a second at the most, in the long run."""
+    rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
+    return _BATCHES_BEYOND * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
 
 
 def _steps(column: npt.NDArray[Any]) -> npt.NDArray[Any]:

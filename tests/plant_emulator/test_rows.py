@@ -9,12 +9,11 @@ import pytest
 
 from plant_emulator.emulator import Emulator
 from plant_emulator.faults import Fault
-from plant_emulator.plant_trace import batches_per_s
 from plant_emulator.settings import PlantSettings
 from protocol.clock import LoopSettings
 from protocol.publication import KEPT_S
 from protocol.states import TripCause
-from protocol.trace import MAX_ROWS, Batch, Operation, Outcome, Sent
+from protocol.trace import MAX_ROWS, Batch, Operation, Outcome, Sent, batches_per_s
 from protocol.transmit import SILENCE, Transmit
 from protocol.wire import WireSpec
 from tests.plant_emulator.stage import RUN, Stage

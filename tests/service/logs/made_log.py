@@ -6,33 +6,26 @@ Only the network and the clocks are made up, so what the log should say is known
 
 from __future__ import annotations
 
-import random
 import threading
-from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections import Counter
 from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
 
-import zenoh
-
 from plant_emulator.emulator import Emulator, truth_of
-from plant_emulator.faults import Fault
 from plant_emulator.plant_trace import PlantTrace
 from protocol import topics
-from protocol.links import Arrival, Link
-from protocol.messages import PROTOCOL_VERSION, Claim, Contract, Event, Grant
+from protocol.links import Arrival
+from protocol.messages import PROTOCOL_VERSION, Claim, Contract, Grant
 from protocol.publication import Received as Message
 from protocol.trace import End, Received, Sent, TraceWriter, read_batch
-from protocol.transmit import SILENCE
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load
 from service.controller import Controller
 from service.logs.mcap_file import CONTRACT_METADATA
 from service.recording.log_file import LogFile
 from service.telling import telemetry_of
-from service.tick_source import MAILBOX, PlantTick, TickSource
+from service.tick_source import PlantTick
 
 START_NS: Final = 1_800_000_000_000_000_000
 """When tick 0 is measured, on the plant's wall clock."""

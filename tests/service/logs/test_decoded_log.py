@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from tests.service.logs.losing_log import SHORT, make_losing_log, read, write
 
 from protocol import topics
 from service.config import load
@@ -17,7 +18,6 @@ from service.logs.files import LogFiles
 from service.logs.mcap_file import CONTRACT_METADATA
 from service.logs.review import review
 from service.logs.table_files import ExportError
-from tests.service.logs.losing_log import SHORT, make_losing_log, read, write
 from tests.service.logs.made_log import VEHICLE
 
 
