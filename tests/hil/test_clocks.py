@@ -48,7 +48,7 @@ def run(tmp_path: Path, environments: Mapping[str, Mapping[str, str]], during: P
     with Bench(settings) as bench:
         statuses = Statuses(bench, settings)
         for role in ("recorder", "plant", "controller"):
-            bench.start(role, environment=environments.get(role))  # type: ignore[arg-type]  # a role
+            bench.start(role, environment=environments.get(role))
         eventually("driving", lambda: statuses.state("plant") == "driven")
         time.sleep(RUN_S / 2)
         if during is not None:
