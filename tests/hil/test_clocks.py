@@ -1,19 +1,24 @@
-"""Wall clocks that are wrong, step, or run fast at either end: loop, watchdog, log, review and replay are as without.
+"""Clocks that are wrong, step, or run fast at either end: loop, watchdog, log, review and replay are as without.
 
-libfaketime gives one process another clock. Offsets and steps leave the monotonic clock alone, as a wrong NTP server
-does; a clock that runs fast is one that counts faster in all its readings.
+libfaketime gives one process another clock. An offset moves all its clocks alike, which is all that a process can see of
+a clock that was wrong when it started; a clock that runs fast counts faster in all its readings. A step leaves the
+monotonic clock alone, as a wrong NTP server does. libfaketime 0.9.10 cannot do that to a process that sleeps until an
+instant, as the plant does (clock_nanosleep gives EINVAL then), so there a step replaces Python's `time.time_ns`, by which
+alone this program reads a wall clock for its messages and traces.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from service.bench import Bench, free_rendezvous
 from service.config import load
+from service.hil import HilLog
 from tests.hil.test_processes import eventually
 from tests.hil.test_recorder import PATIENT, Statuses, assert_whole
 
@@ -29,16 +34,25 @@ def clock(said: str, **more: str) -> dict[str, str]:
     return {"LD_PRELOAD": str(LIBRARIES[0]), "FAKETIME": said, "FAKETIME_NO_CACHE": "1", **more}
 
 
-WALL_ALONE = {"FAKETIME_DONT_FAKE_MONOTONIC": "1"}
 CLOCKS = {
-    "10 s ahead": clock("+10s", **WALL_ALONE),
-    "10 s behind": clock("-10s", **WALL_ALONE),
-    "400 ms ahead": clock("+0.4s", **WALL_ALONE),
+    "10 s ahead": clock("+10s"),
+    "10 s behind": clock("-10s"),
+    "400 ms ahead": clock("+0.4s"),
     "1 % fast": clock("+0 x1.01"),
 }
+STEP_S = 3600
+
+STEPPING = f"""
+import os, time
+true = time.time_ns
+time.time_ns = lambda: true() + {STEP_S} * 10**9 * os.path.exists(os.environ["STEP"])
+"""
+"""A sitecustomize.py: the wall clock steps once a file is there."""
 
 
-def run(tmp_path: Path, environments: Mapping[str, Mapping[str, str]], during: Path | None = None) -> None:
+def run(
+    tmp_path: Path, environments: Mapping[str, Mapping[str, str]], during: Callable[[], object] = lambda: None
+) -> dict[str, Any]:
     """A loop of some seconds, of which nothing may be missing or unanswered for long, and its log."""
     settings = load(overrides=[
         *(f"{name}={value}" for name, value in PATIENT.items()),
@@ -51,8 +65,7 @@ def run(tmp_path: Path, environments: Mapping[str, Mapping[str, str]], during: P
             bench.start(role, environment=environments.get(role))
         eventually("driving", lambda: statuses.state("plant") == "driven")
         time.sleep(RUN_S / 2)
-        if during is not None:
-            during.write_text("+3600s")
+        during()
         time.sleep(RUN_S / 2)
         assert statuses.state("plant") == "driven"
         for role in ("controller", "plant"):
@@ -65,6 +78,7 @@ def run(tmp_path: Path, environments: Mapping[str, Mapping[str, str]], during: P
     assert RUN_S - 1 <= judged["duration_s"] <= RUN_S + 4
     assert judged["z_track"] < 0.02
     assert judged["lapses"].get("stale", 0) == 0
+    return judged
 
 
 @pytest.mark.parametrize("said", CLOCKS)
@@ -73,12 +87,24 @@ def test_a_clock_that_is_wrong_changes_nothing(tmp_path: Path, role: str, said: 
     run(tmp_path, {role: CLOCKS[said]})
 
 
-@pytest.mark.parametrize("role", ["controller", "plant", "recorder"])
+@pytest.mark.parametrize("role", ["controller", "recorder"])
 def test_a_clock_that_steps_by_an_hour_in_mid_run_changes_nothing(tmp_path: Path, role: str) -> None:
     said = tmp_path / "clock"
     said.write_text("+0s")
     stepping = {"LD_PRELOAD": str(LIBRARIES[0]), "FAKETIME_TIMESTAMP_FILE": str(said), "FAKETIME_NO_CACHE": "1"}
-    run(tmp_path, {role: {**stepping, **WALL_ALONE}}, said)
+    run(tmp_path, {role: {**stepping, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}}, lambda: said.write_text(f"+{STEP_S}s"))
+
+
+def test_a_plants_clock_that_steps_by_an_hour_in_mid_run_changes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(STEPPING)
+    stepped = tmp_path / "stepped"
+    environment = {"PYTHONPATH": str(tmp_path / "site"), "STEP": str(stepped)}
+    judged = run(tmp_path, {"plant": environment}, stepped.touch)
+    log = HilLog(tmp_path / "a.mcap")
+    walls = [batch.header.wall_ns for batch in log.batches("plant")]
+    assert max(walls) - min(walls) > 0.9 * STEP_S * 1e9, "the clock did not step, so nothing is shown"
+    assert judged["duration_s"] < 60
 
 
 def test_the_watchdog_trips_as_soon_whatever_the_plants_clock_reads() -> None:
