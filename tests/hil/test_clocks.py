@@ -1,10 +1,10 @@
 """Clocks that are wrong, step, or run fast at either end: loop, watchdog, log, review and replay are as without.
 
-libfaketime gives one process another clock. An offset moves all its clocks alike, which is all that a process can see of
-a clock that was wrong when it started; a clock that runs fast counts faster in all its readings. A step leaves the
+libfaketime gives one process another clock. An offset moves all its clocks alike, which is all that a process can see
+of a clock that was wrong when it started; a clock that runs fast counts faster in all its readings. A step leaves the
 monotonic clock alone, as a wrong NTP server does. libfaketime 0.9.10 cannot do that to a process that sleeps until an
-instant, as the plant does (clock_nanosleep gives EINVAL then), so there a step replaces Python's `time.time_ns`, by which
-alone this program reads a wall clock for its messages and traces.
+instant, as the plant does: clock_nanosleep gives EINVAL. There a step replaces Python's `time.time_ns`, by which alone
+this program reads a wall clock for its messages and traces.
 """
 
 from __future__ import annotations
