@@ -1,7 +1,7 @@
 """Clocks that are wrong, step, or run fast at either end: loop, watchdog, log, review and replay are as without.
 
 libfaketime gives one process another clock, as far as it can (0.9.10, Python 3.11). With a true monotonic clock it
-breaks clock_nanosleep, by which the plant and the recorder sleep; with a false one sem_clockwait, by which the controller
+breaks clock_nanosleep, by which the plant and the recorder sleep; with a false one sem_clockwait, by which a controller
 waits. So the controller's clock is false but for the monotonic one, and all of the plant's are. What remains, steps of
 the plant's and the recorder's clocks and a controller whose clock runs fast, is done to Python's `time`, through which
 alone this program reads clocks.
