@@ -65,7 +65,7 @@ class CachedPublisher:
         self._publisher.put(payload, attachment=_CLOCK.pack(time.time_ns()))
 
 
-class Received(NamedTuple):
+class Delivery(NamedTuple):
     """A message as it was received.
 
     Attributes:
@@ -115,7 +115,7 @@ class RecoveringSubscriber:
         )
         self._misses = self._subscriber.sample_miss_listener(RingChannel(1024))
 
-    def take(self) -> Iterator[Received]:
+    def take(self) -> Iterator[Delivery]:
         """What was received and not yet taken, oldest first. Never waits."""
         while (sample := self._subscriber.try_recv()) is not None:
             yield read_sample(sample)
@@ -130,13 +130,13 @@ class RecoveringSubscriber:
         self._subscriber.undeclare()
 
 
-def read_sample(sample: zenoh.Sample) -> Received:
+def read_sample(sample: zenoh.Sample) -> Delivery:
     """A sample of an advanced publisher, or of any other."""
     clock, source = sample.attachment, sample.source_info
     published_ns: int | None = None
     if clock is not None and len(stamp := clock.to_bytes()) == _CLOCK.size:
         (published_ns,) = _CLOCK.unpack(stamp)
-    return Received(
+    return Delivery(
         str(sample.key_expr),
         sample.payload.to_bytes(),
         0 if source is None else source.source_sn,

@@ -16,7 +16,7 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from protocol import topics
-from protocol.publication import WAITING, Received, RecoveringSubscriber, read_sample
+from protocol.publication import WAITING, Delivery, RecoveringSubscriber, read_sample
 
 CACHE_S: Final = 2.0
 """How long a publisher's cache may take to answer [s]."""
@@ -65,7 +65,7 @@ class Subscriptions:
         self._gaps: Counter[_Source] = Counter()  # numbers that were skipped since losses were last asked for
         self._reported: Counter[_Source] = Counter()  # numbers that were reported missing, and not yet skipped
 
-    def take(self) -> Iterator[Received]:
+    def take(self) -> Iterator[Delivery]:
         """What was received and not yet taken, topic by topic, contracts first. Waits for caches of new publishers."""
         for subscriber in self._topics.values():
             for received in islice(subscriber.take(), self._waiting):
@@ -99,7 +99,7 @@ class Subscriptions:
         self._gaps.clear()
         return found
 
-    def _before(self, first: Received) -> list[Received]:
+    def _before(self, first: Delivery) -> list[Delivery]:
         """What its cache holds of a publisher before the first message that was received of it.
 
         A message that is published while a link is being set up can be received before Zenoh's subscriber learns that
