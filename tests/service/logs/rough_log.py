@@ -10,7 +10,6 @@ import random
 import threading
 from collections import deque
 from dataclasses import dataclass, field
-from pathlib import Path
 from unittest.mock import patch
 
 from plant_emulator.emulator import Emulator, truth_of

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import scipy.io
+from tests.service.logs.losing_log import LOST, PERIOD_NS, SHORT, TICKS, TRUTHS, UNANSWERED, make_losing_log
 
 from protocol.attitude import to_euler
 from protocol.messages import Telemetry
@@ -26,7 +27,6 @@ from service.logs.files import LogFiles
 from service.logs.review import review
 from service.logs.table import Rows, euler_deg, groups, telemetry_fields, tick_fields, truth_fields
 from service.logs.table_files import ExportError, ParquetFile
-from tests.service.logs.losing_log import LOST, PERIOD_NS, SHORT, TICKS, TRUTHS, UNANSWERED, make_losing_log
 from tests.service.logs.made_log import SESSION, START_NS, VEHICLE
 
 
