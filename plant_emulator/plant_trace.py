@@ -9,25 +9,13 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from typing import Final
 
 from plant_emulator.tenancy import Tenancy
 from protocol.clock import LoopSettings
 from protocol.links import Arrival
-from protocol.trace import MAX_ROWS, Sent, TraceWriter
+from protocol.trace import Sent, TraceWriter
 from protocol.transmit import SILENCE
 from protocol.wire import WireSpec
-
-_MARGIN: Final = 1.25
-"""Batches beyond those of a steady loop: sessions that begin and end, operations between them."""
-_FASTEST_HZ: Final = 10_000.0
-"""In lockstep ticks come as fast as they are computed, whatever the grid's rate."""
-
-
-def batches_per_s(loop: LoopSettings) -> float:
-    """Batches a second at the most, in the long run."""
-    rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
-    return _MARGIN * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
 
 
 class PlantTrace:

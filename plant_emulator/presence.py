@@ -13,14 +13,14 @@ from threading import Condition
 from typing import Final
 
 from plant_emulator.front import Front
-from plant_emulator.plant_trace import PlantTrace, batches_per_s
+from plant_emulator.plant_trace import PlantTrace
 from plant_emulator.tenancy import Tenancy
 from protocol import topics
 from protocol.clock import LoopSettings, RollingHistogram
 from protocol.links import Arrival, Mailbox, ZenohLink
 from protocol.messages import Claim, Grant, Refusal, Release, Status, report, summary
 from protocol.role import Role
-from protocol.trace import Outcome
+from protocol.trace import Outcome, batches_per_s
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask
 

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError
 
+from protocol.clock import LoopSettings
 from protocol.messages import PROTOCOL_VERSION, Claim
 from protocol.states import TripCause
 from protocol.verbs import Change, Message
@@ -33,8 +34,18 @@ ENDS: Final[tuple[End, ...]] = ("controller", "plant")
 MAX_ROWS: Final = 256
 """Rows of a batch at the most."""
 
+STEPS: Final = ("tick", "session_tick", "answered", "received", "sent")
+"""Columns that hold steps from row to row, modulo their type's range: ticks and times rise evenly, so they compress
+to a fifth. The first row's step is from 0."""
+
 NEVER: Final = 0xFFFF_FFFF
 """In a column of times or of session ticks: there is none."""
+
+_BATCHES_BEYOND: Final = 1.25
+"""Batches beyond those of a steady loop: sessions that begin and end, operations between them."""
+
+_FASTEST_HZ: Final = 10_000.0
+"""In lockstep ticks come as fast as they are computed, whatever the grid's rate."""
 
 _HEADER: Final = struct.Struct("<BBBBHHIIQQqq64s")
 HEADER_BYTES: Final = _HEADER.size
@@ -233,7 +244,12 @@ def read_columns(payload: bytes, header: Header) -> np.void | None:
     dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
     if len(payload) != HEADER_BYTES + dtype.itemsize + header.tail_bytes:
         return None
-    columns: np.void = np.frombuffer(payload, dtype, 1, HEADER_BYTES)[0]
+    columns: np.void = np.frombuffer(bytearray(payload), dtype, 1, HEADER_BYTES)[0]
+    assert dtype.names is not None
+    for name in dtype.names:
+        if name in STEPS:
+            column = columns[name]
+            np.add.accumulate(column, out=column)
     return columns
 
 
@@ -401,12 +417,24 @@ class TraceWriter:
             self.session.encode("ascii"),
         )
         records = np.frombuffer(self._buffer, self._dtype, rows)
-        assert self._dtype.names is not None
-        columns = [records[name].tobytes() for name in self._dtype.names]
+        names = self._dtype.names
+        assert names is not None
+        columns = [_steps(records[name]).tobytes() if name in STEPS else records[name].tobytes() for name in names]
         self._published += rows
         self.rows = 0
         self.state, self.changes, self.operations = None, [], []
         return b"".join([header, *columns, text])
+
+
+def batches_per_s(loop: LoopSettings) -> float:
+    """Batches that an end publishes a second at the most, in the long run."""
+    rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
+    return _BATCHES_BEYOND * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
+
+
+def _steps(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """What a column of STEPS holds instead of its values. Shapes (n,)."""
+    return np.diff(column, prepend=column.dtype.type(0))
 
 
 def _record_format(end: End, measurement: int, command: int, actuators: int) -> str:

@@ -22,7 +22,7 @@ from protocol.links import ZenohLink
 from protocol.messages import Status, report, summary
 from protocol.role import Role
 from protocol.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
-from protocol.trace import MAX_ROWS, Received, Sent, TraceWriter
+from protocol.trace import Received, Sent, TraceWriter, batches_per_s
 from protocol.transmit import SILENCE
 from protocol.verbs import Answer, Ask, Reference
 from protocol.wire import WireSpec
@@ -103,7 +103,7 @@ class Daemon:
             self._timing = LoopTiming()
         role, loop = self._role, self._loop
         role.declare("telemetry", self._settings.telemetry_rate_hz)
-        role.declare("trace", 1.2 * max(1 / loop.trace_s, loop.rate_hz / MAX_ROWS), lossless=loop.lockstep)
+        role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
         self._live.serve()
         role.serve("stand_down", Ask, lambda _: self._stand_down)
         role.serve("recall", Ask, lambda _: self._recall)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Condition
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import zenoh
 from mcap.reader import make_reader
@@ -22,7 +22,8 @@ from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.messages import Event, Status, model_of
 from protocol.states import PlantState
-from protocol.verbs import Advance, Answer, Ask, Inject, Message
+from protocol.trace import Batch, End, read_batch
+from protocol.verbs import Advance, Answer, Ask, Change, Inject, Message
 from service.bench import Bench, RoleName, free_rendezvous, private_bus
 from service.config import Settings, load
 from service.figures import Figures
@@ -65,16 +66,35 @@ class HilLog:
         """Why the plant went to 0 V, each time it did."""
         return [event.text for event in self.events if event.kind == "tripped"]
 
+    def batches(self, end: End) -> list[Batch]:
+        """What one end did tick by tick, in the order of recording."""
+        read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
+        return [batch for batch in read if batch is not None and batch.header.end == end]
+
+    def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
+        """When one end received or sent frames, on its wall clock [ns since 1970]; ticks without one are left out."""
+        return [
+            at_ns + batch.header.wall_ns - batch.header.monotonic_ns
+            for batch in self.batches(end)
+            for at_ns in batch.times_ns(column).tolist()
+            if at_ns >= 0
+        ]
+
+    @property
+    def changes(self) -> list[Change]:
+        """What controllers followed from which tick on, in order."""
+        return [change for batch in self.batches("controller") for change in batch.tail.changes]
+
     def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
-        """Time of publication [ns] and content of every message of one topic; frames are bytes."""
+        """Time of publication [ns] and content of every message of one topic; frames and traces are bytes."""
         found: list[tuple[int, Message | bytes]] = []
         topic = topics.TOPICS[name]
         with self.path.open("rb") as file:
             for _, channel, message in make_reader(file).iter_messages():
                 address = topics.read_key(channel.topic)
                 if address is not None and address.topic is topic:
-                    frame = topic.carries == "frame"
-                    content = message.data if frame else model_of(topic).model_validate_json(message.data)
+                    raw = topic.carries != "json"
+                    content = message.data if raw else model_of(topic).model_validate_json(message.data)
                     found.append((message.publish_time, content))
         return found
 

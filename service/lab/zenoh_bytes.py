@@ -30,7 +30,6 @@ _SESSION: Final = "1ab0ra70"
 _PATIENCE_S: Final = 20.0
 _POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
-_BARE: Final = {"timestamps": False}
 
 
 class CountError(AeroloopError):
@@ -119,14 +118,14 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
         NetworkError: A session cannot be opened.
     """
     port = _free_port()
-    here = {"rendezvous": "", "gossip": False, **_BARE}  # two need neither, and they would be counted
+    here = {"rendezvous": "", "gossip": False}  # two need neither, and they would be counted
     plant_side = network.model_copy(update={**here, "listen": [f"tcp/127.0.0.1:{port}"], "connect": []})
     with Relay(port) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})
         with join(other_side) as controller:
             to_controller, to_plant = (Mailbox(depth=max(1, len(frames))) for frames in (measurements, commands))
             keys = [topics.key(name, _VEHICLE, session=_SESSION) for name in ("measurement", "command")]
-            link = partial(ZenohLink, lossless=True, numbers=False)
+            link = partial(ZenohLink, lossless=True)
             plant_end = link(plant, keys[0], keys[1], mailbox=to_plant)
             controller_end = link(controller, keys[1], keys[0], mailbox=to_controller)
             _meet(plant, controller)

@@ -103,7 +103,7 @@ class BatchController:
 
     @property
     def state(self) -> ControllerState:
-        """The controller's after the last measurement computed and the last command encoded."""
+        """After the last measurement computed and the last command encoded; `held` is of the last row."""
         said, at = self._sender.memory
         codes = None if said is None else tuple(map(float, said))
         return self._state.model_copy(update={"sent_codes": codes, "sent_tick": at})
@@ -162,7 +162,7 @@ class BatchController:
         return Commands(codes, np.array(sent, dtype=np.bool_))
 
     def _nothing(self, n: int) -> Computed:
-        # Each element's values lie side by side, as whoever judges them reads them.
+        # The values of one element lie side by side in memory: readers take them by element.
         return Computed(*(np.full((columns, n), nan).T for columns in (4, 4, 3, 3, 3, self._wire.actuators, 1, 3, 3)))
 
     def _compute(self, k: Integers, vectors: Array, rates: Array, changes: deque[Change]) -> Sequence[Array]:
@@ -207,8 +207,8 @@ class BatchController:
 
     def _apply(self, change: Change) -> None:
         if change.gains is not None:
-            told = change.gains.model_dump(exclude_none=True)
-            self._gains |= {name: np.array(diagonal) for name, diagonal in told.items()}
+            changed = change.gains.model_dump(exclude_none=True)
+            self._gains |= {name: np.array(diagonal) for name, diagonal in changed.items()}
         self._motion.change(change, self._period)
 
     def _lay_out(self, t: Array, rows: slice) -> None:
@@ -225,5 +225,6 @@ class BatchController:
 
 
 def _table(memory: Buffer, rows: int) -> Array:
+    """Memory as an array, a column a tick; one column where it has no row a tick. Shape (n, rows) or (n, 1)."""
     width = rows if len(memory) % rows == 0 else 1
     return np.asarray(memory).reshape(-1, width)

@@ -36,7 +36,7 @@ def recover(broken: Path, out: Path, progress: Callable[[float], None] | None = 
 
     Args:
         broken: The log; it is not changed.
-        out: The new file, which must not exist; it is removed again where nothing can be recovered.
+        out: The new file, which must not exist; it is removed again on any error.
         progress: Called now and then with the share that is done, 0…1.
 
     Raises:
@@ -46,18 +46,21 @@ def recover(broken: Path, out: Path, progress: Callable[[float], None] | None = 
     try:
         size = broken.stat().st_size
         with out.open("xb") as file:
-            copy = McapCopy(file, "aeroloop log recover")
-            copy.file(broken, damages, lambda read: progress(read / size) if progress else None)
-            copy.finish()
+            try:
+                copy = McapCopy(file, "aeroloop log recover")
+                copy.file(broken, damages, lambda read: progress(read / size) if progress else None)
+                if not copy.messages:
+                    raise RecoverError(f"{broken} holds no whole message")
+                copy.finish()
+                file.flush()
+            except BaseException:
+                out.unlink()
+                raise
     except NotMcapError as error:
-        out.unlink()
         raise RecoverError(f"{error}, so there is nothing to recover") from None
     except FileExistsError:
         raise RecoverError(f"{out} exists already; name another file") from None
     except OSError as error:
         raise RecoverError(f"cannot recover {broken} into {out}: {error.strerror}") from None
-    if not copy.messages:
-        out.unlink()
-        raise RecoverError(f"{broken} holds no whole message")
     lost = [f"at byte {damage.offset}: {damage.what}" for damage in damages]
     return Recovery(out=str(out), messages=copy.messages, channels=len(copy.topics), lost=lost)

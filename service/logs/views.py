@@ -107,7 +107,7 @@ class Tracking(View):
 
     @classmethod
     def of(cls, told: Telemetry, period: float | None) -> Self:
-        """Of what the controller published, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
+        """Of the controller's telemetry, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
         x, y, z = told.attitude_error
         scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
         measured = _product(told.desired, (scalar if told.sign >= 0 else -scalar, x, y, z))

@@ -1,4 +1,4 @@
-"""Messages that were received and are not yet written, because the disk refuses: bounded, the oldest are kept."""
+"""Messages that were taken and are not yet written, mostly because the disk refuses: bounded, the oldest are kept."""
 
 from __future__ import annotations
 

@@ -33,6 +33,9 @@ WORK_EVERY_S: Final = 0.2
 
 STATUS_EVERY_S: Final = 1.0
 
+AT_ONCE: Final = 2000
+"""Messages written before the rings are looked at again."""
+
 QUIET_S: Final = 0.3
 """A network from which nothing was received for so long has nothing more on its way [s]."""
 
@@ -76,7 +79,7 @@ class Recorder:
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
         try:
-            while not self._role.stop.wait(WORK_EVERY_S):
+            while not self._role.stop.wait(0.0 if self._behind else WORK_EVERY_S):
                 self._take()
                 self._role.take_inbox()
                 if time.monotonic() >= self._status_due:
@@ -86,10 +89,11 @@ class Recorder:
         finally:
             self._settle()
             self.log.try_again()
+            self._take_all()
             self._publish_losses()
-            self._take()
+            self._take_all()
             self._publish_status()
-            self._take()
+            self._take_all()
             self.log.close(len(self._backlog))
 
     def reconfigure(self, settings: RecorderSettings) -> None:
@@ -103,13 +107,23 @@ class Recorder:
         now = last = time.monotonic()
         deadline = now + GOES_ON_S
         while now < deadline and now - last < QUIET_S:
-            time.sleep(QUIET_S / 10)
+            time.sleep(0.0 if self._behind else QUIET_S / 10)
             now = time.monotonic()
             if self._take():
                 last = now
 
+    @property
+    def _behind(self) -> bool:
+        """Whether there is something to write, and it can be."""
+        return self.log.writable and len(self._backlog) > 0
+
+    def _take_all(self) -> None:
+        self._take()
+        while self._behind:
+            self._write()
+
     def _take(self) -> int:
-        """Take what was received and write it, or keep it while the disk refuses. How many messages were received."""
+        """Take what was received, and write some of what waits. How many messages were received."""
         count, now = 0, time.time_ns()
         for received in self._subscriptions.take():
             count += 1
@@ -123,7 +137,10 @@ class Recorder:
         return count
 
     def _write(self) -> None:
-        while self.log.writable and (entry := self._backlog.next()) is not None:
+        """Write what has waited longest, `AT_ONCE` messages at the most, unless the disk refuses."""
+        for _ in range(AT_ONCE):
+            if not self.log.writable or (entry := self._backlog.next()) is None:
+                return
             received, at_ns = entry
             self.log.add(received, at_ns, self._decode(received, at_ns))
 

@@ -5,6 +5,7 @@ Run with `uv run pytest tests/benchmarks --benchmark-enable`. Figures are for re
 
 from __future__ import annotations
 
+import time
 from itertools import cycle
 
 import numpy as np
@@ -12,7 +13,10 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from plant_emulator.endpoint import Endpoint
+from plant_emulator.plant_trace import PlantTrace
 from plant_emulator.settings import PlantSettings
+from protocol.clock import LoopSettings
+from protocol.links import Arrival
 from protocol.messages import Claim
 from protocol.verbs import Sinusoid
 from protocol.wire import WireSpec
@@ -79,3 +83,17 @@ def test_the_same_tick_in_plain_numpy(benchmark: BenchmarkFixture, measurements:
         return wire.command.pack(read[0], [quantizer.encode(float(u)) for u in state.u[1:]])
 
     assert len(benchmark(tick)) == wire.command.size
+
+
+def test_a_row_of_the_plants_trace(benchmark: BenchmarkFixture) -> None:
+    wire, loop = WireSpec(), LoopSettings(trace_s=10)
+    endpoint = Endpoint(PlantSettings(ideal=True).build(PERIOD), wire, loop.period_ns)
+    endpoint.claim(
+        Claim(controller="c", session="s", period_ns=loop.period_ns, lockstep=False, auto_arm=True, wire=wire)
+    )
+    trace = PlantTrace(loop, wire, lambda _: None)
+    trace.follow(endpoint)
+    endpoint.tick(None, 0)
+    arrival = Arrival(wire.command.pack(0, (1, 2)), time.monotonic_ns())
+    measurement = endpoint.tick(arrival.frame, 1)
+    benchmark(trace.row, endpoint, measurement, arrival, time.monotonic_ns())

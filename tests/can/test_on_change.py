@@ -21,7 +21,7 @@ from service.hil import Hil
 from service.lab.experiment import run_experiment
 from tests.can.closed_loop import PATIENCE_S, run_on_bus
 from tests.can.in_process import Stranger, virtual
-from tests.can.test_relay import FIRST_COMMAND_NS, NOW, PERIOD_NS, WATCHDOG_NS, Still, command, measurement
+from tests.can.test_relay import FIRST_MEASUREMENT_NS, NOW, PERIOD_NS, WATCHDOG_NS, Still, command, measurement
 
 POLICIES: list[tuple[Policy, Policy]] = [
     ("on_change", "on_change"),
@@ -63,7 +63,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
     link = CanLink(bus, wire, end, lockstep=lockstep)  # type: ignore[arg-type]  # is one of both
     try:
         with Stranger(bus) as stranger:
-            frame = bytes(3) if end == "plant" else bytes(7)
+            frame = bytes((wire.command if end == "plant" else wire.measurement).size)
             identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
             stranger.say(identifier, frame)
             stranger.say(identifier, SILENCE)
@@ -92,8 +92,8 @@ def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanFront, Stranger, b
 
 def test_a_node_sends_silence_where_it_could_not_be_heard_only(node: tuple[CanFront, Stranger, bool]) -> None:
     front, stranger, lockstep = node
-    for counter, frame in enumerate((measurement(0), SILENCE, SILENCE, measurement(3))):
-        front.send(frame, counter)
+    for frame in (measurement(0), SILENCE, SILENCE, measurement(3)):
+        front.send(frame)
     said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
     silence = [SILENCE, SILENCE] if lockstep else []
     assert said == [measurement(0), *silence, measurement(3)]
@@ -125,8 +125,8 @@ def test_silence_passes_in_lockstep_and_has_the_counter_after_the_last() -> None
 def test_silence_does_not_pass_before_a_sessions_first_frame() -> None:
     it = relay()
     assert it.measurement(SILENCE) is None
-    assert it.command(SILENCE, NOW + FIRST_COMMAND_NS) is None
-    it.watch(NOW + FIRST_COMMAND_NS + 1)
+    assert it.command(SILENCE, NOW + FIRST_MEASUREMENT_NS) is None
+    it.watch(NOW + FIRST_MEASUREMENT_NS + 1)
     assert it.state is PlantState.TRIPPED  # it was no first command either
 
 
@@ -144,6 +144,7 @@ def test_an_empty_frame_is_refused_elsewhere_and_feeds_no_watchdog(wire: WireSpe
 
 def test_commands_that_stop_trip_the_bridge_though_the_last_is_held() -> None:
     it = relay(lockstep=False)
+    it.measurement(measurement(0))
     it.command(command(0), NOW)
     it.watch(NOW + WATCHDOG_NS)
     assert it.trip is None

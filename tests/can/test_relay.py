@@ -29,6 +29,7 @@ from protocol.can_link import (
 from protocol.clock import LoopSettings
 from protocol.messages import Claim, Grant, Refusal
 from protocol.states import PlantState, TripCause
+from protocol.trace import Outcome
 from protocol.wire import WireSpec
 from tests.can.in_process import Flaws, Stranger, virtual
 from tests.protocol.gathering import PATIENCE_S
@@ -36,19 +37,22 @@ from tests.protocol.gathering import PATIENCE_S
 WIRE = WireSpec()
 PERIOD_NS = 2_000_000
 WATCHDOG_NS = 100_000_000
-FIRST_COMMAND_NS = 1_000_000_000
+COUNTERS = WIRE.measurement.counters
+FIRST_MEASUREMENT_NS = 1_000_000_000
+FIRST_COMMAND_NS = (COUNTERS - 1) * PERIOD_NS
+"""After the first measurement, before its counter comes round."""
 NOW = 5_000_000_000_000
 """Some instant on the monotonic clock [ns]."""
 
 
 def measurement(counter: int, codes: Sequence[int] = (1, -2, 3, -4, 5, -6)) -> bytes:
     """A well-formed measurement frame."""
-    return WIRE.measurement.pack(counter, codes)
+    return WIRE.measurement.pack(counter % COUNTERS, codes)
 
 
 def command(echo: int, code: int = 5) -> bytes:
     """A well-formed command frame."""
-    return WIRE.command.pack(echo, (code, -code))
+    return WIRE.command.pack(echo % COUNTERS, (code, -code))
 
 
 # ── the relay: tenancy and watchdog of the bridge ──
@@ -67,9 +71,10 @@ def claim(name: str = "a", *, lockstep: bool = False, auto_arm: bool = False) ->
 
 
 def granted(*, lockstep: bool = False) -> Relay:
-    """A relay in a session, which has looked at the clock at NOW."""
+    """A relay in a session, whose first measurement came at NOW."""
     it = relay(lockstep=lockstep)
     assert isinstance(it.claim(claim(lockstep=lockstep)), Grant)
+    assert it.measurement(measurement(0)) is not None
     it.watch(NOW)
     return it
 
@@ -84,7 +89,7 @@ def driven(*, lockstep: bool = False) -> Relay:
 
 @settings(max_examples=40)
 @given(
-    counter=st.integers(0, 15),
+    counter=st.integers(0, COUNTERS - 1),
     codes=st.lists(st.integers(-128, 127), min_size=6, max_size=6),
     voltages=st.lists(st.integers(-32, 31), min_size=2, max_size=2),
 )
@@ -125,7 +130,7 @@ def test_a_malformed_measurement_is_counted_and_does_not_pass(frame: bytes) -> N
     assert it.measurement(measurement(1)) is not None
 
 
-@pytest.mark.parametrize("frame", [b"", bytes(2), bytes(4), bytes(2) + b"\1"])
+@pytest.mark.parametrize("frame", [b"", bytes(2), bytes(4), b"\0\0\1"])
 def test_a_malformed_command_is_counted_and_neither_passes_nor_feeds_the_watchdog(frame: bytes) -> None:
     it = driven()
     assert it.command(frame, NOW + WATCHDOG_NS) is None
@@ -147,8 +152,9 @@ def test_the_watchdog_trips_a_nanosecond_after_its_time_and_says_why() -> None:
 
 def test_every_fresh_command_feeds_the_watchdog() -> None:
     it, at = driven(), NOW
-    for echo in (*range(1, 16), 0, 9, 3):
+    for echo in (*range(1, 16), 40, 41, 70, *range(71, 300, 50)):
         at += WATCHDOG_NS
+        assert it.measurement(measurement(echo)) is not None
         it.watch(at)
         assert it.command(command(echo), at) is not None
     assert it.session is not None
@@ -174,15 +180,70 @@ def test_the_watchdogs_time_can_be_changed_between_two_ticks() -> None:
     assert it.state is PlantState.TRIPPED
 
 
-def test_the_first_command_has_a_second_from_the_grant() -> None:
-    in_time, late = granted(), granted()
+def test_a_command_that_answers_a_measurement_older_than_the_watchdogs_time_does_not_feed_it() -> None:
+    it, ticks = driven(), WATCHDOG_NS // PERIOD_NS
+    for counter in range(1, ticks + 4):
+        it.measurement(measurement(counter))
+    assert it.command(command(2), NOW + 1) == command(2)  # the node judges again
+    assert it.stale == 1
+    assert it.command(command(3), NOW + 2) == command(3)
+    assert it.stale == 1
+    it.watch(NOW + WATCHDOG_NS + 2)
+    assert it.state is PlantState.DRIVEN
+    it.watch(NOW + WATCHDOG_NS + 3)
+    assert it.trip is TripCause.COMMAND_TIMEOUT
+
+
+def test_a_tick_is_a_measurement_that_passes_with_what_was_received_before_it() -> None:
+    it = relay()
+    it.measurement(measurement(0))
+    assert it.ticked == -1
+    it.claim(claim())
+    seen = []
+    for counter, frames in (
+        (0, []),
+        (1, [command(0)]),
+        (2, [command(0, code=9)]),
+        (5, [command(2, code=7)]),
+        (6, [b"?"]),
+        (7, [WIRE.command.pack(6, [WIRE.voltage.quantizer().invalid] * 2)]),
+        (5 + COUNTERS, []),
+    ):
+        for frame in frames:
+            it.command(frame, NOW)
+        assert it.measurement(measurement(counter)) is not None
+        seen.append((it.ticked, it.session_tick, it.outcome, it.answered, it.voltages))
+    level = WIRE.voltage.quantizer().level
+    five, seven = (level(5), level(-5)), (level(7), level(-7))
+    assert seen == [
+        (0, 0, Outcome.NONE, -1, OFF),
+        (1, 1, Outcome.ACTED, 0, five),
+        (2, 2, Outcome.REPEATED, 0, five),
+        (3, 5, Outcome.ACTED, 2, seven),
+        (4, 6, Outcome.MALFORMED, 2, seven),
+        (5, 7, Outcome.ACTED, 6, OFF),  # whether it is the right answer is the node's to say
+        (6, 5 + COUNTERS, Outcome.NONE, 6, OFF),
+    ]
+    assert it.watch(NOW + WATCHDOG_NS + 1)
+    assert (it.ticked, it.session_tick, it.answered, it.voltages) == (7, 6 + COUNTERS, -1, OFF)
+    assert [(operation.kind, operation.tick) for operation in it.operations] == [("claim", -1)]
+
+
+def test_the_first_measurement_has_a_second_and_the_first_command_until_the_counter_comes_round() -> None:
+    in_time, late, silent = granted(), granted(), relay()
     in_time.watch(NOW + FIRST_COMMAND_NS)
     assert in_time.command(command(0), NOW + FIRST_COMMAND_NS) is not None
     in_time.watch(NOW + FIRST_COMMAND_NS + WATCHDOG_NS)
     assert in_time.state is PlantState.DRIVEN
     late.watch(NOW + FIRST_COMMAND_NS + 1)
     assert late.trip is TripCause.COMMAND_TIMEOUT
-    assert "no first command within 1 s" in late.notices[-1].text
+    assert "no first command within 0.51 s" in late.notices[-1].text
+    silent.claim(claim())
+    silent.watch(NOW)
+    silent.watch(NOW + FIRST_MEASUREMENT_NS)
+    assert silent.state is PlantState.GRANTED
+    silent.watch(NOW + FIRST_MEASUREMENT_NS + 1)
+    assert "no first command within 1 s" in silent.notices[-1].text
 
 
 def test_the_time_before_a_session_counts_for_nothing_in_it() -> None:
@@ -192,7 +253,7 @@ def test_the_time_before_a_session_counts_for_nothing_in_it() -> None:
     it.watch(later)
     it.claim(claim())
     it.watch(later + 1_000_000_000)
-    it.watch(later + 1_000_000_000 + FIRST_COMMAND_NS)
+    it.watch(later + 1_000_000_000 + FIRST_MEASUREMENT_NS)
     assert it.state is PlantState.GRANTED
 
 
@@ -207,6 +268,7 @@ def test_a_sessions_first_command_is_fresh_whatever_the_last_sessions_last_one_e
     it.release("of-a")
     it.claim(claim())
     it.watch(NOW)
+    it.measurement(measurement(0))
     assert it.command(command(0), NOW) is not None
     assert it.state is PlantState.DRIVEN
 
@@ -363,8 +425,8 @@ class Bus:
         arrival = self.front.link.take() if self.front.link else None
         frame = self.endpoint.tick(arrival.frame if arrival else None, self._k)
         if frame is not None:
-            self.front.send(frame, self.endpoint.counter)
-        self.front.after_tick(self._k)
+            self.front.send(frame)
+        self.front.after_tick(frame, arrival, 0)
         time.sleep(0.001)
 
     def until(self, what: str, condition: Callable[[], bool]) -> None:
@@ -439,7 +501,7 @@ def test_a_session_begins_when_the_other_side_says_granted_and_counts_from_0(bus
     assert bus.front.link is not None
     bus.hears(PlantState.GRANTED)
     seen = bus.counters(40)
-    assert seen == list(range(len(seen)))
+    assert seen == [k % COUNTERS for k in range(len(seen))]
 
 
 def test_a_command_drives_it_and_the_heartbeat_says_so_at_once(bus: Bus) -> None:
@@ -476,7 +538,7 @@ def test_heartbeats_come_ten_times_a_second_and_at_once_on_a_change(bus: Bus) ->
 def test_another_fingerprint_is_never_followed(bus: Bus, mark: bytes, caplog: pytest.LogCaptureFixture) -> None:
     bus.tell(PlantState.GRANTED, 1, mark)
     bus.until("the refusal", lambda: "another wire spec" in caplog.text)
-    for echo in range(16):
+    for echo in range(40):
         bus.side.send(command(echo))
         bus.turn()
     bus.turn_for(0.2)
@@ -547,7 +609,7 @@ def test_another_number_is_another_session(bus: Bus) -> None:
     bus.hears(PlantState.GRANTED)
     seen = bus.counters(40)
     start = next(i for i in range(len(seen)) if seen[i : i + 16] == list(range(16)))
-    assert seen[start:] == list(range(len(seen) - start))
+    assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
 
 
 def test_a_session_begins_afresh_with_counter_0_whatever_the_last_one_came_to(bus: Bus) -> None:

@@ -17,7 +17,7 @@ import pytest
 from protocol import topics
 from protocol.attitude import to_euler
 from protocol.messages import Event, Telemetry, Truth
-from protocol.verbs import Change, Setpoint
+from protocol.verbs import Setpoint
 from service.hil import Hil
 from service.logs.review import Kept, read
 from tests.hil.test_faults import PATIENT
@@ -91,7 +91,7 @@ def test_the_body_follows_a_file_and_a_live_stream_which_is_held_when_it_falls_s
     truths = [truth for _, truth in log.messages("truth") if isinstance(truth, Truth)]
     yaw_now = degrees(to_euler(truths[-1].attitude)[2])
     assert yaw_now == pytest.approx(25.0, abs=4.0)  # it tracks to a few degrees, as in the paper's experiment
-    changes = [change for _, change in log.messages("change") if isinstance(change, Change)]
+    changes = log.changes
     assert changes[0].tick == 0
     assert len(changes) > 10  # every set-point that a tick took
 
@@ -137,7 +137,7 @@ def test_a_configuration_read_again_changes_what_can_change_live_and_names_the_r
     text = next(event.text for event in log.events if event.kind == "changed" and "read again" in event.text)
     assert "law.C2: [0.15, 0.15, 0.15] → [0.2, 0.2, 0.2]" in text
     assert "law.mass: 1.075 → 2.0, after a restart" in text
-    gains = [change.gains.C2 for _, change in log.messages("change") if isinstance(change, Change) and change.gains]
+    gains = [change.gains.C2 for change in log.changes if change.gains]
     assert gains[-1] == (0.2, 0.2, 0.2)
     assert not any(isinstance(event, Event) and event.kind == "lost" for event in log.events)
 
@@ -172,7 +172,7 @@ def test_a_controller_that_must_be_certified_claims_once_it_is_and_refuses_what_
     # It fails, it holds, and what is asked for beside that changes nothing.
     assert [event.kind for event in said] == ["fault", "changed", "fault"]
     assert "Theorem 1 holds" in said[1].text
-    gains_set = [change.gains.C1 for _, change in log.messages("change") if isinstance(change, Change) and change.gains]
+    gains_set = [change.gains.C1 for change in log.changes if change.gains]
     assert set(gains_set) == {(0.4, 0.4, 0.4)}
     judged = read(log.path).findings.theorem
     assert judged is not None

@@ -19,13 +19,13 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 from mcap.records import Channel
-from service.logs.mcap_file import records
 
 from protocol import topics
 from protocol.messages import Event
 from service.bench import Bench, free_rendezvous
 from service.config import load
 from service.logs.files import ReviewError
+from service.logs.mcap_file import records
 from service.logs.review import review
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]

@@ -135,7 +135,8 @@ def test_a_recorder_that_is_killed_costs_a_chunk_and_the_loop_goes_on(tmp_path: 
         assert hil.status("plant").ticks > started_ticks
     judged = aeroloop("log", "review", str(tmp_path / "hil-0.mcap"))
     assert judged["damages"]
-    assert judged["missing_ticks"] == {"controller": 0, "plant": 0}  # as far as the log can know
+    # A chunk is cut between two topics: the last batches of one end may be there without the other's.
+    assert sum(judged["missing_ticks"].values()) <= (chunk_s + SLACK_S) * 500
     assert judged["duration_s"] >= 3 - chunk_s - SLACK_S
 
 

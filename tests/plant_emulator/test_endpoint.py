@@ -105,7 +105,8 @@ def test_a_claim_is_granted_and_the_next_tick_measures_with_counter_0() -> None:
     assert endpoint.claim(_claim()) == Grant(session="of-a")
     assert (endpoint.state, endpoint.session, endpoint.holder) == (PlantState.GRANTED, "of-a", "a")
     for k in range(4, 4 + 2 * COUNTERS):
-        assert _read(endpoint.tick(None, k))[0] == (k - 4) % COUNTERS == endpoint.counter
+        command = None if k == 4 else _command(k - 5)
+        assert _read(endpoint.tick(command, k))[0] == (k - 4) % COUNTERS == endpoint.counter
     assert _told(endpoint) == ["claimed"]
     assert "a" in endpoint.notices[0].text
     assert endpoint.notices[0].session == "of-a"

@@ -750,25 +750,28 @@ def test_stream_faults_act_one_after_another() -> None:
 
 def test_a_stream_knows_only_its_own_faults() -> None:
     faults = [Fault.parse("measurement:off"), Fault.parse("rate:off")]
-    assert FaultyStream("command", faults).idle
-    assert not FaultyStream("measurement", faults).idle
     assert FaultyStream("command", faults).passes(b"a", 0.0) == [b"a"]
+    assert FaultyStream("measurement", faults).passes(b"a", 0.0) == []
 
 
-def test_a_stream_is_idle_until_something_is_injected_and_after_it_is_over() -> None:
+def test_a_stream_passes_frames_untouched_until_something_is_injected_and_after_it_is_over() -> None:
     stream = FaultyStream("command", [])
     assert stream.passes(b"a", 5.0) == [b"a"]
     stream.inject(Fault.parse("measurement:off"), 5.0)
-    assert stream.idle
     stream.inject(Fault.parse("command:stuck@0.1..0.2"), 5.0)
-    assert not stream.idle
     assert [stream.passes(frame, t) for frame, t in ((b"b", 5.0), (b"c", 5.1), (b"d", 5.2))] == [[b"b"], [b"b"], [b"d"]]
-    assert stream.idle
     stream.inject(Fault.parse("command:stuck"), 5.3)
     assert stream.passes(b"e", 5.3) == [b"d"]
     stream.clear()
-    assert stream.idle
     assert stream.passes(b"f", 5.4) == [b"f"]
+
+
+def test_what_is_held_back_for_one_session_is_lost_with_it() -> None:
+    stream = FaultyStream("command", [Fault.parse("command:delay=0.1")])
+    assert stream.passes(b"a", 0.0) == []
+    stream.forget()
+    assert stream.passes(b"b", 0.1) == []
+    assert stream.passes(None, 0.2) == [b"b"]
 
 
 # ── again ──

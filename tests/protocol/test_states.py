@@ -189,7 +189,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         self.answered = -1  # tick of the measurement that the last fresh command answered
         self.age = 0  # periods since that command, or since the first measurement
         self.voltages: tuple[float, ...] = OFF
-        self.accepted = self.refused = 0
+        self.accepted = self.refused = self.stale = 0
         self.held: list[tuple[float, ...]] = []
         self.told: list[str] = []
 
@@ -219,7 +219,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         for _ in range(ticks):
             limit = {PlantState.GRANTED: FIRST_COMMAND_PERIODS, PlantState.DRIVEN: WATCHDOG_PERIODS}.get(self.state)
             self.age += 1
-            if limit is not None and self.age > limit:
+            if limit is not None and self.sent and self.age > limit:
                 self.tripped(TripCause.COMMAND_TIMEOUT)
             self.held.append(self.voltages)
         self.k += ticks
@@ -229,6 +229,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
             valid = self.plant.seen is REST
             if not self.sent:
                 self.first = self.k  # the first measurement has counter 0, also where ticks were skipped before it
+                self.age = 0
             assert WIRE.measurement.unpack(sent) == (
                 (self.k - self.first) % COUNTERS,
                 (0,) * 6 if valid else NO_VALID_VALUE,
@@ -240,6 +241,8 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
     def commanded(self, answers: int, pair: tuple[int, int], ticks: int) -> None:
         """A command that answers the measurement of a tick."""
         newer = answers > self.answered
+        if newer and self.k - answers > WATCHDOG_PERIODS:
+            newer, self.stale = False, self.stale + 1
         if newer and INVALID in pair and self.sent[answers]:
             self.tripped(TripCause.INVALID_COMMAND)
         elif newer:
@@ -375,7 +378,8 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
     @invariant()
     def it_has_counted_every_command(self) -> None:
-        assert (self.endpoint.accepted, self.endpoint.refused) == (self.accepted, self.refused)
+        counted = self.endpoint.accepted, self.endpoint.refused, self.endpoint.stale
+        assert counted == (self.accepted, self.refused, self.stale)
 
     @invariant()
     def nobody_who_may_not_drive_it_can(self) -> None:

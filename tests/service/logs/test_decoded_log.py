@@ -6,15 +6,18 @@ import random
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from tests.service.logs.losing_log import SHORT, make_losing_log, read, write
 
 from protocol import topics
 from service.config import load
 from service.logs.decoded import Decoder
 from service.logs.export import export
 from service.logs.files import LogFiles
+from service.logs.mcap_file import CONTRACT_METADATA
 from service.logs.review import review
 from service.logs.table_files import ExportError
-from tests.service.logs.losing_log import SHORT, make_losing_log, read, write
 from tests.service.logs.made_log import VEHICLE
 
 
@@ -47,3 +50,29 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_frame_deco
     assert review(tmp_path / "out.mcap").z_track == review(log).z_track
     with pytest.raises(ExportError, match="--session"):
         export([log], "mcap", tmp_path / "other.mcap", session=SHORT)
+
+
+def test_what_several_files_repeat_is_written_once_and_the_last_contract_stays_the_last(tmp_path: Path) -> None:
+    log = make_losing_log(tmp_path, load())
+    contract = next(iter(LogFiles([log]).contracts.values()))
+    before, now = (contract.model_copy(update={"host": host}).model_dump_json() for host in ("before", "now"))
+    (tmp_path / "run").mkdir()
+    for i, contracts in enumerate([(now, before), (before, now), (now,)]):
+        with (tmp_path / "run" / f"{i}.mcap").open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            writer.add_attachment(1, 1, "protocol/SPEC.md", "text/markdown", b"the same")
+            for json in contracts:
+                writer.add_metadata(CONTRACT_METADATA, {"key": "k", "json": json})
+            channel = writer.register_channel("other", "", writer.register_schema("s", "", b""))
+            writer.add_message(channel, i + 1, b"", i + 1, i)
+            writer.finish()
+    export([tmp_path / "run"], "mcap", tmp_path / "out.mcap")
+    with (tmp_path / "out.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert [one.metadata["json"] for one in reader.iter_metadata()] == [now, before, now]
+        assert len(list(reader.iter_attachments())) == 1
+        summary = reader.get_summary()
+        assert summary is not None
+        assert (len(summary.schemas), len(summary.channels)) == (1, 1)
+    assert [message.sequence for message in read(tmp_path / "out.mcap")] == [0, 1, 2]

@@ -20,12 +20,12 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
-
-from service.recording import rolling
-from service.logs.export import export
 from service.recording.intake import Taken
+
+from service.logs.export import export
 from service.logs.mcap_file import records
 from service.logs.recover import RecoverError, recover
+from service.recording import rolling
 from service.settings import RecorderSettings
 from tests.service.logs.made_log import make_log
 

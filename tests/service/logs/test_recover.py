@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
+import resource
 from pathlib import Path
 from typing import NamedTuple
 
@@ -105,5 +108,17 @@ def test_what_is_no_log_or_stands_in_the_way_is_told_in_one_line(whole: Path, tm
         with pytest.raises(RecoverError) as refused:
             recover(broken, out)
         assert len(str(refused.value).splitlines()) == 1
+        assert not out.exists()
     with pytest.raises(RecoverError, match="exists already"):
         recover(whole, whole)
+
+
+def test_what_a_full_disk_cut_short_is_removed(whole: Path, tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(RecoverError, match=os.strerror(errno.EFBIG)):
+            recover(whole, tmp_path / "out.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not (tmp_path / "out.mcap").exists()

@@ -124,6 +124,7 @@ class Publisher:
     """Publishes messages with a number, from a cache of 65 000."""
 
     def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
         self._publisher = CachedPublisher(session, KEY, per_s=1000, lossless=True)
         self._next = 0
 
@@ -256,6 +257,22 @@ def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_mes
     running.end()
     assert running.numbers() == list(range(20_000))
     assert running.losses() == []
+
+
+def test_what_a_role_publishes_before_it_answers_is_awaited_at_the_end(record: Record, publisher: Publisher) -> None:
+    """As a link keeps the order, the answer to a last question follows what was on its way."""
+    running, key = record(), topics.key("contract", "aero", role="plant")
+    publisher.send(1)
+    eventually("the first", lambda: running.recorder.log.written > 2)
+
+    def answer(query: zenoh.Query) -> None:
+        publisher.send(100)
+        query.reply(key, b"{}")
+
+    publisher.session.declare_queryable(key, answer, complete=True)
+    eventually("the queryable", lambda: running.role.zenoh.declare_querier(key).matching_status.matching)  # type: ignore[attr-defined]
+    running.end()
+    assert running.numbers() == list(range(100))
 
 
 def test_the_last_message_in_a_log_is_that_recording_stopped(record: Record, publisher: Publisher) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -21,6 +22,33 @@ EVENT, TRUTH = "aeroloop/aero/event", "aeroloop/v2/truth"
 def gathering() -> Iterator[Gathering]:
     with Gathering() as gathering:
         yield gathering
+
+
+def test_messages_published_while_a_link_is_set_up_do_not_hide_what_was_published_before(gathering: Gathering) -> None:
+    """The publisher is met by gossip, in the midst of a thousand messages a second."""
+    gathering.join()  # holds the rendezvous
+    publisher, over = CachedPublisher(gathering.join(), EVENT, per_s=1000), threading.Event()
+
+    def publish() -> None:
+        while not over.wait(0.001):
+            publisher.put(b"")
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        time.sleep(0.5)
+        subscriptions, taken = Subscriptions(gathering.join()), list[int]()
+
+        def take() -> bool:
+            taken.extend(received.sequence for received in subscriptions.take())
+            return len(taken) > 500
+
+        eventually("some", take)
+    finally:
+        over.set()
+        thread.join()
+    assert taken == list(range(len(taken)))
+    assert subscriptions.losses() == []
 
 
 def test_numbers_that_no_cache_has_are_lost_on_the_network_and_those_that_a_full_ring_dropped_in_the_queue(
