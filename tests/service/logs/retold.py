@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 from protocol import topics
 from protocol.attitude import IDENTITY, Quaternion
-from protocol.trace import HEADER_BYTES, End, read_batch
+from protocol.trace import HEADER_BYTES, STEPS, End, read_batch
 from protocol.verbs import Message as Model
 from service.config import load
 from service.logs.grounds import Library
@@ -99,9 +99,12 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
             return one
         batch = read_batch(one.data)
         assert batch is not None
-        data = bytearray(one.data)
-        edit(np.frombuffer(data, batch.columns.dtype, 1, HEADER_BYTES)[0])
-        return one._replace(data=bytes(data))
+        columns = batch.columns.copy()
+        edit(columns)
+        for name in set(STEPS) & set(columns.dtype.names or ()):
+            columns[name] = np.diff(columns[name], prepend=columns[name].dtype.type(0))
+        at = HEADER_BYTES + columns.nbytes
+        return one._replace(data=one.data[:HEADER_BYTES] + columns.tobytes() + one.data[at:])
 
     return change
 
