@@ -109,9 +109,9 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
     return change
 
 
-def observer_of() -> Observer:
+def observer_of(*overrides: str) -> Observer:
     """An observer of the default configuration."""
-    settings = load()
+    settings = load(overrides=overrides)
     return Observer(settings, Trial(Library(settings).of(()), settings.loop.period, None))
 
 
