@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from protocol.messages import Contract
 from protocol.topics import Address
-from protocol.trace import Batch, Sent
+from protocol.trace import Batch, Sent, read_batch
 from protocol.wire import SignalSpec
 from service.config import Settings, from_contract, load_over
 from service.controller import Codes
@@ -245,10 +245,11 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
     joins: dict[Which, Join] = {}
     plants = Plants(run)
     for arrived in run.batches(plants.route):
-        source, batch = arrived.source, arrived.batch
-        which = source.vehicle, batch.header.session
+        source = arrived.source
+        which = source.vehicle, arrived.header.session
         if source.end == "plant":
-            if not overrides:
+            batch = None if overrides else read_batch(arrived.payload)
+            if batch is not None:
                 plants.take(source, batch)
             continue
         if which not in run.extents:

@@ -195,8 +195,8 @@ def _column(rows: Rows, at: Integers, name: str) -> Integers:
 def _is(rows: Rows, at: Integers, name: str, *kinds: int) -> Flags:
     """Whether a column's value at places of rows is one of these; not where the place is −1. Shape (n,)."""
     values = _column(rows, at, name)
-    found = values == kinds[0]
-    for kind in kinds[1:]:
+    found = np.zeros(len(at), dtype=np.bool_)
+    for kind in kinds:
         found |= values == kind
     return found
 
