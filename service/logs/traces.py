@@ -6,6 +6,7 @@ that was recorded twice is known by its first row, and every session's length is
 
 from __future__ import annotations
 
+import struct
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterator
@@ -300,18 +301,20 @@ def _ticks(header: Header, payload: bytes) -> tuple[int, int, int]:
     if not rows:
         return NO_TICK, NO_TICK, NO_TICK
     if header.end == "controller":
-        ticks = np.frombuffer(payload, "<u4", rows, HEADER_BYTES)
-        first, last, received_as = int(ticks[0]), _sum(ticks), payload[HEADER_BYTES + 5 * rows - 1]
+        (first, last), received_as = _ends(payload, HEADER_BYTES, rows), payload[HEADER_BYTES + 5 * rows - 1]
         if received_as == Received.LATE:  # it is of an earlier tick than the rows before it
-            last = int(np.add.accumulate(ticks).max())
+            steps = np.frombuffer(payload, "<u4", rows, HEADER_BYTES)
+            last = int(np.add.accumulate(steps).max())
         return first, last, last if received_as == Received.FRAME else NO_TICK
-    ticks = np.frombuffer(payload, "<u4", rows, HEADER_BYTES + _SESSION_TICK * rows)
-    answered = _sum(np.frombuffer(payload, "<u4", rows, HEADER_BYTES + _ANSWERED * rows))
-    return int(ticks[0]), _sum(ticks), NO_TICK if answered == NEVER else answered
+    _, answered = _ends(payload, HEADER_BYTES + _ANSWERED * rows, rows)
+    first, last = _ends(payload, HEADER_BYTES + _SESSION_TICK * rows, rows)
+    return first, last, NO_TICK if answered == NEVER else answered
 
 
-def _sum(steps: npt.NDArray[np.uint32]) -> int:
-    return int(np.add.reduce(steps, dtype=np.uint64)) & NEVER
+def _ends(payload: bytes, at: int, rows: int) -> tuple[int, int]:
+    """The first and last value of a column of steps."""
+    steps = struct.unpack_from(f"<{rows}I", payload, at)
+    return steps[0], sum(steps) & NEVER
 
 
 def _next_ticks(batches: Batches) -> Integers:

@@ -58,7 +58,7 @@ def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
 def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_recorded(
     whole: Path, tmp_path: Path
 ) -> None:
-    """A batch is 50 ticks here, and is recorded when its last row is; the clocks of both ends differ by 10 s."""
+    """A batch is some 50 ticks here, recorded with its last row; the clocks of both ends differ by 10 s."""
 
     def event(
         at_s: float, role: str, kind: str, text: str, session: str | None = "s1", tick: int | None = None
@@ -80,7 +80,7 @@ def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_r
     assert [(mark.time_s, mark.role, mark.kind, mark.text) for mark in marks] == [
         (None, "plant", "started", "waits"),
         (0.0, "controller", "claimed", "has it"),
-        (0.5, "controller", "fault", "16 ticks missed"),
+        (0.508, "controller", "fault", "16 ticks missed"),
         (0.52, "controller", "fault", "5 ticks missed"),
         (0.998, "plant", "tripped", "tilted"),
         (None, "plant", "stopped", "at 0 V"),
@@ -122,9 +122,9 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
     assert findings.losses == {"measurement": 7, "event": 1}
     marks = [(mark.time_s, mark.role, mark.text[:17]) for mark in findings.marks if mark.kind == "lost"]
     assert marks == [
-        (0.2, "recorder", "3 of measurement "),
-        (0.4, "recorder", "4 of measurement "),
-        (0.5, "recorder", "1 of event lost: "),
+        (0.202, "recorder", "3 of measurement "),
+        (0.406, "recorder", "4 of measurement "),
+        (0.508, "recorder", "1 of event lost: "),
     ]
 
 
@@ -249,6 +249,6 @@ def test_the_account_tells_timing_gaps_what_happened_and_what_does_not_hold(
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
     assert "latency 298 298 298 300 µs" in out
-    assert "0.400 s plant tripped the [red] limit" in out
+    assert "0.406 s plant tripped the [red] limit" in out
     assert "… and 5 more" in out
     assert "✗ gaps ≤ 0 1" in out

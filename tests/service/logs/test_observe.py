@@ -131,7 +131,7 @@ def test_values_at_the_outermost_level_are_counted_by_signal(whole: Path, tmp_pa
 
 def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Path) -> None:
     """The gyro fails for seven ticks; the controller answers with commands without a valid value."""
-    faults = 'plant.faults=["rate.x:nan@0.86..0.874"]'
+    faults = 'plant.faults=["rate.x:off@0.86..0.874"]'
     make_log(tmp_path / "a.mcap", TICKS, settings=load(overrides=[faults]))
     findings = found(tmp_path / "a.mcap")
     assert findings.invalid == {"measurement": 7, "command": 7}

@@ -195,10 +195,10 @@ def test_a_session_that_begins_far_from_its_reference_is_judged_once_it_is_there
     ("change", "why"),
     [
         (lambda one: None if one.topic == "truth" else one, "no true state"),
-        (lambda one: told_of(one, session=None, session_tick=None), "do not say of which tick"),
+        (lambda one: told_of(one, session=None, session_tick=None), "no true state"),
         (lambda one: told_of(one, session="another"), "no true state"),
     ],
-    ids=["none", "of an older version", "of another session"],
+    ids=["none", "outside of sessions", "of another session"],
 )
 def test_without_a_true_state_of_a_tick_nothing_is_judged_and_the_reason_is_told(
     ideal: Path, tmp_path: Path, change: Callable[[Said], Said | None], why: str
