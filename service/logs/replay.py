@@ -259,7 +259,11 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
             evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
             replayers[which] = Replayer(which, evaluator, settings)
             joins[which] = run.join(which, alone=True)
-        for block in joins[which].add(arrived):
+        if joins[which].add(arrived):
+            for block in joins[which].blocks():
+                replayers[which].take(block)
+    for which, join in joins.items():
+        for block in join.blocks(finished=True):
             replayers[which].take(block)
     sessions = [replayer.result() for replayer in replayers.values()]
     results, reason = plants.results()

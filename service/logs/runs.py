@@ -146,10 +146,10 @@ class Run:
         for arrived in self.batches(route):
             which = arrived.source.vehicle, arrived.header.session
             self._follow(which, arrived)
-            if (join := joins.get(which)) is not None:
-                yield from join.add(arrived)
+            if (join := joins.get(which)) is not None and join.add(arrived):
+                yield from join.blocks()
         for join in joins.values():
-            yield from join.finish()
+            yield from join.blocks(finished=True)
 
     def join(self, which: Which, block: int = BLOCK, *, alone: bool = False) -> Join:
         """What joins the rows of a session.
@@ -246,8 +246,8 @@ class Join:
         }
         self._yielded: float = min(self._settled.values())
 
-    def add(self, arrived: Arrived) -> Iterator[Block]:
-        """A batch of it; blocks that are complete now."""
+    def add(self, arrived: Arrived) -> bool:
+        """A batch of it. Whether a block is complete now."""
         end, has_rows = arrived.source.end, arrived.header.rows > 0
         if end == "controller":
             if has_rows:
@@ -258,18 +258,16 @@ class Join:
         elif has_rows:
             self._plant.add(arrived)
         self._settled[end] = inf if arrived.next_tick == NO_TICK else arrived.next_tick - 1
-        yield from self._cut()
+        return self._limit - self._yielded >= self._block
 
-    def finish(self) -> Iterator[Block]:
-        """No more is to come."""
-        self._settled = {"controller": inf, "plant": inf}
-        yield from self._cut()
+    @property
+    def _limit(self) -> float:
+        """Up to where both ends have been read."""
+        return min(self._settled["controller"], self._settled["plant"] - self._margin)
 
-    def _cut(self) -> Iterator[Block]:
-        """Blocks up to where both ends have been read."""
-        limit = min(self._settled["controller"], self._settled["plant"] - self._margin)
-        if limit - self._yielded < self._block:
-            return
+    def blocks(self, *, finished: bool = False) -> Iterator[Block]:
+        """Blocks that are complete; all that is left where no more is to come."""
+        limit = inf if finished else self._limit
         while len(self._controller) > 1:  # a block has no gap within it
             last = float(self._controller[0].ticks[-1])
             if last > limit:
