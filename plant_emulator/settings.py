@@ -49,7 +49,7 @@ class PlantSettings(BaseModel):
     answer_timeout_s: float = Field(
         default=2.0, gt=0, le=600, description="lockstep only: 0 V after waiting this long for an answer [s]"
     )
-    truth_rate_hz: float = Field(default=50.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
+    truth_rate_hz: float = Field(default=10.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
     faults: list[str] = Field(

@@ -20,7 +20,7 @@ from zenoh.handlers import RingChannel
 
 KEPT_S: Final = 65.0
 """A cache holds what was published in this time, at the topic's rate [s]: 60 s and what a restart takes."""
-HEARTBEAT_S: Final = 1.0
+HEARTBEAT_S: Final = 2.0
 """How often a publisher that has published says its last number [s]: the very last message can be recovered, too."""
 HISTORY: Final = 1_000_000
 """Messages of one publisher that a subscriber asks for at the most; the publisher's cache is smaller."""

@@ -25,7 +25,7 @@ class ControllerSettings(BaseModel):
     auto_arm: bool = Field(
         default=False, description="arm the plant with every claim, instead of waiting for an operator's `op arm`"
     )
-    telemetry_rate_hz: float = Field(default=25.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
+    telemetry_rate_hz: float = Field(default=10.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
     max_reference_rate: float = Field(
         default=1.0, gt=0, le=100, description="fastest turn that an operator's reference may ask for [rad/s]"
     )
@@ -60,7 +60,7 @@ class RecorderSettings(BaseModel):
         default=False, description="record the frames as they crossed the network, too, beside the ends' own traces"
     )
     decoded_hz: float = Field(
-        default=25.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"
+        default=10.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"
     )
     max_file_mb: float = Field(default=256.0, gt=0, description="go on in a new file after this size [MB]")
     max_file_s: float = Field(default=3600.0, gt=0, description="go on in a new file after this time [s]")

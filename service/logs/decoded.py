@@ -185,13 +185,17 @@ class Decoder:
             return []
         name = "measurement" if batch.header.end == "plant" else "command"
         show, frames, found = self._frames[name], columns[name], []
+        slot_ns, last = self._slot_ns, self._slots.get((name, vehicle), -1)
         for row, (sent_as, sent) in enumerate(zip(columns["sent_as"].tolist(), columns["sent"].tolist(), strict=True)):
             at_ns = base_ns + sent * 1000
-            if sent_as == _FRAME and at_ns >= 0 and self._due(name, vehicle, at_ns):
-                try:
-                    found += show(vehicle, wire, frames[row].tobytes(), at_ns)
-                except _MalformedError:
-                    self.malformed += 1
+            if sent_as != _FRAME or at_ns < 0 or (slot_ns and at_ns // slot_ns == last):
+                continue
+            last = at_ns // slot_ns if slot_ns else -1
+            try:
+                found += show(vehicle, wire, frames[row].tobytes(), at_ns)
+            except _MalformedError:
+                self.malformed += 1
+        self._slots[name, vehicle] = last
         return found
 
     def _due(self, name: str, vehicle: str, at_ns: int) -> bool:

@@ -18,7 +18,8 @@ from service.cli import execute
 from service.figures import Figures
 from service.hil import Hil, HilLog
 from service.logs.replay import replay
-from service.logs.review import Kept, read, review
+from service.logs.review import read, review
+from service.logs.ticks import Ticks
 from tests.hil.test_faults import PATIENT, SLACK_S, TOLD, WATCHDOG_S, last_command_ns, seconds_driven_after
 from tests.hil.test_operate import done
 from tests.hil.test_processes import FIGURES, aeroloop
@@ -117,9 +118,9 @@ def test_an_export_has_a_row_a_tick(run: Run, tmp_path: Path) -> None:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     ticks = [int(row["tick"]) for row in rows]
     assert ticks == sorted(set(ticks))
-    kept = Kept()
-    judged = read(run.log.path, watch=kept.watch)
-    assert ticks == [tick.k for tick in kept[judged.which]]
+    blocks: list[Ticks] = []
+    read(run.log.path, watch=blocks.append)
+    assert ticks == [k for block in blocks for k in block.k.tolist()]
     assert len(ticks) > 0.5 * RATE * run.figures.duration_s
 
 

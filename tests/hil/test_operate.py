@@ -19,7 +19,8 @@ from protocol.attitude import to_euler
 from protocol.messages import Event, Telemetry, Truth
 from protocol.verbs import Setpoint
 from service.hil import Hil
-from service.logs.review import Kept, read
+from service.logs.review import read
+from service.logs.ticks import Ticks
 from tests.hil.test_faults import PATIENT
 
 AEROLOOP = [sys.executable, "-m", "service.cli"]
@@ -61,9 +62,13 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     roll, pitch, yaw = (degrees(angle) for angle in to_euler(last.desired))
     assert (roll, pitch, yaw) == pytest.approx((0.0, -10.0, 20.0), abs=1e-6)  # quintics and quaternions, rounded
     # The review computes the errors again from frames and changes; the controller told what it had computed.
-    kept = Kept()
-    judged = read(log.path, watch=kept.watch)
-    computed = {tick.k: tick.attitude_error for tick in kept[judged.which]}
+    blocks: list[Ticks] = []
+    read(log.path, watch=blocks.append)
+    computed = {
+        k: tuple(error)
+        for block in blocks
+        for k, error in zip(block.k.tolist(), block.attitude_error.tolist(), strict=True)
+    }
     told = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
     compared = [(message.attitude_error, computed[message.tick]) for message in told if message.tick in computed]
     assert len(compared) > 500

@@ -23,7 +23,9 @@ from service.bench import Bench, free_rendezvous
 from service.config import Settings, load
 from service.hil import Hil
 from service.logs.files import LogFiles
-from service.logs.review import review
+from service.logs.replay import replay
+from service.logs.report import Findings
+from service.logs.review import read, review
 from tests.hil.cable import Cable
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
 from tests.protocol.gathering import free_port
@@ -36,15 +38,16 @@ SLACK_S = 1.0
 two cores and other work keeps a process waiting for some hundred milliseconds."""
 
 
-def assert_whole(logs: Path, at_least: int) -> dict[str, Any]:
-    """No tick of either end is missing, and both ends replay byte for byte. Returns what the review says."""
-    judged = aeroloop("log", "review", str(logs))
-    assert judged["missing_ticks"] == {"controller": 0, "plant": 0}
-    replayed = aeroloop("log", "replay", str(logs))
-    for end in ("controller", "plant"):
-        assert replayed[end]["differ"] == 0, replayed
-        assert replayed[end]["ticks"] >= at_least, replayed
-    return judged
+def assert_whole(logs: Path, at_least: int) -> Findings:
+    """No tick of either end is missing, and both ends replay byte for byte. Returns what the review finds."""
+    findings = read(logs).findings
+    assert findings.missing_ticks == {"controller": 0, "plant": 0}, findings.missing
+    replayed = replay([logs])
+    for end in (replayed.controller, replayed.plant):
+        assert end is not None, replayed.reasons
+        assert end.differ == 0
+        assert end.ticks >= at_least
+    return findings
 
 
 def test_a_rotated_run_in_lockstep_holds_every_tick_and_is_reviewed_and_replayed_as_a_whole(tmp_path: Path) -> None:
@@ -54,10 +57,13 @@ def test_a_rotated_run_in_lockstep_holds_every_tick_and_is_reviewed_and_replayed
         hil.run(6.0)
     files = LogFiles([tmp_path]).paths
     assert len(files) >= 2
-    figures = assert_whole(tmp_path, 3000)
-    assert figures["skipped_ticks"] == 0
-    assert figures["duration_s"] == 6.0
-    assert figures["z_track"] == review(*files).z_track
+    found = assert_whole(tmp_path, 3000)
+    assert (found.skipped_ticks, found.duration_s) == (0, 6.0)
+    printed = aeroloop("log", "review", str(tmp_path))
+    assert printed["missing_ticks"] == {"controller": 0, "plant": 0}
+    assert printed["z_track"] == found.z_track == review(*files).z_track
+    replayed = aeroloop("log", "replay", str(tmp_path))
+    assert {end: replayed[end]["differ"] for end in ("controller", "plant")} == {"controller": 0, "plant": 0}
 
 
 @pytest.mark.parametrize("away_s", [5, 30])
@@ -72,8 +78,8 @@ def test_a_recorder_that_was_killed_and_comes_back_lacks_nothing(tmp_path: Path,
         hil.run(1)
         assert hil.state("plant") == "driven"
     judged = assert_whole(tmp_path, round(0.5 * 500 * away_s))
-    assert judged["sessions"] == 1
-    assert judged["duration_s"] >= away_s + 2 - SLACK_S
+    assert judged.sessions == 1
+    assert judged.duration_s >= away_s + 2 - SLACK_S
 
 
 def test_a_recorder_that_starts_long_after_the_loop_has_it_from_the_first_tick(tmp_path: Path) -> None:

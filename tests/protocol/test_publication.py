@@ -28,7 +28,12 @@ def payload(i: int) -> bytes:
 def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Received]:
     """What is received until there is so much of it."""
     found: list[Received] = []
-    eventually("receiving", lambda: found.extend(subscriber.take()) or len(found) >= wanted)
+
+    def received() -> bool:
+        found.extend(subscriber.take())
+        return len(found) >= wanted
+
+    eventually("receiving", received)
     time.sleep(0.05)  # a duplicate would follow at once
     found.extend(subscriber.take())
     return found
@@ -76,7 +81,12 @@ def test_what_finds_no_room_to_wait_shows_as_a_gap_in_the_sequence(network: Gath
         publisher.put(payload(i))
     found: list[Received] = []
     time.sleep(0.2)  # nothing is taken meanwhile, so the ring overflows
-    eventually("receiving", lambda: found.extend(subscriber.take()) or (bool(found) and found[-1].sequence == 39))
+
+    def received() -> bool:
+        found.extend(subscriber.take())
+        return bool(found) and found[-1].sequence == 39
+
+    eventually("receiving", received)
     assert [each.sequence for each in found] == list(range(40 - len(found), 40))
 
 

@@ -268,7 +268,7 @@ def test_a_frame_that_is_later_than_the_stale_time_is_not_answered_and_shows_no_
     held = range(100, 200)  # all of them arrive 250 ms after tick 100
     arrivals = [arrival(k, late_ns=max(0, 125 - (k - 100)) * PERIOD_NS if k in held else 0) for k in range(300)]
     source = Source(arrivals, monkeypatch, wire=PERIODIC)
-    source.link = source.source._link = SimulatedLink(arrivals, 300)  # type: ignore[assignment]  # each is taken
+    source.link = source.source._link = SimulatedLink(arrivals, 300)  # each is taken
     monkeypatch.setattr(tick_source, "time", source.link)
     taken = source.run(until(299))
     stale = [each.tick for each in taken if each.received_as is Received.LATE]

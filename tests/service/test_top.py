@@ -6,7 +6,7 @@ from io import StringIO
 
 from rich.console import Console
 
-from protocol.messages import Contract, Event, Status, Telemetry, Truth
+from protocol.messages import PROTOCOL_VERSION, Contract, Event, Status, Telemetry, Truth
 from protocol.verbs import Message
 from service.config import load
 from service.top import SILENT_S, Top
@@ -52,7 +52,9 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
     shown = text(
         heard(
             status__controller=status("controller", "running"),
-            contract__plant=Contract(role="plant", vehicle="aero", host="h", versions={}, config=load().contract()),
+            contract__plant=Contract(
+                protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=load().contract()
+            ),
             telemetry=telemetry,
             truth=Truth(tick=1, attitude=(half, 0.0, 0.0, half), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0)),
             event=Event(role="plant", kind="tripped", text="no fresh command for 100 ms: 0 V"),
@@ -64,7 +66,11 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
 
 def test_where_only_changes_are_sent_the_bits_are_those_of_the_frames_that_were() -> None:
     config = load(overrides=["wire.transmit.command=on_change"]).contract()
-    top = heard(contract__plant=Contract(role="plant", vehicle="aero", host="h", versions={}, config=config))
+    top = heard(
+        contract__plant=Contract(
+            protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config
+        )
+    )
     for uptime_s, sent in ((1.0, 40), (3.0, 440), (3.1, 441)):  # the last says nothing of a rate
         told = status("controller", "running").model_copy(update={"uptime_s": uptime_s, "sent": sent, "received": 10})
         top.hear("aeroloop/aero/status/controller", told.encode())

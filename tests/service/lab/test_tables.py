@@ -91,7 +91,8 @@ def test_the_papers_numbers_are_those_of_its_tables() -> None:
 def test_figures_of_the_paper_are_drawn_from_a_log_under_their_numbers(tmp_path: Path) -> None:
     from service.demo import run_demo
     from service.logs.plots import draw_figures
-    from service.logs.review import Kept, read
+    from service.logs.review import read
+    from service.logs.ticks import Ticks
 
     for overrides, numbers in (
         (["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"], {"C.4", "C.5", "C.6"}),
@@ -100,9 +101,9 @@ def test_figures_of_the_paper_are_drawn_from_a_log_under_their_numbers(tmp_path:
     ):
         log = tmp_path / f"{len(numbers)}-{len(overrides)}.mcap"
         run_demo(load(overrides=["loop.lockstep=true", *overrides]), 0.5, log)
-        kept = Kept()
-        judged = read(log, watch=kept.watch)
-        paths = draw_figures(judged.session.settings, kept[judged.which], tmp_path / log.stem)
+        kept: list[Ticks] = []
+        judged = read(log, watch=kept.append)
+        paths = draw_figures(judged.session.settings, kept, tmp_path / log.stem)
         assert len(paths) == 5
         assert {path.stem.split("-")[0] for path in paths if path.stem.startswith("C.")} == numbers
         assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
