@@ -210,18 +210,25 @@ def read_header(payload: bytes) -> Header | None:
     """The header of a batch; None if the bytes are none of this version."""
     if len(payload) < HEADER_BYTES:
         return None
-    version, end, flags, actuators, measurement, command, rows, tail, *rest, name = _HEADER.unpack_from(payload)
-    run, first_row, monotonic_ns, wall_ns = rest
-    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3):
-        return None
-    try:
-        session = name.rstrip(b"\0").decode("ascii")
-    except UnicodeDecodeError:
+    version, end, flags, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, name = (
+        _HEADER.unpack_from(payload)
+    )
+    session = _name(name)
+    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3) or session is None:
         return None
     final = bool(flags & _FINAL)
     return Header(
         ENDS[end], final, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, session
     )
+
+
+@lru_cache(maxsize=16)
+def _name(padded: bytes) -> str | None:
+    """The name of a session; None if it is none."""
+    try:
+        return padded.rstrip(b"\0").decode("ascii")
+    except UnicodeDecodeError:
+        return None
 
 
 def read_batch(payload: bytes) -> Batch | None:
@@ -241,15 +248,46 @@ def read_batch(payload: bytes) -> Batch | None:
 
 def read_columns(payload: bytes, header: Header) -> np.void | None:
     """The columns of a batch, as in `Batch`; None if its length is not what its header says."""
-    dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
-    if len(payload) != HEADER_BYTES + dtype.itemsize + header.tail_bytes:
+    if len(payload) != batch_bytes(header):
         return None
+    dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
     columns: np.void = np.frombuffer(bytearray(payload), dtype, 1, HEADER_BYTES)[0]
     assert dtype.names is not None
     for name in dtype.names:
         if name in STEPS:
             column = columns[name]
             np.add.accumulate(column, out=column)
+    return columns
+
+
+def batch_bytes(header: Header) -> int:
+    """How long a batch is by its header."""
+    dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
+    return HEADER_BYTES + dtype.itemsize + header.tail_bytes
+
+
+def join_columns(batches: Sequence[tuple[Header, bytes]]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of batches of one end and wire, one after another; of their times see `Batch.times_ns`. Shapes (rows,).
+
+    Args:
+        batches: At least one; headers, and bytes of the length that they say.
+    """
+    first = batches[0][0]
+    dtype = row_dtype(first.end, first.measurement_bytes, first.command_bytes, first.actuators)
+    ends = np.cumsum([header.rows for header, _ in batches])
+    columns: dict[str, npt.NDArray[Any]] = {}
+    assert dtype.fields is not None
+    for name, (kind, at, *_) in dtype.fields.items():
+        size = at + kind.itemsize
+        parts = [
+            payload[HEADER_BYTES + header.rows * at : HEADER_BYTES + header.rows * size] for header, payload in batches
+        ]
+        column = np.frombuffer(b"".join(parts), kind.base).reshape(-1, *kind.shape)
+        if name in STEPS:  # each batch begins with a step from 0
+            column = np.add.accumulate(column, dtype=kind)
+            before = np.concatenate([[0], column[ends[:-1] - 1]]).astype(kind)
+            column -= np.repeat(before, np.diff(ends, prepend=0))
+        columns[name] = column
     return columns
 
 

@@ -52,8 +52,10 @@ class ClockOffset:
                 trip = (there - base) + (back + base)
                 quick = known[trip[known] <= np.median(trip[known])]
                 offset = ((there - base) - (back + base))[quick] / 2
-                slope, at_zero = np.polyfit(quick, offset, 1) if np.ptp(quick) >= WINDOW // 4 else (0.0, offset.mean())
-                found[begin:end] = base + at_zero + slope * np.arange(end - begin)
+                apart, middle = quick - quick.mean(), offset.mean()
+                spread = float(apart @ apart) if quick[-1] - quick[0] >= WINDOW // 4 else 0.0
+                slope = float(apart @ (offset - middle)) / spread if spread else 0.0
+                found[begin:end] = base + middle + slope * (np.arange(end - begin) - quick.mean())
                 self.last_ns = float(found[end - 1])
             else:
                 found[begin:end] = self.last_ns

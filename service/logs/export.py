@@ -15,7 +15,6 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from protocol.attitude import Quaternion, Vector
 from protocol.host import versions
 from protocol.messages import Truth
 from protocol.topics import Address
@@ -115,7 +114,7 @@ def _table(paths: Sequence[Path], to: Format, part: Path, session: str | None, p
         true = Truth.model_validate_json(payload)
         writer = writers.get((vehicle, true.session or ""))
         if writer is not None and true.session_tick is not None:
-            writer.truths.append((true.session_tick, true.attitude, true.rate, true.voltages))
+            writer.truths.append((true.session_tick, *true.attitude, *true.rate, *true.voltages))
 
     def route(address: Address) -> Taker | None:
         return partial(truth, address.vehicle) if address.topic.name == "truth" else None
@@ -144,7 +143,7 @@ class _Writer:
     """Writes one session's ticks into a table."""
 
     def __init__(self, which: Which, file: TableFile, settings: Settings) -> None:
-        self.truths: list[tuple[int, Quaternion, Vector, tuple[float, ...]]] = []
+        self.truths: list[tuple[float, ...]] = []  # tick, attitude, rate, voltages
         self.rows = 0
         self._which = which
         self._file = file
@@ -159,15 +158,12 @@ class _Writer:
 
     def _true_at(self, k: Integers) -> Truths:
         """Of each tick the last truth by then. Shapes (n, columns)."""
-        shapes = (1, 4, 3, self._actuators)
-        known = [
-            np.array(column).reshape(-1, n) for column, n in zip(zip(*self.truths, strict=True), shapes, strict=True)
-        ]
-        known = known or [np.empty((0, n)) for n in shapes]
-        at = np.searchsorted(known[0][:, 0], k, side="right")
+        columns = 8 + self._actuators
+        known = np.array(self.truths, dtype=np.float64).reshape(-1, columns)
+        at = np.searchsorted(known[:, 0], k, side="right")
         self.truths = self.truths[max(0, int(at[-1]) - 1) :]
-        ticks, *columns = (np.vstack([np.full((1, column.shape[1]), np.nan), column])[at] for column in known)
-        return Truths(ticks[:, 0], *columns)
+        true = np.vstack([np.full((1, columns), np.nan), known])[at]
+        return Truths(true[:, 0], true[:, 1:5], true[:, 5:8], true[:, 8:])
 
 
 def beside(log: Path, ending: str) -> Path:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from protocol.messages import Contract
 from protocol.topics import Address
-from protocol.trace import Batch, Sent
+from protocol.trace import Batch, Sent, read_batch
 from protocol.wire import SignalSpec
 from service.config import Settings, from_contract, load_over
 from service.controller import Codes
@@ -245,10 +245,11 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
     joins: dict[Which, Join] = {}
     plants = Plants(run)
     for arrived in run.batches(plants.route):
-        source, batch = arrived.source, arrived.batch
-        which = source.vehicle, batch.header.session
+        source = arrived.source
+        which = source.vehicle, arrived.header.session
         if source.end == "plant":
-            if not overrides:
+            batch = None if overrides else read_batch(arrived.payload)
+            if batch is not None:
                 plants.take(source, batch)
             continue
         if which not in run.extents:
@@ -258,7 +259,11 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
             evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
             replayers[which] = Replayer(which, evaluator, settings)
             joins[which] = run.join(which, alone=True)
-        for block in joins[which].add(arrived):
+        if joins[which].add(arrived):
+            for block in joins[which].blocks():
+                replayers[which].take(block)
+    for which, join in joins.items():
+        for block in join.blocks(finished=True):
             replayers[which].take(block)
     sessions = [replayer.result() for replayer in replayers.values()]
     results, reason = plants.results()

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from protocol.messages import Truth
 from protocol.topics import Address
 from protocol.verbs import Change
 from service.config import ConfigError
@@ -108,14 +107,9 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         frames = WireCheck(which, settings.wire, run.reached)
         story = Story(which, settings.loop.period, run.reached, run.open_sessions)
 
-        def truth(payload: bytes, _: int) -> None:
-            true = Truth.model_validate_json(payload)
-            if true.session == which[1]:
-                session.truth(true.session_tick, true.attitude, true.rate)
-
         def route(address: Address) -> Taker | None:
             if address.topic.name == "truth":
-                return truth if address.vehicle == vehicle else None
+                return session.truth if address.vehicle == vehicle else None
             return frames.route(address) or story.route(address)
 
         for block in run.read([which], route):

@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.topics import Address
-from protocol.trace import NEVER, Batch, End, Outcome, Received
+from protocol.trace import NEVER, End, Header, Outcome, Received, join_columns
 from protocol.verbs import Change
 from service.logs.files import LogFiles, Progress, ReviewError
-from service.logs.traces import Arrived, Extent, InOrder, Integers, Missing, TraceIndex, Which
+from service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, TraceIndex, Which
 
 BLOCK: Final = 4096
 """Ticks of a block, about: numpy is quick with so many, and they stay in the cache."""
@@ -144,13 +144,12 @@ class Run:
         """
         joins = {which: self.join(which, block) for which in sessions}
         for arrived in self.batches(route):
-            header = arrived.batch.header
-            which = arrived.source.vehicle, header.session
+            which = arrived.source.vehicle, arrived.header.session
             self._follow(which, arrived)
-            if (join := joins.get(which)) is not None:
-                yield from join.add(arrived)
+            if (join := joins.get(which)) is not None and join.add(arrived):
+                yield from join.blocks()
         for join in joins.values():
-            yield from join.finish()
+            yield from join.blocks(finished=True)
 
     def join(self, which: Which, block: int = BLOCK, *, alone: bool = False) -> Join:
         """What joins the rows of a session.
@@ -169,12 +168,11 @@ class Run:
     def _follow(self, which: Which, arrived: Arrived) -> None:
         """Keep how far the plant's trace has come; the controller's, where the log has none of the plant."""
         vehicle, session = which
-        header = arrived.batch.header
+        header = arrived.header
         if header.end == "controller" and which in self.extents and self.extents[which].rows["plant"]:
             return
         if header.rows:
-            ticks = arrived.batch.columns["session_tick" if header.end == "plant" else "tick"]
-            self.reached[which], self.open_sessions[vehicle] = int(ticks[-1]), session
+            self.reached[which], self.open_sessions[vehicle] = arrived.last_tick, session
         if header.final or not session:
             self.open_sessions.pop(vehicle, None)
 
@@ -194,12 +192,12 @@ class _Segment:
     def __init__(self, end: End, state: dict[str, Any] | None = None) -> None:
         self.state = state
         self._column = "tick" if end == "controller" else "session_tick"
-        self._batches: list[Batch] = []
+        self._batches: list[tuple[Header, bytes]] = []
         self._rows: Rows = {}
 
-    def add(self, batch: Batch) -> None:
+    def add(self, arrived: Arrived) -> None:
         """Rows that follow."""
-        self._batches.append(batch)
+        self._batches.append((arrived.header, arrived.payload))
 
     @property
     def rows(self) -> Rows:
@@ -248,30 +246,28 @@ class Join:
         }
         self._yielded: float = min(self._settled.values())
 
-    def add(self, arrived: Arrived) -> Iterator[Block]:
-        """A batch of it; blocks that are complete now."""
-        batch, end = arrived.batch, arrived.source.end
+    def add(self, arrived: Arrived) -> bool:
+        """A batch of it. Whether a block is complete now."""
+        end, has_rows = arrived.source.end, arrived.header.rows > 0
         if end == "controller":
-            if batch.header.rows:
+            if has_rows:
                 if arrived.after_gap or not self._controller:
-                    self._controller.append(_Segment(end, batch.tail.state))
-                self._controller[-1].add(batch)
-            self._changes += batch.tail.changes
-        elif batch.header.rows:
-            self._plant.add(batch)
-        self._settled[end] = inf if arrived.next_tick is None else arrived.next_tick - 1
-        yield from self._cut()
+                    self._controller.append(_Segment(end, arrived.tail.state))
+                self._controller[-1].add(arrived)
+            self._changes += arrived.changes
+        elif has_rows:
+            self._plant.add(arrived)
+        self._settled[end] = inf if arrived.next_tick == NO_TICK else arrived.next_tick - 1
+        return self._limit - self._yielded >= self._block
 
-    def finish(self) -> Iterator[Block]:
-        """No more is to come."""
-        self._settled = {"controller": inf, "plant": inf}
-        yield from self._cut()
+    @property
+    def _limit(self) -> float:
+        """Up to where both ends have been read."""
+        return min(self._settled["controller"], self._settled["plant"] - self._margin)
 
-    def _cut(self) -> Iterator[Block]:
-        """Blocks up to where both ends have been read."""
-        limit = min(self._settled["controller"], self._settled["plant"] - self._margin)
-        if limit - self._yielded < self._block:
-            return
+    def blocks(self, *, finished: bool = False) -> Iterator[Block]:
+        """Blocks that are complete; all that is left where no more is to come."""
+        limit = inf if finished else self._limit
         while len(self._controller) > 1:  # a block has no gap within it
             last = float(self._controller[0].ticks[-1])
             if last > limit:
@@ -321,17 +317,16 @@ def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
     return np.where(ticks[at] == k, places[at], -1)
 
 
-def _joined(batches: Sequence[Batch]) -> Rows:
+def _joined(batches: Sequence[tuple[Header, bytes]]) -> Rows:
     """Rows of batches of one end, one after another."""
-    counts = [batch.header.rows for batch in batches]
-    names = batches[0].columns.dtype.names or ()
-    rows: Rows = {name: np.concatenate([batch.columns[name] for batch in batches]) for name in names}
-    base = np.repeat([batch.header.monotonic_ns for batch in batches], counts)
+    rows = join_columns(batches)
+    headers = [header for header, _ in batches]
+    counts = [header.rows for header in headers]
+    base = np.repeat([header.monotonic_ns for header in headers], counts)
     for name in ("received", "sent"):
-        known = rows[name] != NEVER
-        rows[name] = np.where(known, rows[name].astype(np.int64) * 1000 + base, -1)
+        rows[name] = np.where(rows[name] == NEVER, -1, rows[name].astype(np.int64) * 1000 + base)
     for name in ("tick", "session_tick", "answered"):
         if name in rows:
             rows[name] = rows[name].astype(np.int64)
-    rows["wall"] = np.repeat([batch.header.wall_ns - batch.header.monotonic_ns for batch in batches], counts)
+    rows["wall"] = np.repeat([header.wall_ns - header.monotonic_ns for header in headers], counts)
     return rows

@@ -100,7 +100,6 @@ class Trial:
         self._changes: list[Change] = []  # the first few
         self._since, self._until = 0, inf
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
-        self._untold = 0  # truths that do not say of which tick they are
         self._before: Ticks | None = None  # the last block: a truth may come a little late
         self._drawn = np.empty((0, 4))  # the last true state: its tick, ‖z‖, V and the angle of its error [deg]
         self._tallies: dict[str, Tally] = {}
@@ -122,10 +121,8 @@ class Trial:
         self._settled = self._since + transient(self._grounds.law) / self._period
 
     def truth(self, tick: int | None, attitude: Quaternion, rate: Vector) -> None:
-        """What was true as a tick's measurement was taken; None if nobody says which."""
-        if tick is None:
-            self._untold += 1
-        elif not self._truths or tick > self._truths[-1][0]:
+        """What was true as a tick's measurement was taken; None of a state that none was taken of."""
+        if tick is not None and (not self._truths or tick > self._truths[-1][0]):
             self._truths.append((tick, attitude, rate))
 
     def ticks(self, ticks: Ticks) -> tuple[Array, Array]:
@@ -240,8 +237,6 @@ class Trial:
     def _reasons(self, found: TheoremFindings) -> dict[str, str]:
         reasons = dict[str, str]()
         no_truth = "the log has no true state of a tick that is judged"
-        if self._untold:
-            no_truth = "the log's true states do not say of which tick they are"
         changed = f"gains or reference changed at {found.until_s} s"
         end = "the session ended before" if found.until_s is None else changed
         short = f"the transient lasts {found.transient_s:.3g} s, and {end}"

@@ -56,14 +56,10 @@ class Buckets(NamedTuple):
         """Neighbours merged, from bucket `since` on; if their number is odd, the last stays as it is."""
         end = since + (len(self.rows) - since) // 2 * 2
         first, then = self.part(slice(since, end, 2)), self.part(slice(since + 1, end, 2))
-        later_low = (then.low < first.low) | np.isnan(first.low)
-        later_high = (then.high > first.high) | np.isnan(first.high)
-        merged = type(self)(
-            np.where(later_low, then.low, first.low),
-            np.where(later_high, then.high, first.high),
-            np.where(later_low == later_high, np.where(later_low, then.rising, first.rising), later_high),
-            first.rows + then.rows,
-        )
+        low, high = np.fmin(first.low, then.low), np.fmax(first.high, then.high)
+        later_low, later_high = low != first.low, high != first.high
+        among = np.where(later_low, then.rising, first.rising)
+        merged = type(self)(low, high, np.where(later_low == later_high, among, later_high), first.rows + then.rows)
         return self.part(slice(since)).followed_by(merged).followed_by(self.part(slice(end, None)))
 
 

@@ -132,13 +132,13 @@ class TickReader:
         over = (block.at_plant >= 0) & ~_is(plant, block.at_plant, "sent_as", Sent.NONE)
         over[places] = False
         beside = self._beside(block, used, places, over, plants_codes) if over.any() else None
-        columns = []
-        for i, column in enumerate(self._evaluator.compute(used)):
-            filled = np.full((n, column.shape[1]), np.nan)
-            filled[places] = column
-            if beside is not None:
-                filled[over] = beside[i]
-            columns.append(filled)
+        columns = list(self._evaluator.compute(used))
+        if len(used.k) < n:
+            for i, column in enumerate(columns):
+                columns[i] = np.full((n, column.shape[1]), np.nan)
+                columns[i][places] = column
+                if beside is not None:
+                    columns[i][over] = beside[i]
         attitude, desired, rate, attitude_error, rate_error, unquantized, sign, gain, damping = columns
         unquantized[over] = damping[over] = np.nan
         ticks = Ticks(
@@ -195,8 +195,8 @@ def _column(rows: Rows, at: Integers, name: str) -> Integers:
 def _is(rows: Rows, at: Integers, name: str, *kinds: int) -> Flags:
     """Whether a column's value at places of rows is one of these; not where the place is −1. Shape (n,)."""
     values = _column(rows, at, name)
-    found = values == kinds[0]
-    for kind in kinds[1:]:
+    found = np.zeros(len(at), dtype=np.bool_)
+    for kind in kinds:
         found |= values == kind
     return found
 

@@ -6,6 +6,7 @@ that was recorded twice is known by its first row, and every session's length is
 
 from __future__ import annotations
 
+import struct
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterator
@@ -14,9 +15,10 @@ from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from protocol.trace import NEVER, Batch, End, Header, Received, read_batch, read_columns, read_header
+from protocol.trace import HEADER_BYTES, NEVER, End, Header, Received, Tail, batch_bytes, read_header, row_dtype
+from protocol.verbs import Change
 
 Which = tuple[str, str]
 """A vehicle and a session."""
@@ -25,6 +27,9 @@ Key = tuple[int, bool, int, int]
 """Place of a batch among those of its source: first row, whether it has rows, time and, where it has none, checksum."""
 
 NO_TICK: Final = -1
+
+_SESSION_TICK, _ANSWERED = (row_dtype("plant", 1, 1, 2).fields[name][1] for name in ("session_tick", "answered"))  # type: ignore[index]  # it has fields
+"""Bytes of a row before these columns, whatever the frames' sizes."""
 
 Integers = npt.NDArray[np.int64]
 
@@ -125,7 +130,7 @@ class TraceIndex:
     def add(self, vehicle: str, payload: bytes) -> None:
         """A batch that a file holds."""
         header = read_header(payload)
-        if header is None or read_columns(payload, header) is None:
+        if header is None or len(payload) != batch_bytes(header):
             self.malformed += 1
             return
         batches = self.sources.setdefault(Source(vehicle, header.end, header.run), Batches())
@@ -201,15 +206,33 @@ class Arrived(NamedTuple):
 
     Attributes:
         source: Whose.
-        batch: Its rows and tail.
+        header: What it says of all its rows.
+        payload: Its bytes.
         after_gap: Whether rows before it are missing.
-        next_tick: No row of its session that comes later is of a tick before this one; None if none comes.
+        last_tick: Tick of its last row; −1 without rows.
+        next_tick: No row of its session that comes later is of a tick before this one; −1 if none comes.
     """
 
     source: Source
-    batch: Batch
+    header: Header
+    payload: bytes
     after_gap: bool
-    next_tick: int | None
+    last_tick: int
+    next_tick: int
+
+    @property
+    def tail(self) -> Tail:
+        """What belongs to its rows; nothing where that is malformed."""
+        text = self.payload[len(self.payload) - self.header.tail_bytes :]
+        try:
+            return Tail.model_validate_json(text) if text else Tail()
+        except ValidationError:
+            return Tail()
+
+    @property
+    def changes(self) -> list[Change]:
+        """Changes in its tail; most tails have none."""
+        return self.tail.changes if self.payload.find(b'"changes"', -self.header.tail_bytes or None) >= 0 else []
 
 
 class InOrder:
@@ -220,33 +243,48 @@ class InOrder:
     """
 
     def __init__(self, index: TraceIndex) -> None:
-        self._waiting: dict[Source, dict[Key, Batch]] = {source: {} for source in index.sources}
-        self._at = dict.fromkeys(index.sources, 0)
-        self._keys = {source: batches.table[:, :4].tolist() for source, batches in index.sources.items()}
-        self._next = {source: _next_ticks(batches) for source, batches in index.sources.items()}
-        self._after = dict.fromkeys(index.sources, 0)
+        self._queues = {source: _Queue(batches) for source, batches in index.sources.items()}
 
     def take(self, vehicle: str, payload: bytes) -> Iterator[Arrived]:
         """A batch as a file holds it; then every batch whose turn it is."""
-        batch = read_batch(payload)
-        if batch is None:
+        header = read_header(payload)
+        if header is None or len(payload) != batch_bytes(header):
             return
-        source = Source(vehicle, batch.header.end, batch.header.run)
-        keys, waiting = self._keys[source], self._waiting[source]
-        place = bisect_left(keys, list(key_of(batch.header, payload)), lo=self._at[source])
-        if place == len(keys) or tuple(keys[place][:2]) != (batch.header.first_row, batch.header.rows > 0):
-            return
-        waiting.setdefault(tuple(keys[place]), batch)
-        while self._at[source] < len(keys):
-            batch = waiting.pop(tuple(keys[self._at[source]]), None)
-            if batch is None:
-                return
-            at, header = self._at[source], batch.header
-            gap = header.rows > 0 and header.first_row > self._after[source]
-            self._after[source] = header.first_row + header.rows
-            self._at[source] = at + 1
-            following = int(self._next[source][at])
-            yield Arrived(source, batch, gap, None if following == NO_TICK else following)
+        source = Source(vehicle, header.end, header.run)
+        queue = self._queues[source]
+        queue.put(header, payload)
+        while (batch := queue.next(source)) is not None:
+            yield batch
+
+
+class _Queue:
+    """Batches of one source that wait for those before them."""
+
+    def __init__(self, batches: Batches) -> None:
+        self._keys: list[Key] = list(zip(*(column.tolist() for column in batches.table[:, :4].T), strict=True))
+        self._last, self._next = batches.column("last").tolist(), _next_ticks(batches).tolist()
+        self._waiting: dict[Key, tuple[Header, bytes]] = {}
+        self._at = self._row = 0
+
+    def put(self, header: Header, payload: bytes) -> None:
+        """A batch of it, known or not."""
+        key, keys = key_of(header, payload), self._keys
+        place = self._at
+        if place == len(keys) or keys[place] != key:
+            place = bisect_left(keys, key, lo=place)
+            if place == len(keys) or keys[place] != key:
+                return  # it was taken before
+        self._waiting[key] = header, payload
+
+    def next(self, source: Source) -> Arrived | None:
+        """The batch whose turn it is; None if it has not been read yet."""
+        at = self._at
+        if at == len(self._keys) or (found := self._waiting.pop(self._keys[at], None)) is None:
+            return None
+        header, payload = found
+        gap = header.rows > 0 and header.first_row > self._row
+        self._row, self._at = header.first_row + header.rows, at + 1
+        return Arrived(source, header, payload, gap, self._last[at], self._next[at])
 
 
 def key_of(header: Header, payload: bytes) -> Key:
@@ -255,17 +293,28 @@ def key_of(header: Header, payload: bytes) -> Key:
 
 
 def _ticks(header: Header, payload: bytes) -> tuple[int, int, int]:
-    """The first and last tick of a batch, and the last tick of which its rows prove that the other end had it."""
-    columns = read_columns(payload, header)
-    if columns is None or not header.rows:
+    """The first and last tick of a batch, and a tick of which it proves that the other end had it, too.
+
+    Ticks are steps, whose sum is the last row's.
+    """
+    rows = header.rows
+    if not rows:
         return NO_TICK, NO_TICK, NO_TICK
     if header.end == "controller":
-        ticks = columns["tick"]
-        received = ticks[(columns["received_as"] == Received.FRAME) | (columns["received_as"] == Received.LATE)]
-        return int(ticks.min()), int(ticks.max()), int(received.max()) if len(received) else NO_TICK
-    ticks, answered = columns["session_tick"], columns["answered"]
-    proof = answered[answered != NEVER]
-    return int(ticks.min()), int(ticks.max()), int(proof.max()) if len(proof) else NO_TICK
+        (first, last), received_as = _ends(payload, HEADER_BYTES, rows), payload[HEADER_BYTES + 5 * rows - 1]
+        if received_as == Received.LATE:  # it is of an earlier tick than the rows before it
+            steps = np.frombuffer(payload, "<u4", rows, HEADER_BYTES)
+            last = int(np.add.accumulate(steps).max())
+        return first, last, last if received_as == Received.FRAME else NO_TICK
+    _, answered = _ends(payload, HEADER_BYTES + _ANSWERED * rows, rows)
+    first, last = _ends(payload, HEADER_BYTES + _SESSION_TICK * rows, rows)
+    return first, last, NO_TICK if answered == NEVER else answered
+
+
+def _ends(payload: bytes, at: int, rows: int) -> tuple[int, int]:
+    """The first and last value of a column of steps."""
+    steps = struct.unpack_from(f"<{rows}I", payload, at)
+    return steps[0], sum(steps) & NEVER
 
 
 def _next_ticks(batches: Batches) -> Integers:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Container
 from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
@@ -161,10 +162,12 @@ def make_log(
     begin: int = 0,
     changes: Changes | None = None,
     spoil: int | None = None,
-    chunk_every: int = 100,
+    chunk_every: int = 20,
     truth_every: int = 0,
+    lost: Container[int] = (),
+    skipped: Container[int] = (),
 ) -> None:
-    """Write a log of a loop in which nothing goes wrong.
+    """Write a log of a loop in which nothing else goes wrong.
 
     Args:
         path: Where.
@@ -175,48 +178,75 @@ def make_log(
         spoil: The tick whose command is not logged as it was sent.
         chunk_every: Close a chunk after so many messages.
         truth_every: Publish the true state every so many ticks; 0 is never.
+        lost: Ticks whose measurement never reaches the controller.
+        skipped: Ticks that the plant has no time for.
     """
     settings = settings or lockstep()
-    wire, loop, changes = settings.wire, settings.loop, changes or {}
+    messages = made(settings, ticks, changes or {}, spoil, truth_every, lost, skipped)
+    write(path, settings, [message for message in messages if not begin or not _before(message, begin)], chunk_every)
+
+
+def made(
+    settings: Settings,
+    ticks: int,
+    changes: Changes = {},  # noqa: B006  # nobody changes it
+    spoil: int | None = None,
+    truth_every: int = 0,
+    lost: Container[int] = (),
+    skipped: Container[int] = (),
+    session: str = SESSION,
+    at_ns: int = 0,
+) -> list[Logged]:
+    """The messages of such a loop; arguments as of `make_log`.
+
+    The session may have another name, and begin so long after the first instant of both clocks [ns]; each session is
+    of processes of its own.
+    """
+    wire, loop = settings.wire, settings.loop
     messages = Messages()
-    clocks: dict[End, Clock] = {"plant": Clock("plant"), "controller": Clock("controller")}
-    plant_clock, clock = clocks["plant"], clocks["controller"]
+    plant_clock, clock = Clock("plant"), Clock("controller")
     emulator = Emulator(loop, wire, settings.plant, threading.Event())
-    endpoint = emulator.endpoint
+    endpoint, n = emulator.endpoint, at_ns // 1_000_000
     with patch("plant_emulator.plant_trace.time", plant_clock):
-        trace = PlantTrace(loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"])
+        plant_clock.now_ns = at_ns
+        trace = PlantTrace(
+            loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n
+        )
         claim = Claim(
-            controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
+            controller="c", session=session, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
         )
         assert isinstance(endpoint.claim(claim), Grant)
         trace.follow(endpoint)
-        end = ControllerEnd(settings, messages, clock)
+        end = ControllerEnd(settings, messages, clock, session, RUNS["controller"] + n)
         arrival: Arrival | None = None
         for k in range(ticks):
-            at_ns = plant_clock.now_ns = k * loop.period_ns
+            if k in skipped:
+                continue
+            now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
             measurement = emulator.tick(arrival.frame if arrival else None, k)
             assert measurement is not None, endpoint.notices
             trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
             if truth_every and k % truth_every == 0:
                 messages.add("truth", truth_of(emulator._emulated, endpoint).encode(), plant_clock, "plant")
-            clock.now_ns = at_ns + ONE_WAY_NS
+            arrival = None
+            if k in lost:
+                continue
+            clock.now_ns = now_ns + ONE_WAY_NS
             if k in changes:
                 end.follow(k, *changes[k])
             command = end.controller.tick(measurement, k)
             received_as = Received.FRAME if measurement else Received.SILENT
-            now_ns = clock.monotonic_ns()
             logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
-            end.record(PlantTick(k, measurement, received_as, now_ns, now_ns), logged, now_ns)
+            received_ns = clock.monotonic_ns()
+            end.record(PlantTick(k, measurement, received_as, received_ns, received_ns), logged, received_ns)
             if k % 10 == 0 and end.controller.tick_index == k:
-                messages.add("telemetry", telemetry_of(end.controller, SESSION).encode(), clock)
-            arrival = None if command is None or (not command and not loop.lockstep) else Arrival(
-                command, plant_clock.at(at_ns + 2 * ONE_WAY_NS)
-            )  # fmt: skip
+                messages.add("telemetry", telemetry_of(end.controller, session).encode(), clock)
+            if command or (command is not None and loop.lockstep):
+                arrival = Arrival(command, plant_clock.at(now_ns + 2 * ONE_WAY_NS))
         end.publish(final=True)
-        endpoint.release(SESSION)
+        endpoint.release(session)
         trace.follow(endpoint)
-    kept = [message for message in messages.all if not _before(message, begin)] if begin else messages.all
-    write(path, settings, kept, chunk_every)
+    return messages.all
 
 
 def _before(message: Logged, begin: int) -> bool:

@@ -1,4 +1,4 @@
-"""A log told again with something changed: messages moved, replaced, left out or added, everything else as it was.
+"""A log told again with something changed: messages moved, replaced, left out or added, rows of batches edited.
 
 And ticks made up, for an observer that is fed by hand.
 """
@@ -6,8 +6,9 @@ And ticks made up, for an observer that is fed by hand.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from math import nan
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.reader import make_reader
@@ -15,18 +16,21 @@ from mcap.writer import Writer
 
 from protocol import topics
 from protocol.attitude import IDENTITY, Quaternion
+from protocol.trace import HEADER_BYTES, STEPS, End, read_batch
 from protocol.verbs import Message as Model
+from service.config import load
+from service.logs.grounds import Library
 from service.logs.observe import Observer
+from service.logs.theorem import Trial
 from service.logs.ticks import Ticks
-from tests.service.logs.made_log import SESSION, START_NS, VEHICLE
+from tests.service.logs.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000
-ZEROS = bytes(7)  # a measurement of 8 bits a signal
-LATENCY_NS = 300_000  # in the bin from 291.7 to 304.4 µs, whose middle is 297.9
+LATENCY_NS = 2 * ONE_WAY_NS  # in the bin from 291.7 to 304.4 µs, whose middle is 297.9
 
 
 class Said(NamedTuple):
-    """A message: its key, when it was published [ns], what it says."""
+    """A message: its key, when it was recorded [ns], what it says."""
 
     key: str
     published_ns: int
@@ -60,21 +64,26 @@ def retell(
         log: The log.
         out: The new one.
         change: What becomes of each message; None leaves it out.
-        more: Messages to add.
+        more: Messages to add, by their times.
         metadata: Metadata to add, by name.
     """
     with log.open("rb") as file:
         reader = make_reader(file)
-        messages = [Said(channel.topic, one.publish_time, one.data) for _, channel, one in reader.iter_messages()]
+        messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
         known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+    kept = [one for message in messages if (one := change(message)) is not None]
+    return tell(out, sorted([*kept, *more], key=lambda one: one.published_ns), [*known, *metadata])
+
+
+def tell(out: Path, messages: Iterable[Said], metadata: Iterable[tuple[str, dict[str, str]]] = ()) -> Path:
+    """Write messages in this order."""
     with out.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="aeroloop", library="test")
-        for name, entries in [*known, *metadata]:
+        for name, entries in metadata:
             writer.add_metadata(name, entries)
         channels: dict[str, int] = {}
-        kept = [one for message in messages if (one := change(message)) is not None]
-        for one in sorted([*kept, *more], key=lambda one: one.published_ns):
+        for one in messages:
             if one.key not in channels:
                 channels[one.key] = writer.register_channel(one.key, "", 0)
             writer.add_message(channels[one.key], one.published_ns, one.data, one.published_ns)
@@ -82,15 +91,50 @@ def retell(
     return out
 
 
-def feed(
-    observer: Observer,
-    k: int,
-    attitude: Quaternion = IDENTITY,
-    desired: Quaternion = IDENTITY,
-) -> None:
-    """Let an observer see a tick, with its measurement."""
-    at = START_NS + k * PERIOD_NS
-    zero = (0.0, 0.0, 0.0)
-    observer.measurement(ZEROS, at)
-    columns = (k, at, float(LATENCY_NS), attitude, desired, zero, zero, zero, zero, (0.0, 0.0), 1.0, zero, zero)
-    observer.ticks(Ticks(*(np.array([column]) for column in columns)))
+def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
+    """What edits the columns of an end's batches in place."""
+
+    def change(one: Said) -> Said:
+        if one.topic != "trace" or not one.key.endswith(end):
+            return one
+        batch = read_batch(one.data)
+        assert batch is not None
+        columns = batch.columns.copy()
+        edit(columns)
+        for name in set(STEPS) & set(columns.dtype.names or ()):
+            columns[name] = np.diff(columns[name], prepend=columns[name].dtype.type(0))
+        at = HEADER_BYTES + columns.nbytes
+        return one._replace(data=one.data[:HEADER_BYTES] + columns.tobytes() + one.data[at:])
+
+    return change
+
+
+def observer_of(*overrides: str) -> Observer:
+    """An observer of the default configuration."""
+    settings = load(overrides=overrides)
+    return Observer(settings, Trial(Library(settings).of(()), settings.loop.period, None))
+
+
+def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:
+    """One tick at rest."""
+    at, zero, one = START_NS + k * PERIOD_NS, (0.0,) * 3, float(LATENCY_NS)
+    columns = (
+        k,
+        at,
+        at,
+        one,
+        nan,
+        nan,
+        attitude,
+        desired,
+        zero,
+        zero,
+        zero,
+        zero,
+        (0.0, 0.0),
+        (0.0, 0.0),
+        1.0,
+        zero,
+        zero,
+    )
+    return Ticks(*(np.array([column]) for column in columns))

@@ -14,20 +14,29 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import scipy.io
-from tests.service.logs.losing_log import LOST, PERIOD_NS, SHORT, TICKS, TRUTHS, UNANSWERED, make_losing_log
 
 from protocol.attitude import to_euler
 from protocol.messages import Telemetry
 from protocol.wire import WireSpec
 from service.cli import execute
 from service.config import Settings, from_contract, load
-from service.logs import spool
 from service.logs.export import export
 from service.logs.files import LogFiles
 from service.logs.review import review
-from service.logs.table import Rows, euler_deg, groups, telemetry_fields, tick_fields, truth_fields
+from service.logs.runs import Run
+from service.logs.table import Rows, Truths, euler_deg, groups
 from service.logs.table_files import ExportError, ParquetFile
-from tests.service.logs.made_log import SESSION, START_NS, VEHICLE
+from service.logs.ticks import Ticks
+from tests.service.logs.made_log import SESSION, START_NS, VEHICLE, made, write
+from tests.service.logs.retold import PERIOD_NS
+
+TICKS = 400
+SKIPPED = range(100, 148)
+"""The plant had no time for them."""
+UNANSWERED = range(200, 204)
+"""Their measurements were lost."""
+SHORT = "s2"
+"""A second session, of 50 ticks."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +46,10 @@ def settings() -> Settings:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory, settings: Settings) -> Path:
-    return make_losing_log(tmp_path_factory.mktemp("log"), settings)
+    """Two sessions, the first of which skips ticks and leaves some unanswered."""
+    long = made(settings, TICKS, truth_every=10, lost=UNANSWERED, skipped=SKIPPED)
+    short = made(settings, 50, session=SHORT, at_ns=3_600_000_000_000)
+    return write(tmp_path_factory.mktemp("log") / "log.mcap", settings, [*long, *short])
 
 
 Table = dict[str, list[Any]]
@@ -64,7 +76,7 @@ def test_the_rows_sum_up_to_the_figures_of_the_review(log: Path, parquet: Table,
     for row, after in zip(all_rows, [*all_rows[1:], None], strict=True):
         held = after["tick"] - row["tick"] if after else 1
         z_track += sum(row[f"attitude_error_{axis}"] ** 2 for axis in "xyz") * held * period
-    answered = [row for row in all_rows if row["latency_us"] is not None]
+    answered = [row for row in all_rows if row["voltage_2_V"] is not None]
     longest = round(settings.plant.watchdog_s / period)
     for row, after in zip(answered, [*answered[1:], None], strict=True):
         held = min(longest, after["tick"] - row["tick"]) if after else 1
@@ -75,7 +87,7 @@ def test_the_rows_sum_up_to_the_figures_of_the_review(log: Path, parquet: Table,
 
 
 def test_a_gap_stays_a_gap(parquet: Table) -> None:
-    ticks = [k for k in range(TICKS) if k not in LOST]
+    ticks = [k for k in range(TICKS) if k not in SKIPPED]
     assert parquet["tick"] == ticks
     assert parquet["time_s"] == [k * 0.002 for k in ticks]
     assert parquet["published_ns"] == [START_NS + k * PERIOD_NS for k in ticks]
@@ -84,43 +96,43 @@ def test_a_gap_stays_a_gap(parquet: Table) -> None:
 def test_nothing_was_commanded_where_nothing_answered(parquet: Table) -> None:
     for row in rows(parquet):
         answered = row["tick"] not in UNANSWERED
-        assert row["latency_us"] == (300.0 if answered else None)
+        assert row["latency_us"] == (300.0 if answered and row["tick"] != TICKS - 1 else None)
         for name in ("voltage_2_V", "voltage_3_V", "saturated_voltage_2", "saturated_voltage_3"):
             assert (row[name] is not None) == answered
 
 
-def test_truth_is_the_last_that_was_published_by_then(parquet: Table) -> None:
-    known = 0
+def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: Settings) -> None:
+    """Every tenth tick has one, unless the plant skipped it."""
+    quantizer = settings.wire.rate.quantizer()
     for row in rows(parquet):
-        before = [i for i, at_ns in enumerate(TRUTHS) if at_ns <= row["published_ns"]]
-        if not before:
-            assert [row[name] for name in row if name.startswith("truth_")] == [None] * 13
-            continue
-        known += 1
-        assert row["truth_rate_x_rad_s"] == before[-1]
-        assert row["truth_age_s"] == pytest.approx((row["published_ns"] - TRUTHS[before[-1]]) * 1e-9, abs=1e-12)
-        assert (row["truth_q3"], row["truth_voltage_2_V"], row["truth_voltage_3_V"]) == (0.5, 1.0, -1.0)
-        assert row["truth_roll_deg"] == pytest.approx(90.0)
-    assert known == len(parquet["tick"]) - 21  # the first came a millisecond after tick 20
+        last = max(k for k in range(0, row["tick"] + 1, 10) if k not in SKIPPED)
+        assert row["truth_age_s"] == pytest.approx((row["tick"] - last) * 0.002)
+        if last == row["tick"]:  # the gyro's noise and its quantizer lie between
+            assert row["rate_z_rad_s"] == pytest.approx(row["truth_rate_z_rad_s"], abs=quantizer.limit / 20)
+    assert len(set(parquet["truth_voltage_2_V"])) > 3
 
 
-def test_telemetry_stands_at_its_own_tick_and_nowhere_else(log: Path, parquet: Table) -> None:
+def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
+    """And is what telemetry said of it: θ̂ before the tick is that after the one before."""
     told = {}
-    for _, payload, _ in LogFiles([log]).messages(("telemetry",)):
-        telemetry = Telemetry.model_validate_json(payload)
+    for found in LogFiles([log]).routed(lambda address: address if address.topic.name == "telemetry" else None):
+        telemetry = Telemetry.model_validate_json(found.data)
         if telemetry.session == SESSION:
             told[telemetry.tick] = telemetry
-    found = 0
+    before: Telemetry | None = None
     for row in rows(parquet):
         theta = tuple(row[f"damping_estimate_{axis}_Nms_rad"] for axis in "xyz")
         volts = row["unquantized_voltage_2_V"], row["unquantized_voltage_3_V"]
-        if spoken := told.get(row["tick"]):
-            found += 1
-            assert (theta, volts, row["sign"]) == (spoken.damping_estimate, spoken.voltages, spoken.sign)
-            assert tuple(row[f"attitude_error_{axis}"] for axis in "xyz") == spoken.attitude_error
-        else:
-            assert (theta, volts, row["sign"]) == ((None,) * 3, (None,) * 2, None)
-    assert found == TICKS / 10 - 5  # of which five spoke of ticks that were lost
+        if row["tick"] in UNANSWERED:
+            assert (theta, volts) == ((None,) * 3, (None,) * 2)
+            continue
+        if before is not None and before.tick == row["tick"] - 1:
+            assert theta == before.damping_estimate
+        before = told.get(row["tick"])
+        if before is not None:
+            assert (volts, row["sign"]) == (before.voltages, before.sign)
+            assert tuple(row[f"attitude_error_{axis}"] for axis in "xyz") == before.attitude_error
+    assert len(told) > 30
 
 
 def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, settings: Settings) -> None:
@@ -128,11 +140,11 @@ def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, set
     assert wire.voltage.bits is not None
     top = 2 ** (wire.voltage.bits - 1) - 1
     codes = {}
-    for address, payload, published_ns in LogFiles([log]).messages(("command",)):
-        frame = wire.command.unpack(payload)
-        assert frame is not None
-        if address.session == SESSION:
-            codes[(published_ns - START_NS) // PERIOD_NS] = frame[1]
+    for block in Run([log]).read([(VEHICLE, SESSION)]):
+        for k, frame in zip(block.controller["tick"].tolist(), block.controller["command"], strict=True):
+            read = wire.command.unpack(frame.tobytes())
+            assert read is not None
+            codes[k] = read[1]
     for motor in (0, 1):
         found = dict(zip(parquet["tick"], parquet[f"saturated_voltage_{motor + 2}"], strict=True))
         assert {k: flag for k, flag in found.items() if flag is not None} == {
@@ -142,17 +154,18 @@ def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, set
     assert not any(parquet["saturated_rate_x"] + parquet["saturated_attitude_x"])
 
 
-def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded(tmp_path: Path) -> None:
+def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_not_commanded() -> None:
     wire = WireSpec(actuators=3)
     top = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
-    with spool.Spool(tmp_path) as piles:
-        dtypes = [piles.pile(fields(3)).dtype for fields in (tick_fields, telemetry_fields, truth_fields)]
-    ticks, telemetry, truth = (np.zeros(3, dtype) for dtype in dtypes)
-    ticks["attitude"] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-    ticks["rate"][0] = top["rate"], -top["rate"], 0.99 * top["rate"]
-    ticks["voltages"] = (top["voltage"], -top["voltage"], 0.0), (nan, nan, nan), (top["voltage"], 0.0, 0.0)
-    ticks["latency_ns"] = 1, 1, -1
-    rows = Rows(VEHICLE, SESSION, ticks, telemetry, truth)
+    zeros, one = np.zeros((3, 3)), np.ones(3)
+    attitude = np.zeros((3, 4))
+    attitude[:] = (0.1, top["attitude"], -top["attitude"], 0.5), (0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    rate, volts = zeros.copy(), np.full((3, 3), nan)
+    rate[0] = top["rate"], -top["rate"], 0.99 * top["rate"]
+    volts[0] = top["voltage"], -top["voltage"], 0.0
+    k = np.arange(3)
+    law = attitude, attitude, rate, zeros, zeros, zeros, volts, volts, one, zeros, zeros
+    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), Truths(one, attitude, zeros, zeros))
     found = {
         column.name: list(values)
         for group in groups(wire, 0.002)
@@ -252,7 +265,7 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
         assert exported.rows == len(table["tick"])
         return list(zip(table["session"], table["tick"], strict=True))
 
-    first = [(SESSION, k) for k in range(TICKS) if k not in LOST]
+    first = [(SESSION, k) for k in range(TICKS) if k not in SKIPPED]
     second = [(SHORT, k) for k in range(50)]
     assert ticks(None) == first
     assert ticks(SHORT) == ticks(f"{VEHICLE}/{SHORT}") == second
@@ -264,10 +277,15 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
 def test_the_table_does_not_depend_on_how_it_is_cut_into_blocks(
     log: Path, tmp_path: Path, parquet: Table, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """But for the delays, whose clocks are fitted block by block."""
+    fitted = {"measurement_delay_us", "command_delay_us"}
     for size in (5, 64):
-        monkeypatch.setattr(spool, "BLOCK_ROWS", size)
+        monkeypatch.setattr(Run.read, "__defaults__", (lambda _: None, size))
         export([log], "parquet", tmp_path / f"{size}.parquet")
-        assert pyarrow.parquet.read_table(tmp_path / f"{size}.parquet").to_pydict() == parquet
+        table = pyarrow.parquet.read_table(tmp_path / f"{size}.parquet").to_pydict()
+        assert {name: column for name, column in table.items() if name not in fitted} == {
+            name: column for name, column in parquet.items() if name not in fitted
+        }
 
 
 def test_what_stands_in_the_way_is_told_in_one_line_and_nothing_is_left_behind(

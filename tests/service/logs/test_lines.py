@@ -11,11 +11,11 @@ import pytest
 from protocol.attitude import Quaternion
 from protocol.messages import Truth
 from service.config import load
-from service.logs.observe import Observer
-from service.logs.review import Kept, read, report
+from service.logs.review import read, report
 from service.logs.thin import ThinnedLines
-from tests.service.logs.made_log import START_NS, make_log
-from tests.service.logs.retold import LATENCY_NS, PERIOD_NS, feed, retell, told
+from service.logs.ticks import Ticks
+from tests.service.logs.made_log import SESSION, START_NS, make_log
+from tests.service.logs.retold import LATENCY_NS, PERIOD_NS, observer_of, retell, ticks_of, told
 
 TICKS = 500
 
@@ -29,19 +29,19 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_short_session_is_drawn_exactly(whole: Path) -> None:
-    kept = Kept()
-    judged = read(whole, watch=kept.watch)
-    made, ticks = judged.report(), kept[judged.which]
+    blocks: list[Ticks] = []
+    judged = read(whole, watch=blocks.append)
+    made, ticks = judged.report(), Ticks.joined(blocks)
     drawn = {(panel.group, panel.label, line.label): line.values for panel in made.panels for line in panel.lines}
     assert made.thinned == 1
-    assert made.time.tolist() == [tick.k * 0.002 for tick in ticks]
-    assert drawn["rate", "ω₃", "measured"].tolist() == [tick.rate[2] for tick in ticks]
-    assert drawn["rate", "ω₃", "desired"].tolist() == [tick.desired_rate[2] for tick in ticks]
-    assert drawn["attitude", "ε₂", "desired"].tolist() == [tick.desired[2] for tick in ticks]
-    assert drawn["attitude_error", "ε̃₁", "measured"].tolist() == [tick.attitude_error[0] for tick in ticks]
-    assert drawn["rate_error", "ω_e2", "measured"].tolist() == [tick.rate_error[1] for tick in ticks]
-    assert drawn["input", "u₂", "commanded"].tolist() == [tick.voltages[0] for tick in ticks]
-    assert drawn["latency", "latency", "latency"].tolist() == [LATENCY_NS / 1e3] * TICKS
+    assert made.time.tolist() == (ticks.k * 0.002).tolist()
+    assert drawn["rate", "ω₃", "measured"].tolist() == ticks.rate[:, 2].tolist()
+    assert drawn["rate", "ω₃", "desired"].tolist() == ticks.desired_rate[:, 2].tolist()
+    assert drawn["attitude", "ε₂", "desired"].tolist() == ticks.desired[:, 2].tolist()
+    assert drawn["attitude_error", "ε̃₁", "measured"].tolist() == ticks.attitude_error[:, 0].tolist()
+    assert drawn["rate_error", "ω_e2", "measured"].tolist() == ticks.rate_error[:, 1].tolist()
+    assert drawn["input", "u₂", "commanded"].tolist() == ticks.voltages[:, 0].tolist()
+    assert drawn["latency", "latency", "latency"][:-1].tolist() == [LATENCY_NS / 1e3] * (TICKS - 1)
     assert drawn["period", "period", "period"][1:].tolist() == [PERIOD_NS / 1e3] * (TICKS - 1)
     assert max(drawn["error_angle", "angle", "measured"]) == pytest.approx(judged.figures.max_error_deg)
     assert judged.figures.final_error_deg == pytest.approx(drawn["error_angle", "angle", "measured"][-1])
@@ -67,27 +67,28 @@ def test_panels_stand_in_the_order_of_the_papers_figures_and_are_named_after_the
 
 
 def test_of_both_signs_the_attitude_is_drawn_with_that_beside_the_desired_one() -> None:
-    observer = Observer(load())
-    feed(observer, 0, attitude=(-0.6, 0.0, -0.8, 0.0), desired=(0.6, 0.0, 0.8, 0.0))
-    feed(observer, 1, attitude=(0.6, 0.0, 0.8, 0.0), desired=(0.6, 0.0, 0.8, 0.0))
-    observer.finish()
+    observer = observer_of()
+    observer.ticks(ticks_of(0, attitude=(-0.6, 0.0, -0.8, 0.0), desired=(0.6, 0.0, 0.8, 0.0)))
+    observer.ticks(ticks_of(1, attitude=(0.6, 0.0, 0.8, 0.0), desired=(0.6, 0.0, 0.8, 0.0)))
     _, panels = observer.lines()
     assert panels[0].lines[0].values.tolist() == panels[0].lines[1].values.tolist() == [0.6, 0.6]
 
 
 def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_path: Path) -> None:
     """The truth, told at every tenth tick, is the desired attitude turned by 10°: the angle between them is that."""
-    kept = Kept()
-    judged = read(whole, watch=kept.watch)
     turn = cos(radians(5)), 0.0, sin(radians(5)), 0.0
+    blocks: list[Ticks] = []
+    read(whole, watch=blocks.append)
+    ticks = Ticks.joined(blocks)
     more = [
         told(
             "truth",
-            Truth(tick=tick.k, attitude=product(tick.desired, turn), rate=(0, 0, 0), voltages=(0, 0)),
-            tick.published_ns + 1000,
+            Truth(tick=k, session=SESSION, session_tick=k, attitude=product(tuple(desired), turn), rate=(0, 0, 0),
+                  voltages=(0, 0)),
+            START_NS + k * PERIOD_NS + 1000,
         )
-        for tick in kept[judged.which][::10]
-    ]
+        for k, desired in list(zip(ticks.k.tolist(), ticks.desired.tolist(), strict=True))[::10]
+    ]  # fmt: skip
     made = report([retell(whole, tmp_path / "a.mcap", more=more)])
     (panel,) = (panel for panel in made.panels if panel.group == "error_angle")
     assert [line.label for line in panel.lines] == ["measured", "true"]
@@ -96,22 +97,24 @@ def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_pa
 
 def test_the_true_error_is_that_of_the_law_however_far_the_body_is_turned() -> None:
     desired = 0.5, -0.5, 0.5, 0.5
-    observer = Observer(load())
+    observer = observer_of()
     for k in range(3):
-        feed(observer, k, desired=desired)
-        observer.truth(product(desired, (cos(radians(15)), sin(radians(15)), 0.0, 0.0)), START_NS + k * PERIOD_NS)
-    observer.finish()
+        turned = product(desired, (cos(radians(15)), sin(radians(15)), 0.0, 0.0))
+        observer.trial.truth(k, turned, (0.0, 0.0, 0.0))
+        observer.ticks(ticks_of(k, desired=desired))
     _, panels = observer.lines()
-    (true,) = (line.values for panel in panels for line in panel.lines if line.label == "true")
+    (true,) = (
+        line.values for panel in panels for line in panel.lines if (panel.group, line.label) == ("error_angle", "true")
+    )
     assert true == pytest.approx([30.0] * 3)
 
 
-def test_the_damping_estimate_is_what_telemetry_told(whole: Path) -> None:
+def test_the_damping_estimate_is_that_of_every_tick(whole: Path) -> None:
     values = {
         panel.label: panel.lines[0].values for panel in report([whole]).panels if panel.group == "damping_estimate"
     }
     assert values["θ̂₂"][0] == pytest.approx(0.007, abs=1e-4)  # as Table C.1 has it, before it adapts
-    assert len(np.unique(values["θ̂₂"])) > TICKS / 2  # between two telemetries it is interpolated
+    assert len(np.unique(values["θ̂₂"])) > 0.9 * TICKS
 
 
 @pytest.mark.parametrize("rows", [1, 2, 63, 64, 65, 127, 1000, 5003])
@@ -158,10 +161,9 @@ def test_buckets_are_alike_however_long_it_runs() -> None:
 
 
 def test_an_observer_holds_a_bounded_number_of_points_however_many_ticks_come() -> None:
-    observer = Observer(load())
+    observer = observer_of()
     for k in range(20_000):
-        feed(observer, k)
-    observer.finish()
+        observer.ticks(ticks_of(k))
     time, panels = observer.lines()
     assert 1024 < len(time) <= 4096
     assert observer.thinned == 16

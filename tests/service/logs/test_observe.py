@@ -1,26 +1,22 @@
-"""What is seen of a session is what was put into its log: gaps, timing, saturation, frames without a value."""
+"""What is observed of a session is what was put into its log: gaps, timing, saturation, frames without a value."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import nan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from protocol.messages import Percentiles, Status
 from service.config import load
-from service.logs.observe import Observer
 from service.logs.report import Findings
 from service.logs.review import read
-from service.logs.tallies import Told
 from tests.service.logs.made_log import START_NS, make_log
-from tests.service.logs.retold import PERIOD_NS, Said, feed, retell, told
+from tests.service.logs.retold import Said, edited, observer_of, retell, ticks_of, told
 
 TICKS = 500
-
-Retold = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +27,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def tick_of(one: Said) -> int:
-    return (one.published_ns - START_NS) // PERIOD_NS
-
-
 def found(path: Path) -> Findings:
     return read(path).findings
 
@@ -42,27 +34,23 @@ def found(path: Path) -> Findings:
 # Gaps
 
 
-def test_ticks_that_no_command_answered_are_gaps_whether_they_were_measured_or_not(whole: Path, tmp_path: Path) -> None:
-    def lost(one: Said) -> Said | None:
-        passed_over = one.topic == "command" and 50 <= tick_of(one) < 53
-        missed = one.topic in ("measurement", "command") and 200 <= tick_of(one) < 240
-        return None if passed_over or missed else one
-
-    findings = found(retell(whole, tmp_path / "a.mcap", lost))
+def test_ticks_that_no_command_answered_are_gaps_whether_they_were_measured_or_not(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", TICKS, settings=load(), lost=range(50, 53), skipped=range(200, 240))
+    findings = found(tmp_path / "a.mcap")
     assert [(gap.tick, gap.ticks, gap.time_s) for gap in findings.gaps] == [(50, 3, 0.1), (200, 40, 0.4)]
     assert findings.gap_count == 2
     assert findings.skipped_ticks == 43
+    assert findings.lapses == {"missed": 3}
 
 
 def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None:
-    observer = Observer(load())
+    observer = observer_of()
     k, lengths = 0, [1 + i * 7919 % 1000 for i in range(3000)]
     for i, length in enumerate(lengths):
         observer.answered(np.array([k]))
         k += 1 + length
-        feed(observer, i)
+        observer.ticks(ticks_of(i))
     observer.answered(np.array([k]))
-    observer.finish()
     assert observer.gap_count == 3000
     assert sorted(gap.ticks for gap in observer.gaps) == sorted(lengths)[-100:]
     assert [gap.tick for gap in observer.gaps] == sorted(gap.tick for gap in observer.gaps)
@@ -70,39 +58,25 @@ def test_of_many_gaps_the_longest_hundred_are_kept_and_all_are_counted() -> None
 
 def test_gaps_are_seen_where_sensors_give_no_valid_value() -> None:
     """Such measurements are answered, but there is no tick to judge."""
-    observer = Observer(load())
+    observer = observer_of()
     for block in ([*range(7, 9), *range(12, 4010)], [*range(4014, 6000)]):  # with a gap where a block ends
         observer.answered(np.array(block))
-    observer.finish()
     assert [(gap.tick, gap.ticks) for gap in observer.gaps] == [(9, 3), (4010, 4)]
-
-
-def test_what_is_told_while_there_are_no_ticks_is_forgotten_but_for_the_last() -> None:
-    last = Told(1)
-    for i in range(50_000):
-        last.add(i, (10.0 * i,))
-    values = last.on(np.array([0.0, 40_000.0, 49_998.5, 60_000.0]))[:, 0]
-    assert np.isnan(values[:2]).all()
-    assert values[2:].tolist() == [499_985.0, 499_990.0]
 
 
 # Timing
 
 
-def test_latency_and_period_are_those_of_the_times_of_publication(whole: Path, tmp_path: Path) -> None:
-    """Ten late answers of 500, and one measurement 500 µs late: percentiles within a bin of 4.4 %, counts exactly."""
+def test_latency_and_period_are_those_of_the_plants_own_clock(whole: Path, tmp_path: Path) -> None:
+    """Ten late answers of 500, and one measurement 200 µs late: percentiles within a bin of 4.4 %, counts exactly."""
 
-    def later(one: Said) -> Said:
-        k = tick_of(one)
-        if one.topic == "command" and k % 50 == 7:
-            return one._replace(published_ns=one.published_ns + 1_000_000)
-        if one.topic == "measurement" and k == 300:
-            return one._replace(published_ns=one.published_ns + 200_000)
-        return one
+    def later(columns: Any) -> None:
+        columns["received"][columns["answered"] % 50 == 7] += 1000
+        columns["sent"][columns["session_tick"] == 300] += 200
 
-    timing = found(retell(whole, tmp_path / "a.mcap", later)).timing
+    timing = found(retell(whole, tmp_path / "a.mcap", edited("plant", later))).timing
     latency, period = timing["latency"], timing["period"]
-    assert (latency.count, period.count) == (TICKS, TICKS - 1)
+    assert (latency.count, period.count) == (TICKS - 1, TICKS - 1)  # nothing acts on the last command any more
     assert latency.p50 == pytest.approx(300, rel=0.044)
     assert latency.p99 == pytest.approx(1300, rel=0.044)
     assert (latency.max, period.max) == (1300, 2200)
@@ -110,7 +84,7 @@ def test_latency_and_period_are_those_of_the_times_of_publication(whole: Path, t
     assert period.p999 == pytest.approx(2200, rel=0.044)
     assert [count for edge, count in period.bins if edge < 1900 or edge > 2100] == [1, 1]
     slow = [count for edge, count in latency.bins if edge > 1000]
-    assert (sum(slow), sum(count for _, count in latency.bins)) == (10, TICKS)
+    assert (sum(slow), sum(count for _, count in latency.bins)) == (10, TICKS - 1)
 
 
 def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: Path, tmp_path: Path) -> None:
@@ -138,41 +112,34 @@ def test_values_at_the_outermost_level_are_counted_by_signal(whole: Path, tmp_pa
     """Of the last hundred ticks, a motor at its limit in one command, both in another, and a rate in ten frames."""
     wire = load().wire
 
-    def full(one: Said) -> Said:
-        k = tick_of(one)
-        if one.topic == "command" and k in (420, 421):
-            return one._replace(data=wire.command.pack(k % 256, (-31, 31 if k == 421 else 30)))
-        if one.topic == "measurement" and 430 <= k < 440:
-            return one._replace(data=wire.measurement.pack(k % 256, (126, 0, 0, 0, 0, -127)))
-        return one
+    def commands(columns: Any) -> None:
+        for k in (420, 421):
+            frame = np.void(wire.command.pack(k % 256, (-31, 31 if k == 421 else 30)))
+            columns["command"][columns["tick"] == k] = frame
 
-    clean, findings = found(whole), found(retell(whole, tmp_path / "a.mcap", full))
+    def measurements(columns: Any) -> None:
+        for k in range(430, 440):
+            frame = np.void(wire.measurement.pack(k % 256, (126, 0, 0, 0, 0, -127)))
+            columns["measurement"][columns["session_tick"] == k] = frame
+
+    path = retell(whole, tmp_path / "a.mcap", edited("controller", commands))
+    clean, findings = found(whole), found(retell(path, tmp_path / "b.mcap", edited("plant", measurements)))
     more = {name: findings.saturated[name] - clean.saturated[name] for name in findings.saturated}
     assert more == pytest.approx({"attitude": 0.0, "rate": 10 / (3 * TICKS), "voltage": 3 / (2 * TICKS)}, abs=1e-12)
     assert findings.invalid == {"measurement": 0, "command": 0}
 
 
-def test_frames_without_a_valid_value_are_counted_and_are_answered(whole: Path, tmp_path: Path) -> None:
-    wire = load().wire
-
-    def dead(one: Said) -> Said:
-        k = tick_of(one)
-        if 430 <= k < 437 and one.topic == "measurement":
-            return one._replace(data=wire.measurement.pack(k % 256, (0, 0, 0, 0, -128, 0)))
-        if 430 <= k < 437 and one.topic == "command":
-            return one._replace(data=wire.command.pack(k % 256, (-32, -32)))
-        return one
-
-    findings = found(retell(whole, tmp_path / "a.mcap", dead))
+def test_frames_without_a_valid_value_are_counted_and_are_answered(tmp_path: Path) -> None:
+    """The gyro fails for seven ticks; the controller answers with commands without a valid value."""
+    faults = 'plant.faults=["rate.x:off@0.86..0.874"]'
+    make_log(tmp_path / "a.mcap", TICKS, settings=load(overrides=[faults]))
+    findings = found(tmp_path / "a.mcap")
     assert findings.invalid == {"measurement": 7, "command": 7}
     assert (findings.gap_count, findings.skipped_ticks) == (0, 0)
 
 
 def test_without_quantization_a_value_at_the_limit_is_saturated() -> None:
-    settings = load(overrides=["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"])
-    observer = Observer(settings)
-    for volts in (24.0, -24.0, 23.9, nan):
-        observer.command(settings.wire.command.pack(0, (volts, 1.0)))
-    observer.finish()
+    observer = observer_of("wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont")
+    observer.frames(np.empty((0, 6)), np.array([[volts, 1.0] for volts in (24.0, -24.0, 23.9, nan)]))
     assert observer.saturated == {"voltage": 2 / 7}
     assert observer.invalid["command"] == 1

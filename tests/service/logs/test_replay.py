@@ -7,82 +7,108 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 
 from protocol import topics
+from protocol.messages import PROTOCOL_VERSION, Contract
 from service.config import load
 from service.figures import Figures, Stream
 from service.lab.experiment import run_experiment
 from service.logs.files import LogFiles, ReviewError
 from service.logs.limits import Limit, LimitError
-from service.logs.mcap_file import CHANGE_METADATA
-from service.logs.replay import SessionReplay, replay
-from service.logs.review import review
-from tests.service.logs.made_log import AN_OPERATORS_WORDS, make_log
-from tests.service.logs.retold import retell
+from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from service.logs.replay import EndReplay, SessionReplay, replay
+from service.logs.review import read, review
+from service.logs.runs import Run
+from tests.service.logs.made_log import AN_OPERATORS_WORDS, START_NS, lockstep, made, make_log, write
+from tests.service.logs.retold import Said, retell, tell
 
 TICKS = 600
 
 
 def replayed(path: Path, *overrides: str) -> SessionReplay:
-    (session,) = replay([path], overrides)
+    (session,) = replay([path], overrides).sessions
     return session
 
 
-def test_every_command_of_a_log_is_computed_again_byte_for_byte(tmp_path: Path) -> None:
-    make_log(tmp_path / "a.mcap", TICKS)
-    session = replayed(tmp_path / "a.mcap")
-    assert (session.first_tick, session.commands, session.differing) == (0, TICKS, 0)
-    assert session.first_difference is None
-
-
-def test_the_golden_log_gives_the_commands_that_it_always_gave() -> None:
-    """Recorded once, with an operator's words in it: whatever changes the law's bytes shows here."""
-    session = replayed(Path(__file__).parent / "golden.mcap")
-    assert (session.first_tick, session.commands, session.differing) == (0, 500, 0)
-
-
-def test_what_an_operator_changed_is_changed_in_the_replay_at_the_same_tick(tmp_path: Path) -> None:
+def test_both_ends_of_a_log_are_computed_again_byte_for_byte(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
-    session = replayed(tmp_path / "a.mcap")
-    assert (session.commands, session.differing) == (TICKS, 0)
+    both = replay([tmp_path / "a.mcap"])
+    assert both.controller == both.plant == EndReplay(ticks=TICKS, differ=0)
+    (session,) = both.sessions
+    assert (session.first_tick, session.first_difference) == (0, None)
 
 
-def test_a_change_that_a_rotated_run_tells_again_is_known_once(tmp_path: Path) -> None:
-    make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
-    changes = LogFiles([tmp_path / "a.mcap"]).changes["aero", "s1"]
-    again = [
-        (CHANGE_METADATA, {"key": topics.key("change", "aero"), "json": change.model_dump_json()}) for change in changes
-    ]
-    retold = retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=again)
-    assert [change.tick for change in LogFiles([retold]).changes["aero", "s1"]] == [0, 120, 250, 400]
+def test_the_golden_log_gives_what_it_always_gave() -> None:
+    """Recorded once, with an operator's words in it: whatever changes either end's bytes shows here."""
+    both = replay([Path(__file__).parent / "golden.mcap"])
+    assert both.controller == both.plant == EndReplay(ticks=500, differ=0)
 
 
-@pytest.mark.parametrize("begin", [1, 7, 123, 305])
-def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_telemetry_on(tmp_path: Path, begin: int) -> None:
+@pytest.mark.parametrize("begin", [1, 123, 305])
+def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_batch_on(tmp_path: Path, begin: int) -> None:
+    """Every file that the recorder begins has what the controller followed until then, but no state of the plant."""
+    make_log(tmp_path / "whole.mcap", TICKS, changes=AN_OPERATORS_WORDS)
+    changes = [change for block in Run([tmp_path / "whole.mcap"]).read([("aero", "s1")]) for change in block.changes]
     make_log(tmp_path / "a.mcap", TICKS, begin=begin, changes=AN_OPERATORS_WORDS)
-    session = replayed(tmp_path / "a.mcap")
-    told = -(-begin // 10) * 10
-    assert session.first_tick == told + 1  # the telemetry's own command had been computed before
-    assert (session.commands, session.differing) == (TICKS - told - 1, 0)
+    before = [
+        (CHANGE_METADATA, {"key": topics.key("trace", "aero", role="controller"), "json": change.model_dump_json()})
+        for change in changes
+    ]
+    both = replay([retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=before)])
+    (session,) = both.sessions
+    assert session.first_tick is not None
+    assert begin <= session.first_tick < begin + 60
+    assert both.controller == EndReplay(ticks=TICKS - session.first_tick, differ=0)
+    assert both.plant is None
+    assert both.reasons == {"plant": "the log lacks the plant's first row, so the plant's state is not known"}
 
 
 def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
+    """The plant acted on what the controller sent, not on what it wrote down."""
     make_log(tmp_path / "a.mcap", TICKS, spoil=321)
-    session = replayed(tmp_path / "a.mcap")
-    assert session.differing == 1
+    both = replay([tmp_path / "a.mcap"])
+    (session,) = both.sessions
+    assert session.differ == 1
     assert session.first_difference is not None
     assert session.first_difference.tick == 321
     assert session.first_difference.time_s == pytest.approx(0.642)
     logged, computed = (
         bytes.fromhex(text) for text in (session.first_difference.logged, session.first_difference.computed)
     )
-    assert logged[1] ^ computed[1] == 1
+    assert logged[-1] ^ computed[-1] == 0x10
+
+
+def test_a_real_machine_is_not_replayed_and_the_reason_is_told(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 100)
+    config = {**lockstep().contract(), "plant": {**lockstep().contract()["plant"], "via": "quanser"}}
+    contract = Contract(
+        protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config
+    ).model_dump_json()
+    key = topics.key("contract", "aero", role="plant")
+    path = tell_with(tmp_path / "a.mcap", tmp_path / "b.mcap", {"key": key, "json": contract})
+    both = replay([path])
+    assert both.plant is None
+    assert both.controller == EndReplay(ticks=100, differ=0)
+    assert "quanser" in both.reasons["plant"]
+
+
+def tell_with(log: Path, out: Path, contract: dict[str, str]) -> Path:
+    """The log with this contract before any other of its role."""
+    retell(log, out)
+    with out.open("rb") as file:
+        reader = make_reader(file)
+        messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+        known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+    others = [(name, entries) for name, entries in known if entries.get("key") != contract["key"]]
+    return tell(out, messages, [(CONTRACT_METADATA, contract), *others])
 
 
 def test_with_another_law_it_says_what_would_have_been_commanded(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS)
     session = replayed(tmp_path / "a.mcap", "law.C2=[0.3, 0.3, 0.3]")
-    assert session.differing > TICKS / 2
+    assert session.differ > TICKS / 2
+    assert replay([tmp_path / "a.mcap"], ["law.C2=[0.3, 0.3, 0.3]"]).plant is None
     assert session.max_v is not None
     assert session.max_v > 0.7  # at least a step of the voltage's quantizer
     assert session.u_total_computed != session.u_total_logged
@@ -99,23 +125,28 @@ def test_the_figures_of_a_made_log_are_those_of_the_experiment(tmp_path: Path) -
 
 
 def test_a_file_cut_anywhere_gives_what_was_whole_before_the_cut_and_says_so(tmp_path: Path) -> None:
-    """At 300 places, and at every byte of the last chunk's neighbourhood; a chunk of 100 ticks is the unit of loss."""
+    """At 100 places, and at every byte of each chunk's end; a chunk of 20 messages is the unit of loss."""
     whole = tmp_path / "a.mcap"
     make_log(whole, TICKS, changes=AN_OPERATORS_WORDS)
     data = whole.read_bytes()
     ends = _chunks(data, whole)
     rng = random.Random(1)
     cut = tmp_path / "cut.mcap"
-    for size in {*(rng.randrange(8, len(data)) for _ in range(300)), *(end + d for end in ends for d in (-1, 0, 1))}:
+    found = []
+    for size in sorted(
+        {*(rng.randrange(8, len(data)) for _ in range(100)), *(e + d for e in ends for d in (-1, 0, 1))}
+    ):
         cut.write_bytes(data[:size])
-        complete = sum(end <= size for end in ends)
-        if complete == 0:
+        if not any(end <= size for end in ends):
             continue
-        (session,) = replay([cut])
-        assert session.differing == 0
-        assert session.commands >= 100 * complete - 1  # the last command waits for a later measurement
+        both = replay([cut])
+        assert both.controller is not None
+        assert not both.differs
+        found.append(both.controller.ticks)
         if size < ends[-1]:
             assert LogFiles([cut]).damages[cut]
+    assert found == sorted(found)
+    assert found[-1] == TICKS
 
 
 def _chunks(data: bytes, path: Path) -> list[int]:
@@ -126,23 +157,24 @@ def _chunks(data: bytes, path: Path) -> list[int]:
         at += 9 + length
         if opcode == Opcode.CHUNK:
             ends.append(at)
-    assert len(ends) >= TICKS // 100, path
+    assert len(ends) > 3, path
     return ends
 
 
-def test_a_damaged_chunk_is_stepped_over_and_named(tmp_path: Path) -> None:
-    """In real time, where the times of publication tell the ticks after the gap; in lockstep only counters do."""
+def test_a_damaged_chunk_is_stepped_over_and_what_it_held_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     make_log(path, TICKS, settings=load())
     data = bytearray(path.read_bytes())
     ends = _chunks(bytes(data), path)
     data[(ends[2] + ends[1]) // 2] ^= 0xFF  # within the third chunk
     path.write_bytes(data)
-    figures = review(path)
-    assert len(figures.damages) == 1
-    assert "a chunk" in figures.damages[0]
-    assert figures.command.frames_per_s is not None
-    assert figures.skipped_ticks == 100  # its ticks, and no others
+    judged = read(path)
+    assert len(judged.figures.damages) == 1
+    assert "a chunk" in judged.figures.damages[0]
+    missing = judged.findings.missing_ticks
+    assert min(missing.values()) > 0
+    both = replay([path])
+    assert both.controller == EndReplay(ticks=TICKS - missing["controller"], differ=0)
 
 
 def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -161,9 +193,10 @@ def _empty(folder: Path) -> Path:
 
 
 def test_a_folder_is_read_as_one_run_in_the_order_of_time(tmp_path: Path) -> None:
-    """Two recorders by turns, whose file names sort the other way round."""
-    make_log(tmp_path / "b.mcap", 300)
-    make_log(tmp_path / "a.mcap", TICKS, begin=300)
+    """Two recorders by turns, whose file names sort the other way round; the second has the last 60 ticks again."""
+    messages = made(lockstep(), TICKS)
+    write(tmp_path / "b.mcap", lockstep(), [m for m in messages if m.at_ns < START_NS + 300 * 2_000_000])
+    write(tmp_path / "a.mcap", lockstep(), [m for m in messages if m.at_ns >= START_NS + 240 * 2_000_000])
     (tmp_path / "whole").mkdir()
     make_log(tmp_path / "whole" / "w.mcap", TICKS)
     parts, whole = review(tmp_path), review(tmp_path / "whole")

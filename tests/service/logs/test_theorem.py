@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from plant_emulator.settings import PlantSettings
-from protocol.messages import Contract, Truth
+from protocol.messages import PROTOCOL_VERSION, Contract, Truth
 from protocol.verbs import Change, Gains, Hold, Stream
 from service.config import Settings, load
 from service.logs import grounds
@@ -22,8 +22,8 @@ from service.logs.limits import Limit
 from service.logs.mcap_file import CONTRACT_METADATA
 from service.logs.plots import draw_theorem
 from service.logs.report import Findings, Line, TheoremFindings
-from service.logs.review import Kept, read, report
-from service.logs.tallies import BLOCK
+from service.logs.review import read, report
+from service.logs.runs import BLOCK
 from service.logs.theorem import Trial
 from service.logs.ticks import Ticks
 from service.theorem.certificate import Evaluated, bounds_of, certify
@@ -195,10 +195,10 @@ def test_a_session_that_begins_far_from_its_reference_is_judged_once_it_is_there
     ("change", "why"),
     [
         (lambda one: None if one.topic == "truth" else one, "no true state"),
-        (lambda one: told_of(one, session=None, session_tick=None), "do not say of which tick"),
+        (lambda one: told_of(one, session=None, session_tick=None), "no true state"),
         (lambda one: told_of(one, session="another"), "no true state"),
     ],
-    ids=["none", "of an older version", "of another session"],
+    ids=["none", "outside of sessions", "of another session"],
 )
 def test_without_a_true_state_of_a_tick_nothing_is_judged_and_the_reason_is_told(
     ideal: Path, tmp_path: Path, change: Callable[[Said], Said | None], why: str
@@ -217,12 +217,15 @@ def block(first: int, count: int) -> Ticks:
     """Ticks at rest, where they shall be."""
     k, zeros, upright = np.arange(first, first + count), np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     one = np.ones(count)
-    return Ticks(k, k, one, upright, upright, zeros, zeros, zeros, zeros, zeros, one, zeros + 0.3, zeros)
+    times = k, k, one, one, one
+    return Ticks(k, *times, upright, upright, zeros, zeros, zeros, zeros, zeros, zeros, one, zeros + 0.3, zeros)
 
 
 def trial(*changes: Change) -> Trial:
     settings = load(overrides=["reference.kind=hold"])
-    return Trial(Library(settings).of(changes), changes, 0.002, None)
+    one = Trial(Library(settings).of(changes), 0.002, None)
+    one.changed(changes)
+    return one
 
 
 def test_a_true_state_that_comes_after_its_block_still_counts_and_long_silence_costs_no_memory() -> None:
@@ -235,28 +238,28 @@ def test_a_true_state_that_comes_after_its_block_still_counts_and_long_silence_c
         late.truth(k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     drawn = late.ticks(block(9 * BLOCK - 10, 10))
     assert late.findings()[0].samples == 11
-    assert np.isfinite(drawn).all()
+    assert all(np.isfinite(lines).all() for lines in drawn)
 
 
 def test_the_true_line_goes_from_one_told_state_to_the_next_and_begins_with_the_first() -> None:
     one = trial()
     for k in (10, 30):
         one.truth(k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.001 * k))
-    norm = one.ticks(block(0, 40))[:, 1]
+    norm = one.ticks(block(0, 40))[1][:, 1]
     assert np.isnan(norm[:10]).all()
     assert norm[[10, 20, 30, 39]] == pytest.approx([0.01, 0.02, 0.03, 0.03])
     assert one.findings()[0].samples == 2  # what lies between is drawn, not judged
     one.truth(50, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.05))
-    assert one.ticks(block(40, 20))[0, 1] == pytest.approx(0.04)
+    assert one.ticks(block(40, 20))[1][0, 1] == pytest.approx(0.04)
 
 
 def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
     settings = load(overrides=["reference.kind=hold"])
     values = []
     for damping in (None, (0.0, 0.0, 0.02)):
-        one = Trial(Library(settings).of(()), (), 0.002, damping)
+        one = Trial(Library(settings).of(()), 0.002, damping)
         one.truth(0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        values.append(float(one.ticks(block(0, 1))[0, 3]))
+        values.append(float(one.ticks(block(0, 1))[1][0, 3]))
     assert values == pytest.approx([0.0, 0.02**2 / 0.02 / 2])
 
 
@@ -282,24 +285,26 @@ def quick() -> Settings:
 def test_the_largest_norm_and_error_after_the_transient_are_beside_what_is_guaranteed(tmp_path: Path) -> None:
     settings = quick()
     make_log(tmp_path / "a.mcap", TICKS, settings=settings, truth_every=1)
-    kept = Kept()
-    judged = read(tmp_path / "a.mcap", watch=kept.watch)
+    blocks: list[Ticks] = []
+    judged = read(tmp_path / "a.mcap", watch=blocks.append)
     theorem = judged.findings.theorem
     promise = promised(settings)
     assert theorem is not None
     assert theorem.radius is not None
     assert (theorem.holds, theorem.radius) == (True, promise["radius"])
     assert theorem.transient_s == 0.5
-    after = [tick for tick in kept[judged.which] if tick.k >= 250]
+    after = Ticks.joined(blocks).where(slice(250, None))
     norms = []
-    for tick in after:
-        rate_d = twin.rotation(np.array(tick.attitude)) @ np.array(tick.desired_rate)
-        q, omega, q_d, omega_d = (np.array([row]) for row in (tick.attitude, tick.rate, tick.desired, rate_d))
-        c = coordinates(q, omega, q_d, omega_d, np.array([tick.sign]), np.array(settings.law.C1))
+    for i in range(len(after.k)):
+        rate_d = twin.rotation(after.attitude[i]) @ after.desired_rate[i]
+        q, omega, q_d, omega_d = (
+            np.array([row]) for row in (after.attitude[i], after.rate[i], after.desired[i], rate_d)
+        )
+        c = coordinates(q, omega, q_d, omega_d, after.sign[i : i + 1], np.array(settings.law.C1))
         norms.append(float(c.norm[0]))
     assert theorem.z_norm == pytest.approx(max(norms), rel=1e-9)
     assert theorem.z_norm_share == pytest.approx(max(norms) / theorem.radius)
-    largest = max(np.linalg.norm(tick.attitude_error) for tick in after)
+    largest = np.linalg.norm(after.attitude_error, axis=1).max()
     assert theorem.error_deg == pytest.approx(np.degrees(2 * np.arcsin(largest)))
     # Of 16 bits, what is measured is what is true to some 1e-4.
     assert theorem.true_z_norm == pytest.approx(theorem.z_norm, abs=1e-3)
@@ -318,7 +323,13 @@ def with_contract(path: Path, out: Path, certificate: dict[str, Any]) -> Path:
     """The log with a certificate in its controller's contract."""
     config = read(path).session.settings.contract()
     contract = Contract(
-        role="controller", vehicle="aero", host="h", versions={}, config=config, certificate=certificate
+        protocol=PROTOCOL_VERSION,
+        role="controller",
+        vehicle="aero",
+        host="h",
+        versions={},
+        config=config,
+        certificate=certificate,
     )
     entry = {"key": "aeroloop/aero/contract/controller", "json": contract.model_dump_json()}
     return retell(path, out, metadata=[(CONTRACT_METADATA, entry)])

@@ -1,0 +1,236 @@
+"""Reading is a join on the tick: what was joined is what happened, whatever went wrong, and both ends replay."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.trace import Outcome, read_batch
+from service.config import load
+from service.logs.files import ReviewError
+from service.logs.replay import replay
+from service.logs.review import read, review
+from service.logs.ticks import Ticks
+from service.logs.traces import Missing
+from tests.service.logs.made_log import SESSION, VEHICLE, Logged, made, make_log, write
+from tests.service.logs.retold import Said, edited, retell, told
+from tests.service.logs.rough_log import Known, rough_loop
+
+SEEDS = range(16)
+
+
+def end_of(message: Logged) -> str:
+    """Which end's batch a message is; empty if it is none."""
+    return message.key.rpartition("/")[2] if "/trace/" in message.key else ""
+
+
+def is_final(message: Logged) -> bool:
+    batch = read_batch(message.payload)
+    return batch is not None and batch.header.final
+
+
+def rows_of(message: Logged) -> int:
+    batch = read_batch(message.payload)
+    return 0 if batch is None else batch.header.rows
+
+
+def written(path: Path, known: Known, messages: list[Logged] | None = None) -> Path:
+    return write(path, known.settings, known.messages.all if messages is None else messages)
+
+
+def ticks_in(path: Path) -> Ticks:
+    blocks: list[Ticks] = []
+    read(path, watch=blocks.append)
+    return Ticks.joined(blocks)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_was_joined_is_what_happened_and_both_ends_replay_byte_for_byte(seed: int, tmp_path: Path) -> None:
+    known = rough_loop(seed)
+    path = written(tmp_path / "a.mcap", known)
+    replayed = replay([path])
+    assert replayed.controller is not None
+    assert replayed.plant is not None
+    assert (replayed.controller.ticks, replayed.controller.differ) == (len(known.commands), 0)
+    assert replayed.plant.differ == 0
+    assert replayed.plant.ticks >= len(known.measured)
+    assert replayed.reasons == {}
+    findings, ticks = read(path).findings, ticks_in(path)
+    assert findings.missing == []
+    answered = sorted({*(k for k, command in known.commands.items() if command is not None), *known.acted})
+    assert ticks.k.tolist() == [k for k in sorted({*known.measured, *known.commands}) if k <= answered[-1]]
+    assert findings.skipped_ticks == ticks.k[-1] - ticks.k[0] + 1 - len(answered)
+    missed = [k for k in known.measured if k not in known.commands and k <= answered[-1]]
+    counted = {name: known.outcomes.count(outcome) for name, outcome in (("stale", Outcome.STALE),
+               ("repeated", Outcome.REPEATED), ("withheld", Outcome.WITHHELD))}  # fmt: skip
+    expected = {"late": known.late, "missed": len(missed), **counted}
+    assert {name: findings.lapses.get(name, 0) for name in expected} == expected
+    for k, latency in zip(ticks.k.tolist(), ticks.latency_ns.tolist(), strict=True):
+        if k in known.acted and known.measured.get(k):
+            assert latency == pytest.approx(known.acted[k] - known.sent[k], abs=2000)  # rows have whole microseconds
+        else:
+            assert np.isnan(latency)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_way_delays_and_the_offset_are_found_on_clocks_that_differ_and_drift(seed: int, tmp_path: Path) -> None:
+    """Both ways take 150 µs on average and may queue: the median of either is that, within what is not symmetrical."""
+    findings = read(written(tmp_path / "a.mcap", rough_loop(seed, 3000, 'wire.transmit="periodic"'))).findings
+    for name in ("measurement_delay", "command_delay"):
+        assert findings.timing[name].p50 == pytest.approx(150, abs=30)
+    assert findings.clock_offset_us is not None
+    assert findings.clock_offset_us[0] == pytest.approx(82_800e6, abs=50)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:6])
+def test_batches_that_come_twice_or_out_of_order_change_nothing(seed: int, tmp_path: Path) -> None:
+    known, chance = rough_loop(seed), random.Random(seed)
+    messages = known.messages.all
+    again = sorted(chance.choices(range(len(messages)), k=len(messages) // 2))
+    doubled = [*messages, *(messages[i] for i in again)]
+    late = chance.sample(range(len(messages)), len(messages) // 4)
+    moved = sorted(range(len(messages)), key=lambda i: i + (chance.uniform(0, 9) if i in late else 0))
+    whole, *others = (
+        read(written(tmp_path / f"{name}.mcap", known, some)).figures.model_copy(update={"log": None})
+        for name, some in (("a", messages), ("b", doubled), ("c", [messages[i] for i in moved]))
+    )
+    assert others == [whole, whole]
+    both = replay([tmp_path / "b.mcap"])
+    assert both.controller == replay([tmp_path / "a.mcap"]).controller
+
+
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, tmp_path: Path) -> None:
+    """Each batch has the controller's state before it, so a gap ends with it. A plant is only known from its start."""
+    known, chance = rough_loop(seed, 2000, 'wire.transmit="periodic"'), random.Random(seed)
+    messages = list(known.messages.all)
+    for end in ("controller", "plant"):
+        batches = [m for m in messages if end_of(m) == end and rows_of(m) and b'"changes"' not in m.payload]
+        at = chance.randrange(1, len(batches) - 3)
+        for gone in batches[at : at + 2]:
+            messages.remove(gone)
+    path = written(tmp_path / "a.mcap", known, messages)
+    gone_rows = {
+        end: sum(rows_of(m) for m in known.messages.all if end_of(m) == end)
+        - sum(rows_of(m) for m in messages if end_of(m) == end)
+        for end in ("controller", "plant")
+    }
+    findings = read(path).findings
+    assert findings.missing_ticks == gone_rows
+    assert {gap.end for gap in findings.missing} == {"controller", "plant"}
+    replayed = replay([path])
+    assert replayed.controller is not None
+    assert replayed.controller.ticks == len(known.commands) - gone_rows["controller"]
+    assert replayed.controller.differ == 0
+    assert f"{gone_rows['plant']} rows are missing" in replayed.reasons["plant"]
+
+
+def test_what_a_killed_end_did_last_is_named_by_what_the_other_proves(tmp_path: Path) -> None:
+    settings = load()
+    messages = made(settings, 600)
+    last = [m for m in messages if end_of(m) == "controller"][-3:]
+    write(tmp_path / "a.mcap", settings, [m for m in messages if m not in last])
+    (missing,) = read(tmp_path / "a.mcap").findings.missing
+    rows = sum(map(rows_of, last))
+    # The plant has acted on all of them but the last.
+    assert missing == Missing(
+        vehicle=VEHICLE, session=SESSION, end="controller", first_tick=600 - rows, last_tick=598, rows=rows - 1
+    )
+    figures = review(tmp_path / "a.mcap")
+    assert figures.skipped_ticks == 0  # they were answered: the plant acted on it
+    last = [m for m in messages if end_of(m) == "plant"][-3:]
+    write(tmp_path / "b.mcap", settings, [m for m in messages if m not in last])
+    (missing,) = read(tmp_path / "b.mcap").findings.missing
+    rows = sum(map(rows_of, last))
+    assert (missing.end, missing.first_tick, missing.last_tick, missing.rows) == ("plant", 600 - rows, 599, rows)
+
+
+def test_a_session_of_which_the_last_batch_is_missing_is_named(tmp_path: Path) -> None:
+    """A log of a loop that still runs: nothing is known to be missing, and nothing says that nothing is."""
+    settings = load()
+    messages = [
+        m for m in made(settings, 500) if not (b := read_batch(m.payload) if end_of(m) else None) or not b.header.final
+    ]
+    write(tmp_path / "a.mcap", settings, messages)
+    findings = read(tmp_path / "a.mcap").findings
+    assert {(gap.end, gap.last_tick) for gap in findings.missing} >= {("plant", None)}
+    assert sum(findings.missing_ticks.values()) <= 1
+
+
+def test_one_end_alone_is_read_for_what_it_has(tmp_path: Path) -> None:
+    settings = load()
+    messages = made(settings, 500)
+    write(tmp_path / "whole.mcap", settings, messages)
+    write(tmp_path / "a.mcap", settings, [m for m in messages if end_of(m) != "plant"])
+    whole, alone = read(tmp_path / "whole.mcap"), read(tmp_path / "a.mcap")
+    assert (alone.figures.z_track, alone.figures.u_total) == (whole.figures.z_track, whole.figures.u_total)
+    assert alone.findings.missing_ticks == {"controller": 0, "plant": 500}
+    assert "latency" not in alone.findings.timing
+    assert replay([tmp_path / "a.mcap"]).reasons == {"plant": "the log has no trace of a plant"}
+    write(tmp_path / "b.mcap", settings, [m for m in messages if end_of(m) == "plant"])
+    assert read(tmp_path / "b.mcap").findings.missing_ticks["controller"] == 499
+
+
+def test_a_log_of_the_first_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 100)
+    path = retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=[old_contract()])
+    says = "is a log of protocol version 1; read it with aeroloop 0.1, which wrote it"
+    for reader in (review, lambda path: replay([path])):
+        with pytest.raises(ReviewError, match=says) as refused:
+            reader(path)
+        assert str(refused.value) == f"{path} {says}"
+
+
+def old_contract() -> tuple[str, dict[str, str]]:
+    text = '{"role": "plant", "vehicle": "aero", "host": "h", "versions": {}, "config": {}}'
+    return "aeroloop.contract", {"key": "aeroloop/aero/contract/plant", "json": text}
+
+
+def test_frames_from_the_wire_are_compared_with_the_traces(tmp_path: Path) -> None:
+    known = rough_loop(20)
+    path = written(tmp_path / "a.mcap", known)
+    assert read(path).findings.frames is None
+
+    def frames(change: int | None = None) -> list[Said]:
+        at = known.messages.all[0].at_ns
+        sent = [("measurement", k, frame) for k, frame in known.measured.items() if frame]
+        sent += [("command", k, frame) for k, frame in known.commands.items() if frame]
+        sent.sort(key=lambda one: one[1])
+        return [
+            told(name, frame[:-1] + bytes([frame[-1] ^ 0x10]) if i == change else frame, at + k * 2_000_000)
+            for i, (name, k, frame) in enumerate(sent)
+        ]
+
+    made_frames = frames()
+    findings = read(retell(path, tmp_path / "b.mcap", more=made_frames)).findings
+    recorded = {name: sum(one.topic == name for one in made_frames) for name in ("measurement", "command")}
+    assert findings.frames == {name: {"recorded": n, "differ": 0} for name, n in recorded.items()}
+    findings = read(retell(path, tmp_path / "c.mcap", more=frames(change=100))).findings
+    assert findings.frames is not None
+    assert sum(count["differ"] for count in findings.frames.values()) == 1
+
+
+def test_a_row_that_is_not_what_was_done_is_found_at_either_end(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 500, settings=load())
+
+    def quiet(columns: np.void) -> None:
+        columns["sent_as"][columns["tick"] == 123] = 2
+
+    def weaker(columns: np.void) -> None:
+        columns["voltages"][columns["session_tick"] == 77] *= 0.5
+
+    one = replay([retell(tmp_path / "a.mcap", tmp_path / "b.mcap", edited("controller", quiet))])
+    assert one.controller is not None
+    assert one.controller.differ == 1
+    first = one.sessions[0].first_difference
+    assert first is not None
+    assert (first.tick, first.logged) == (123, "silent")
+    other = replay([retell(tmp_path / "a.mcap", tmp_path / "c.mcap", edited("plant", weaker))])
+    assert other.plant is not None
+    assert other.plant.differ == 1
+    difference = other.plants[0].first_difference
+    assert difference is not None
+    assert (difference.session_tick, difference.field) == (77, "voltages")
