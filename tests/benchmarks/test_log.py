@@ -61,5 +61,6 @@ def test_review(benchmark: BenchmarkFixture, made: Made) -> None:
 
 def test_replay(benchmark: BenchmarkFixture, made: Made) -> None:
     measure(benchmark, made, lambda: replay([made.path]))
-    (session,) = replay([made.path])
-    assert (session.commands, session.differing) == (made.ticks, 0)
+    replayed = replay([made.path]).controller
+    assert replayed is not None
+    assert (replayed.ticks, replayed.differ) == (made.ticks, 0)

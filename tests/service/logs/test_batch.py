@@ -241,10 +241,11 @@ def test_codes_and_levels_of_many_are_those_of_each(signal: SignalSpec, seed: in
     widths=st.lists(st.none() | st.integers(2, 16), min_size=1, max_size=7),
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(0, 40),
+    counter_bits=st.integers(4, 16),
 )
-def test_frames_are_read_many_at_once_as_each(widths: list[int | None], seed: int, n: int) -> None:
+def test_frames_are_read_many_at_once_as_each(widths: list[int | None], seed: int, n: int, counter_bits: int) -> None:
     """Given as bytes, as an array of frames, and as a strided array of octets."""
-    kind, rng = FrameFormat(widths), np.random.default_rng(seed)
+    kind, rng = FrameFormat(widths, counter_bits), np.random.default_rng(seed)
     floats = [float("nan"), -0.0, 5e-324, -1.7e308, *rng.normal(size=10)]
     rows = [
         [
