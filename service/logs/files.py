@@ -65,6 +65,11 @@ class LogFiles:
         self.metadata: dict[str, dict[str, Any]] = {}
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
+        if not self.contracts:  # one that is damaged may have a copy; where none can be read, it is not damage
+            for path, damages in self.damages.items():
+                for damage in damages:
+                    if CONTRACT_METADATA in damage.what:
+                        raise ReviewError(f"{path} is not a log of this version: {damage.what}")
         self._size = sum(path.stat().st_size for path in self.paths)
 
     def settings(self, vehicle: str) -> Settings:
@@ -136,15 +141,10 @@ class LogFiles:
                 elif isinstance(record, Channel) and _is_contract(record.topic):
                     contracts.add(record.id)
                 elif isinstance(record, Metadata):
-                    said = json.loads(record.metadata.get("json", "{}"))
-                    if record.name == CONTRACT_METADATA:
-                        self._add_contract(record.metadata["json"].encode(), path)
-                    elif record.name == CHANGE_METADATA:
-                        self._add_change(record.metadata["key"], Change.model_validate(said))
-                    elif record.name.startswith(METADATA_PREFIX):
-                        self.metadata[record.name.removeprefix(METADATA_PREFIX)] = (
-                            said if isinstance(said, dict) else {}
-                        )
+                    try:
+                        self._add_metadata(record, path)
+                    except (ValidationError, ValueError, KeyError) as error:
+                        damages.append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
         except NotMcapError as error:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
@@ -155,16 +155,24 @@ class LogFiles:
             self.damages[path] = damages
         return first
 
-    def _add_change(self, key: str, change: Change) -> None:
-        if (address := topics.read_key(key)) is not None:
-            known = self.changes.setdefault((address.vehicle, change.session), [])
+    def _add_metadata(self, record: Metadata, path: Path) -> None:
+        text = record.metadata.get("json", "{}")
+        if record.name == CONTRACT_METADATA:
+            self._add_contract(text.encode(), path)
+        elif record.name == CHANGE_METADATA:
+            change, address = Change.model_validate_json(text), topics.read_key(record.metadata["key"])
+            known = self.changes.setdefault((address.vehicle if address else "", change.session), [])
             if change not in known:  # every file of a rotated run repeats it
                 known.append(change)
+        elif record.name.startswith(METADATA_PREFIX):
+            said = json.loads(text)
+            self.metadata[record.name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
 
     def _add_contract(self, text: bytes, path: Path) -> None:
         said = json.loads(text)
-        version = said.get("protocol", 1)
-        if version != PROTOCOL_VERSION:
+        old = isinstance(said, dict) and said.keys() <= Contract.model_fields.keys() - {"protocol"}
+        if old or said["protocol"] != PROTOCOL_VERSION:
+            version = 1 if old else said["protocol"]
             written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
             raise ReviewError(f"{path} is a log of protocol version {version}; read it with {written_by} wrote it")
         contract = Contract.model_validate(said)

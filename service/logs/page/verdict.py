@@ -85,6 +85,8 @@ def _facts(run: Findings) -> list[str]:
         facts.append(f"the longest of {run.sessions} sessions is judged")
     if run.losses:
         facts.append(f"the recorder lost {_count(sum(run.losses.values()), 'message')}")
+    if missing := sum(run.missing_ticks.values()):
+        facts.append(f"{_count(missing, 'tick')} were not recorded")
     if run.damages:
         facts.append("not all of the log could be read")
     return facts
@@ -143,7 +145,8 @@ def broken(reports: Sequence[Report]) -> Html:
     for index, report in enumerate(reports):
         name = run_name(report, index, len(reports)) if len(reports) > 1 else Html("")
         lost = [f"the recorder lost {_count(n, 'message')} of {topic}" for topic, n in report.findings.losses.items()]
-        items += [tag("li", name, " " if name else "", text) for text in [*report.findings.damages, *lost]]
+        missing = [f"not recorded: {gap}" for gap in report.findings.missing if gap.rows]
+        items += [tag("li", name, " " if name else "", text) for text in [*report.findings.damages, *missing, *lost]]
     return tag("ul", items) if items else Html("")
 
 

@@ -88,6 +88,8 @@ def made_report(
         invalid={"measurement": 0, "command": 2},
         losses={},
         lapses={},
+        missing_ticks={"controller": 0, "plant": 0},
+        missing=[],
         marks=list(marks),
         checks=list(checks),
         theorem=theorem,

@@ -23,7 +23,7 @@ from service.config import Settings, load
 from service.controller import Controller, ControllerState
 from service.figures import Score
 from service.logs.batch import BatchController, Commands, Computed
-from service.logs.codes import codes_in, encoded_by, levels
+from service.logs.codes import codes_in, encoded_by, frames_of, levels
 
 TICKS = 300
 ROWS = 64
@@ -239,11 +239,13 @@ def test_codes_and_levels_of_many_are_those_of_each(signal: SignalSpec, seed: in
 
 @given(
     widths=st.lists(st.none() | st.integers(2, 16), min_size=1, max_size=7),
+    counter_bits=st.integers(4, 16),
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(0, 40),
-    counter_bits=st.integers(4, 16),
 )
-def test_frames_are_read_many_at_once_as_each(widths: list[int | None], seed: int, n: int, counter_bits: int) -> None:
+def test_frames_are_read_and_written_many_at_once_as_each(
+    widths: list[int | None], counter_bits: int, seed: int, n: int
+) -> None:
     """Given as bytes, as an array of frames, and as a strided array of octets."""
     kind, rng = FrameFormat(widths, counter_bits), np.random.default_rng(seed)
     floats = [float("nan"), -0.0, 5e-324, -1.7e308, *rng.normal(size=10)]
@@ -254,7 +256,8 @@ def test_frames_are_read_many_at_once_as_each(widths: list[int | None], seed: in
         ]
         for _ in range(n)
     ]
-    frames = [kind.pack(i % 16, row) for i, row in enumerate(rows)]
+    counters = rng.integers(kind.counters, size=n)
+    frames = [kind.pack(int(counter), row) for counter, row in zip(counters, rows, strict=True)]
     table = np.zeros(n, dtype=[("tick", "<u4"), ("frame", f"V{kind.size}")])
     table["frame"] = np.array(frames, dtype=f"V{kind.size}")
     octets = table.view(np.uint8).reshape(n, 4 + kind.size)[:, 4:]
@@ -262,6 +265,8 @@ def test_frames_are_read_many_at_once_as_each(widths: list[int | None], seed: in
         codes = codes_in(kind, given_as)
         assert codes.shape == (n, len(widths))
         assert bits(codes) == bits(rows)
+    values = np.array(rows, dtype=np.float64).reshape(n, len(widths))
+    assert [row.tobytes() for row in frames_of(kind, counters, values)] == frames
 
 
 @pytest.mark.parametrize("cut", [1, 7, 1000])

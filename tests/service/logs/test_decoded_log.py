@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from tests.service.logs.losing_log import SHORT, make_losing_log, read, write
 
 from protocol import topics
 from service.config import load
@@ -18,42 +18,68 @@ from service.logs.files import LogFiles
 from service.logs.mcap_file import CONTRACT_METADATA
 from service.logs.review import review
 from service.logs.table_files import ExportError
-from tests.service.logs.made_log import VEHICLE
+from tests.service.logs.made_log import SESSION, VEHICLE, make_log
+from tests.service.logs.retold import Said, tell
+
+TICKS = 400
 
 
-def test_a_log_with_everything_decoded_has_every_raw_message_and_each_frame_decoded(tmp_path: Path) -> None:
+class Read(NamedTuple):
+    """A message as the mcap package's reader has it."""
+
+    topic: str
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+def read(path: Path) -> list[Read]:
+    with path.open("rb") as file:
+        return [
+            Read(channel.topic, message.sequence, message.log_time, message.publish_time, message.data)
+            for _, channel, message in make_reader(file).iter_messages()
+        ]
+
+
+def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decoded(tmp_path: Path) -> None:
     """Also where the recorder has decoded some already: those are made again, not doubled."""
-    log = make_losing_log(tmp_path, load(overrides=["loop.lockstep=false"]))
-    contract = next(iter(LogFiles([log]).contracts.values()))
+    log = tmp_path / "log.mcap"
+    make_log(log, TICKS, settings=load())
     raw, rng = read(log), random.Random(3)
+    files = LogFiles([log])
     decoder = Decoder(rate_hz=10)
-    decoder.configure(contract)
-    recorded = [(message.topic, message.publish_time, message.data) for message in raw]
+    for contract in files.contracts.values():
+        decoder.configure(contract)
+    recorded = [Said(message.topic, message.log_time, message.data) for message in raw]
     for message in raw:
         address = topics.read_key(message.topic)
         assert address is not None
-        recorded += [(d.topic, d.at_ns, d.data) for d in decoder.take(address, message.data, message.publish_time)]
+        recorded += [Said(d.topic, d.at_ns, d.data) for d in decoder.take(address, message.data, message.publish_time)]
+    assert len(recorded) > len(raw)
     rng.shuffle(recorded)
-    write(tmp_path / "recorded.mcap", recorded, contract.model_dump_json())
+    contracts = [
+        (CONTRACT_METADATA, {"key": topics.key("contract", VEHICLE, role=role), "json": one.model_dump_json()})
+        for (_, role), one in files.contracts.items()
+    ]
+    tell(tmp_path / "recorded.mcap", recorded, contracts)
     exported = export([tmp_path / "recorded.mcap"], "mcap", tmp_path / "out.mcap")
     found = read(tmp_path / "out.mcap")
     assert exported.rows == len(found)
-    assert sorted((m.topic, m.publish_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
-        (m.topic, m.publish_time, m.data) for m in raw
+    assert sorted((m.topic, m.log_time, m.data) for m in found if m.topic.startswith("aeroloop/")) == sorted(
+        (m.topic, m.log_time, m.data) for m in raw
     )
-    given = {m for m in read(tmp_path / "recorded.mcap") if m.topic.startswith("aeroloop/")}
-    assert given <= set(found)  # with their sequence and both times
-    for name, key in (("measurement", "measurement"), ("pose", "measurement"), ("command", "command")):
-        times = sorted(m.publish_time for m in raw if m.topic.endswith(f"/{key}"))
-        assert sorted(m.publish_time for m in found if m.topic == f"/{VEHICLE}/{name}") == times
-    assert LogFiles([tmp_path / "out.mcap"]).contracts == LogFiles([log]).contracts
+    for name in ("measurement", "pose", "command"):
+        assert len([m for m in found if m.topic == f"/{VEHICLE}/{name}"]) == TICKS
+    assert LogFiles([tmp_path / "out.mcap"]).contracts == files.contracts
     assert review(tmp_path / "out.mcap").z_track == review(log).z_track
     with pytest.raises(ExportError, match="--session"):
-        export([log], "mcap", tmp_path / "other.mcap", session=SHORT)
+        export([log], "mcap", tmp_path / "other.mcap", session=SESSION)
 
 
 def test_what_several_files_repeat_is_written_once_and_the_last_contract_stays_the_last(tmp_path: Path) -> None:
-    log = make_losing_log(tmp_path, load())
+    log = tmp_path / "log.mcap"
+    make_log(log, 50)
     contract = next(iter(LogFiles([log]).contracts.values()))
     before, now = (contract.model_copy(update={"host": host}).model_dump_json() for host in ("before", "now"))
     (tmp_path / "run").mkdir()

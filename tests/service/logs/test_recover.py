@@ -40,7 +40,7 @@ def read(path: Path) -> list[Read]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("log") / "whole.mcap"
-    make_log(path, TICKS, chunk_every=50)
+    make_log(path, TICKS, chunk_every=5)
     return path
 
 
