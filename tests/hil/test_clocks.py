@@ -20,7 +20,7 @@ from service.bench import Bench, free_rendezvous
 from service.config import load
 from service.hil import HilLog
 from tests.hil.test_processes import eventually
-from tests.hil.test_recorder import PATIENT, Statuses, assert_whole
+from tests.hil.test_recorder import PATIENT, RATE, Statuses, assert_whole
 
 LIBRARIES = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
 
@@ -79,12 +79,12 @@ def run(
         assert statuses.state("plant") == "driven"
         for role in ("controller", "plant"):
             bench.stop(role)  # type: ignore[arg-type]  # a role
-    judged = assert_whole(tmp_path, round(0.5 * RUN_S * 500))
+    judged = assert_whole(tmp_path, round(0.5 * RUN_S * RATE))
     assert judged.sessions == 1
     assert judged.trips == []
     # A shared machine misses ticks, more so under libfaketime; a clock that decided anything would lose nearly all.
     assert judged.skipped_ticks is not None
-    assert judged.skipped_ticks < 0.5 * RUN_S * 500
+    assert judged.skipped_ticks < 0.5 * RUN_S * RATE
     assert RUN_S - 1 <= judged.duration_s <= RUN_S + 4
     assert judged.z_track is not None
     assert judged.z_track < 0.02
