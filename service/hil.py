@@ -22,7 +22,7 @@ from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.messages import Event, Status, model_of
 from protocol.states import PlantState
-from protocol.trace import Batch, End, read_batch
+from protocol.trace import Batch, End, Received, Sent, read_batch
 from protocol.verbs import Advance, Answer, Ask, Change, Inject, Message
 from service.bench import Bench, RoleName, free_rendezvous, private_bus
 from service.config import Settings, load
@@ -73,11 +73,12 @@ class HilLog:
 
     def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
         """When one end received or sent frames, on its wall clock [ns since 1970]; ticks without one are left out."""
+        frame = Received.FRAME if (end, column) == ("controller", "received") else Sent.FRAME
         return [
             at_ns + batch.header.wall_ns - batch.header.monotonic_ns
             for batch in self.batches(end)
-            for at_ns in batch.times_ns(column).tolist()
-            if at_ns >= 0
+            for at_ns, what in zip(batch.times_ns(column).tolist(), batch.columns[f"{column}_as"].tolist(), strict=True)
+            if at_ns >= 0 and what == frame
         ]
 
     @property

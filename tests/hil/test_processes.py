@@ -21,9 +21,10 @@ from mcap.reader import make_reader
 from mcap.records import Channel
 
 from protocol import topics
-from protocol.messages import Event
+from protocol.messages import Event, Truth
 from service.bench import Bench, free_rendezvous
 from service.config import load
+from service.hil import HilLog
 from service.logs.files import ReviewError
 from service.logs.mcap_file import records
 from service.logs.review import review
@@ -148,15 +149,15 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def grown(log: Path) -> Callable[[], bool]:
-    """Whether a log holds frames; a chunk is closed every second."""
+    """Whether a log holds a controller's trace; a chunk is closed every second."""
 
-    def holds_frames() -> bool:
+    def holds_ticks() -> bool:
         if not log.exists() or not log.stat().st_size:
             return False
         topics_in_it = {record.topic for record in records(log) if isinstance(record, Channel)}
-        return any(topic.startswith("aeroloop/") and topic.endswith("/command") for topic in topics_in_it)
+        return any(topic.startswith("aeroloop/") and topic.endswith("/trace/controller") for topic in topics_in_it)
 
-    return holds_frames
+    return holds_ticks
 
 
 def said(folder: Path, part: str, text: str) -> Callable[[], bool]:
@@ -234,12 +235,9 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
         eventually("driving", lambda: len(commands) > 200)
         bench.stop("controller", signal.SIGKILL)
         time.sleep(0.5)  # five watchdogs, and all the time there is for a wrong plant to go on at its last command
-    with log.open("rb") as file:
-        messages = [(channel.topic, message) for _, channel, message in make_reader(file).iter_messages()]
-    answered = [m.publish_time for topic, m in messages if topics.read_key(topic) and topic.endswith("/command")]
-    last_command = max(answered)
-    truths = [(m.publish_time, json.loads(m.data)) for topic, m in messages if topic == topics.key("truth", "aero")]
-    driven = [time_ns for time_ns, truth in truths if any(truth["voltages"])]
+    last_command = max(HilLog(log).times("plant", "received"))
+    truths = [(at_ns, truth) for at_ns, truth in HilLog(log).messages("truth") if isinstance(truth, Truth)]
+    driven = [at_ns for at_ns, truth in truths if any(truth.voltages)]
     # The watchdog's 100 ms; 100 ms of slack for a grid that is kept waiting by other work on the machine.
     assert driven
     assert max(driven) - last_command < 200_000_000

@@ -108,7 +108,7 @@ def _run(settings: Settings, first_tick: int, seconds: float) -> Run:
     assert isinstance(endpoint.claim(claim), Grant)
     frames: list[bytes] = []
     rows: list[tuple[object, ...]] = []
-    measurement = endpoint.tick(None, first_tick)
+    measurement = endpoint.tick(None, 0)
     for k in range(first_tick, first_tick + loop.ticks(seconds)):
         assert measurement is not None
         frames.append(measurement)
@@ -126,7 +126,7 @@ def _run(settings: Settings, first_tick: int, seconds: float) -> Run:
                 (controller.sign,),
             )
         )
-        measurement = endpoint.tick(command, k + 1)
+        measurement = endpoint.tick(command, k + 1 - first_tick)
     assert endpoint.accepted == len(frames)
     columns = [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
     return Run(settings, frames, endpoint.saturated + controller.saturated, *columns)
