@@ -151,7 +151,8 @@ def test_a_controller_that_must_be_certified_claims_once_it_is_and_refuses_what_
     hil: Hil, tmp_path: Path
 ) -> None:
     config = tmp_path / "a.toml"
-    gains = "[law]\nC1 = [{0}, {0}, {0}]\n[controller]\nrequire_certificate = true\nstale_s = 2\n[wire]\ncounter_bits = 11\n"
+    gains = "[law]\nC1 = [{0}, {0}, {0}]\n[controller]\nrequire_certificate = true\nstale_s = 2\n"
+    gains += "[wire]\ncounter_bits = 11\n"
     config.write_text(gains.format(3.0))
     hil.start(settings=PATIENT, drive=False)
     network = f"network.rendezvous={hil.settings.network.rendezvous}"
