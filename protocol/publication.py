@@ -22,6 +22,8 @@ KEPT_S: Final = 65.0
 """A cache holds what was published in this time, at the topic's rate [s]: 60 s and what a restart takes."""
 HEARTBEAT_S: Final = 2.0
 """How often a publisher that has published says its last number [s]: the very last message can be recovered, too."""
+CACHE_S: Final = 2.0
+"""How long a publisher's cache may take to answer [s]."""
 HISTORY: Final = 1_000_000
 """Messages of one publisher that a subscriber asks for at the most; the publisher's cache is smaller."""
 WAITING: Final = 65_536
@@ -65,7 +67,7 @@ class CachedPublisher:
         self._publisher.put(payload, attachment=_CLOCK.pack(time.time_ns()))
 
 
-class Received(NamedTuple):
+class Delivery(NamedTuple):
     """A message as it was received.
 
     Attributes:
@@ -114,11 +116,33 @@ class RecoveringSubscriber:
             subscriber_detection=True,
         )
         self._misses = self._subscriber.sample_miss_listener(RingChannel(1024))
+        self._session = session
+        self._known: set[tuple[zenoh.ZenohId, int]] = set()  # publishers
 
-    def take(self) -> Iterator[Received]:
-        """What was received and not yet taken, oldest first. Never waits."""
+    def take(self) -> Iterator[Delivery]:
+        """What was received and not yet taken, oldest first. Waits for nothing but the cache of a new publisher."""
         while (sample := self._subscriber.try_recv()) is not None:
-            yield read_sample(sample)
+            received = read_sample(sample)
+            if received.source is not None:
+                publisher = received.source.zid, received.source.eid
+                if publisher not in self._known:
+                    self._known.add(publisher)
+                    yield from self._before(received)
+            yield received
+
+    def _before(self, first: Delivery) -> list[Delivery]:
+        """What its cache holds of a publisher before the first message that was received of it.
+
+        A message that is published while a link is being set up can be received before Zenoh's subscriber learns that
+        there is a cache; it then drops the cache's older ones without a miss (seen with zenoh 1.10).
+        """
+        assert first.source is not None
+        if not first.sequence:
+            return []
+        cache = f"{first.key}/@adv/*/{first.source.zid}/{first.source.eid}/**?_anyke;_sn=..{first.sequence - 1}"
+        replies = self._session.get(cache, consolidation=zenoh.ConsolidationMode.NONE, timeout=CACHE_S)
+        found = [read_sample(reply.ok) for reply in replies if reply.ok is not None]
+        return sorted(found, key=lambda received: received.sequence)
 
     def missed(self) -> Iterator[Missed]:
         """What was found missing since this was last called."""
@@ -130,13 +154,13 @@ class RecoveringSubscriber:
         self._subscriber.undeclare()
 
 
-def read_sample(sample: zenoh.Sample) -> Received:
+def read_sample(sample: zenoh.Sample) -> Delivery:
     """A sample of an advanced publisher, or of any other."""
     clock, source = sample.attachment, sample.source_info
     published_ns: int | None = None
     if clock is not None and len(stamp := clock.to_bytes()) == _CLOCK.size:
         (published_ns,) = _CLOCK.unpack(stamp)
-    return Received(
+    return Delivery(
         str(sample.key_expr),
         sample.payload.to_bytes(),
         0 if source is None else source.source_sn,

@@ -22,7 +22,7 @@ from protocol import topics
 from protocol.errors import AeroloopError
 from protocol.messages import Contract
 from protocol.network import NetworkSettings, join
-from protocol.publication import Received, RecoveringSubscriber, read_sample
+from protocol.publication import Delivery, RecoveringSubscriber, read_sample
 from service.logs.decoded import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder, topic_of
 from service.logs.schemas import Shape
 
@@ -68,7 +68,7 @@ class Feed:
                     break
                 yield from self._decode(read_sample(sample))
 
-    def _decode(self, received: Received) -> list[Decoded]:
+    def _decode(self, received: Delivery) -> list[Decoded]:
         address = topics.read_key(received.key)
         if address is None:
             return []

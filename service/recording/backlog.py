@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import Final
 
-from protocol.publication import Received
+from protocol.publication import Delivery
 
 MOST_MESSAGES: Final = 200_000
 MOST_BYTES: Final = 128_000_000
@@ -21,17 +21,17 @@ class Backlog:
 
     def __init__(self) -> None:
         self.refused: Counter[str] = Counter()
-        self._queue: deque[tuple[Received, int]] = deque()
+        self._queue: deque[tuple[Delivery, int]] = deque()
         self._bytes = 0
 
     def __len__(self) -> int:
         return len(self._queue)
 
-    def room(self, received: Received) -> bool:
+    def room(self, received: Delivery) -> bool:
         """Whether there is room for one more."""
         return len(self._queue) < MOST_MESSAGES and self._bytes + len(received.payload) <= MOST_BYTES
 
-    def put(self, received: Received, at_ns: int) -> None:
+    def put(self, received: Delivery, at_ns: int) -> None:
         """Add a message, or count it as refused."""
         if self.room(received):
             self._queue.append((received, at_ns))
@@ -39,7 +39,7 @@ class Backlog:
         else:
             self.refused[received.key] += 1
 
-    def next(self) -> tuple[Received, int] | None:
+    def next(self) -> tuple[Delivery, int] | None:
         """Take out the message that has waited longest; None if there is none."""
         if not self._queue:
             return None

@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from protocol import topics
 from protocol.host import versions
 from protocol.messages import model_of
-from protocol.publication import Received
+from protocol.publication import Delivery
 from service.logs.decoded import Decoded
 from service.logs.mcap_file import CHUNK_BYTES
 from service.logs.schemas import Shape, json_shape
@@ -111,7 +111,7 @@ class LogFile:
         """Whether the file is no longer where it was made: somebody has moved or removed it."""
         return not self._out.stands_at(self.path)
 
-    def add(self, received: Received, at_ns: int) -> None:
+    def add(self, received: Delivery, at_ns: int) -> None:
         """Add a message to the chunk, under its key and its publisher's number.
 
         Args:

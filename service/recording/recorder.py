@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from protocol import topics
 from protocol.messages import Contract, Loss, Status
-from protocol.publication import Received
+from protocol.publication import Delivery
 from protocol.role import Role
 from protocol.trace import read_batch
 from service.logs.decoded import Decoded, Decoder
@@ -144,7 +144,7 @@ class Recorder:
             received, at_ns = entry
             self.log.add(received, at_ns, self._decode(received, at_ns))
 
-    def _decode(self, received: Received, at_ns: int) -> list[Decoded]:
+    def _decode(self, received: Delivery, at_ns: int) -> list[Decoded]:
         address = _address(received.key)
         if address is None or address.topic.carries == "frame":
             return []
@@ -155,7 +155,7 @@ class Recorder:
         at_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
         return self._decoder.take(address, received.payload, at_ns) if self._decoder else []
 
-    def _configure(self, received: Received) -> None:
+    def _configure(self, received: Delivery) -> None:
         try:
             contract = Contract.model_validate_json(received.payload)
         except ValidationError:

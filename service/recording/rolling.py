@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from protocol.errors import AeroloopError
-from protocol.publication import Received
+from protocol.publication import Delivery
 from protocol.verbs import Change
 from service.logs.decoded import Decoded
 from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA, RECORDER_METADATA, opening
@@ -44,7 +44,7 @@ def parts(path: Path) -> list[Path]:
 
 
 class _Entry(NamedTuple):
-    received: Received
+    received: Delivery
     at_ns: int
     decoded: list[Decoded]
 
@@ -95,7 +95,7 @@ class RollingLog:
         """Whether messages can be added."""
         return not self.trouble
 
-    def add(self, received: Received, at_ns: int, decoded: list[Decoded]) -> None:
+    def add(self, received: Delivery, at_ns: int, decoded: list[Decoded]) -> None:
         """Add a message, when it was received [ns since 1970], and what was made of it; only while `writable`."""
         entry = _Entry(received, at_ns, decoded)
         self._unwritten.append(entry)

@@ -16,10 +16,7 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from protocol import topics
-from protocol.publication import WAITING, Received, RecoveringSubscriber, read_sample
-
-CACHE_S: Final = 2.0
-"""How long a publisher's cache may take to answer [s]."""
+from protocol.publication import WAITING, Delivery, RecoveringSubscriber, read_sample
 
 _MASK: Final = 0xFFFF_FFFF
 """Publishers' numbers have 32 bits and begin again at 0."""
@@ -52,7 +49,6 @@ class Subscriptions:
     """
 
     def __init__(self, session: zenoh.Session, *, frames: bool = False, waiting: int = WAITING) -> None:
-        self._session = session
         self._waiting = waiting
         self._topics = {
             key: RecoveringSubscriber(session, key, waiting) for key in (topics.key(n, "*") for n in topics.RECORDED)
@@ -65,17 +61,12 @@ class Subscriptions:
         self._gaps: Counter[_Source] = Counter()  # numbers that were skipped since losses were last asked for
         self._reported: Counter[_Source] = Counter()  # numbers that were reported missing, and not yet skipped
 
-    def take(self) -> Iterator[Received]:
+    def take(self) -> Iterator[Delivery]:
         """What was received and not yet taken, topic by topic, contracts first. Waits for caches of new publishers."""
         for subscriber in self._topics.values():
             for received in islice(subscriber.take(), self._waiting):
                 if received.source is not None:
-                    source = received.source.zid, received.source.eid
-                    if received.sequence and source not in self._following:
-                        for earlier in self._before(received):
-                            self._follow(earlier.key, source, earlier.sequence)
-                            yield earlier
-                    self._follow(received.key, source, received.sequence)
+                    self._follow(received.key, (received.source.zid, received.source.eid), received.sequence)
                 yield received
         for frames in self._frames:
             for _ in range(self._waiting):
@@ -98,18 +89,6 @@ class Subscriptions:
                 found.append(Lost(self._keys[source], gap - reported, "queue"))
         self._gaps.clear()
         return found
-
-    def _before(self, first: Received) -> list[Received]:
-        """What its cache holds of a publisher before the first message that was received of it.
-
-        A message that is published while a link is being set up can be received before Zenoh's subscriber learns that
-        there is a cache; the subscriber then drops the cache's older ones.
-        """
-        assert first.source is not None
-        cache = f"{first.key}/@adv/*/{first.source.zid}/{first.source.eid}/**?_anyke;_sn=..{first.sequence - 1}"
-        replies = self._session.get(cache, consolidation=zenoh.ConsolidationMode.NONE, timeout=CACHE_S)
-        found = [read_sample(reply.ok) for reply in replies if reply.ok is not None]
-        return sorted(found, key=lambda received: received.sequence)
 
     def _follow(self, key: str, source: _Source, number: int) -> None:
         expected = self._following.get(source)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from protocol.publication import CachedPublisher, Received, RecoveringSubscriber
+from protocol.publication import CachedPublisher, Delivery, RecoveringSubscriber
 from tests.protocol.gathering import Gathering, eventually
 
 KEY = "aeroloop/aero/trace/plant"
@@ -25,9 +25,9 @@ def payload(i: int) -> bytes:
     return f"{i:06}".encode() + bytes(2000)
 
 
-def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Received]:
+def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Delivery]:
     """What is received until there is so much of it."""
-    found: list[Received] = []
+    found: list[Delivery] = []
 
     def received() -> bool:
         found.extend(subscriber.take())
@@ -39,7 +39,7 @@ def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Received]:
     return found
 
 
-def assert_complete(received: list[Received], count: int) -> None:
+def assert_complete(received: list[Delivery], count: int) -> None:
     assert [int(each.payload[:6]) for each in received] == list(range(count))
     assert [each.sequence for each in received] == list(range(count))
     assert {each.key for each in received} == {KEY}
@@ -79,7 +79,7 @@ def test_what_finds_no_room_to_wait_shows_as_a_gap_in_the_sequence(network: Gath
     assert_complete(collect(subscriber, 3), 3)
     for i in range(3, 40):  # the ring of the subscriber holds ten
         publisher.put(payload(i))
-    found: list[Received] = []
+    found: list[Delivery] = []
     time.sleep(0.2)  # nothing is taken meanwhile, so the ring overflows
 
     def received() -> bool:
@@ -93,7 +93,7 @@ def test_what_finds_no_room_to_wait_shows_as_a_gap_in_the_sequence(network: Gath
 def test_a_plain_publisher_is_received_too_and_says_no_time(network: Gathering) -> None:
     session = network.join(network.settings)
     subscriber = RecoveringSubscriber(network.join(network.settings), ANY)
-    found: list[Received] = []
+    found: list[Delivery] = []
 
     def received() -> bool:
         session.put(KEY, b"plain")

@@ -41,7 +41,7 @@ def test_a_configuration_that_is_the_same_says_nothing(role: str) -> None:
             "reference.amplitude: [0.0, 40.0, 100.0] → [0.0, 0.0, 1.0]",
         ),
         ("controller", "controller.stale_s=0.2", "controller.stale_s: 0.1 → 0.2"),
-        ("controller", "controller.telemetry_rate_hz=5", "controller.telemetry_rate_hz: 50.0 → 5.0"),
+        ("controller", "controller.telemetry_rate_hz=5", "controller.telemetry_rate_hz: 10.0 → 5.0"),
         ("controller", "controller.max_reference_rate=2", "controller.max_reference_rate: 1.0 → 2.0"),
         ("controller", "controller.max_reference_tilt_deg=9", "controller.max_reference_tilt_deg: 60.0 → 9.0"),
         ("controller", "controller.auto_arm=true", "controller.auto_arm: False → True"),
@@ -52,7 +52,7 @@ def test_a_configuration_that_is_the_same_says_nothing(role: str) -> None:
         ),
         ("plant", "plant.limits.max_tilt_deg=10", "plant.limits.max_tilt_deg: 75.0 → 10.0"),
         ("plant", "plant.watchdog_s=0.2", "plant.watchdog_s: 0.1 → 0.2"),
-        ("plant", "plant.truth_rate_hz=5", "plant.truth_rate_hz: 50.0 → 5.0"),
+        ("plant", "plant.truth_rate_hz=5", "plant.truth_rate_hz: 10.0 → 5.0"),
         ("recorder", "recorder.chunk_s=2", "recorder.chunk_s: 1.0 → 2.0"),
     ],
 )

@@ -18,7 +18,7 @@ from plant_emulator.plant_trace import PlantTrace
 from protocol import topics
 from protocol.links import Arrival
 from protocol.messages import PROTOCOL_VERSION, Claim, Contract, Grant
-from protocol.publication import Received as Message
+from protocol.publication import Delivery as Message
 from protocol.trace import End, Received, Sent, TraceWriter, read_batch
 from protocol.verbs import Change, Gains, Hold, Reference
 from service.config import Settings, load

@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
-from protocol.publication import Received
+from protocol.publication import Delivery
 from service.logs.export import export
 from service.logs.mcap_file import records
 from service.logs.recover import RecoverError, recover
@@ -152,7 +152,7 @@ def test_the_files_of_a_rotated_run(
     with whole.open("rb") as file:
         for i, (_, channel, message) in enumerate(make_reader(file).iter_messages()):
             log.add(
-                Received(channel.topic, message.data, message.sequence, message.publish_time, None),
+                Delivery(channel.topic, message.data, message.sequence, message.publish_time, None),
                 message.log_time,
                 [],
             )

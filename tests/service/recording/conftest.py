@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from protocol import topics
-from protocol.publication import Received
+from protocol.publication import Delivery
 from protocol.verbs import Change, Gains, Hold
 from service.config import load
 from service.recording import rolling
@@ -37,7 +37,7 @@ def story() -> Story:
         at_ns = START_NS + k * 2_000_000
         for said in ends.tick(k, k * 2_000_000 + 1, at_ns):
             # received some time after it was published, so that the two cannot be taken for each other
-            received = Received(said.key, said.payload, 5 + numbers[said.key], at_ns, None)
+            received = Delivery(said.key, said.payload, 5 + numbers[said.key], at_ns, None)
             messages.append(Arrived(received, at_ns + 77))
             numbers[said.key] += 1
     contract = contract_of(settings, "plant").encode()

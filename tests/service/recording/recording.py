@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 from protocol import topics
 from protocol.messages import Contract
-from protocol.publication import Received
+from protocol.publication import Delivery
 from protocol.trace import read_batch
 from protocol.verbs import Change
 from service.logs.decoded import Decoded, Decoder
@@ -32,7 +32,7 @@ EVERYTHING = 1 << 60
 class Arrived(NamedTuple):
     """A message, and when it was received [ns since 1970]."""
 
-    received: Received
+    received: Delivery
     at_ns: int
 
 

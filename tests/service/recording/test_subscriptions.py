@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from protocol.publication import CachedPublisher, Received
+from protocol.publication import CachedPublisher, Delivery
 from service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlog
 from service.recording.subscriptions import Subscriptions
 from tests.protocol.gathering import Gathering, eventually
@@ -91,9 +91,9 @@ def test_numbers_that_no_cache_has_are_lost_on_the_network_and_those_that_a_full
 def test_what_waits_is_bounded_in_bytes_and_in_messages_and_the_oldest_are_kept_in_order(size: int, fit: int) -> None:
     backlog, payload = Backlog(), bytes(size)
     for number in range(fit + 5):
-        backlog.put(Received("k", payload, number, None, None), number)
+        backlog.put(Delivery("k", payload, number, None, None), number)
     assert len(backlog) == fit
     assert backlog.refused == {"k": 5}
     assert [entry[1] for entry in iter(backlog.next, None)] == list(range(fit))
-    backlog.put(Received("k", payload, 0, None, None), 0)
+    backlog.put(Delivery("k", payload, 0, None, None), 0)
     assert len(backlog) == 1
