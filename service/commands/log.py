@@ -94,16 +94,21 @@ def replay(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Compute with this instead of what the log says."),
     ] = None,
+    end: Annotated[
+        Literal["controller", "plant"] | None,
+        typer.Option("--end", help="Only this end; both if left out.", show_default=False),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Compute what both ends did again from their traces, and compare byte for byte."""
 
     def run() -> Replay:
+        from protocol.trace import ENDS
         from service.display import share_bar
         from service.logs.replay import replay
 
         with share_bar("replaying", hidden=json) as update:
-            return replay(logs, overrides or [], update)
+            return replay(logs, overrides or [], update, ends=[end] if end else ENDS)
 
     replayed = guarded(run)
     if json:

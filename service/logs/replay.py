@@ -2,23 +2,25 @@
 
 The controller is sans-I/O, and its rows hold all that it had, so the same rows must give the same commands: which were
 sent, which silence stood for, and every bit of them. The emulated plant is replayed from its own rows
-(plant_replay.py).
+(plant_emulator/replay.py).
 With another configuration it says what would have been commanded instead; the plant of the log does not follow that, so
 it is no simulation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import sqrt
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from plant_emulator.replay import PlantReplay, PlantReplayed, why_not
 from protocol.messages import Contract
 from protocol.topics import Address
-from protocol.trace import Batch, Sent, read_batch
+from protocol.trace import ENDS, Batch, End, Sent, read_batch
 from protocol.wire import SignalSpec
 from service.config import Settings, from_contract, load_over
 from service.controller import Codes
@@ -26,10 +28,11 @@ from service.figures import added, squares
 from service.logs.codes import codes_in, frames_of, levels
 from service.logs.evaluate import Evaluator, held_codes
 from service.logs.files import Progress, ReviewError
-from service.logs.plant_replay import PlantReplay, PlantReplayed, why_not
 from service.logs.report import Array
 from service.logs.runs import Block, Join, Run, Taker
 from service.logs.traces import Source, Which
+
+_NOT_ASKED: Final = "only the other end was replayed"
 
 
 class Difference(BaseModel):
@@ -217,7 +220,12 @@ class Plants:
         self._contracts[contract.vehicle, contract.role] = contract
 
 
-def replay(paths: Sequence[Path], overrides: Sequence[str] = (), progress: Progress | None = None) -> Replay:
+def replay(
+    paths: Sequence[Path],
+    overrides: Sequence[str] = (),
+    progress: Progress | None = None,
+    ends: Collection[End] = ENDS,
+) -> Replay:
     """Replay every session of a run.
 
     Args:
@@ -225,6 +233,7 @@ def replay(paths: Sequence[Path], overrides: Sequence[str] = (), progress: Progr
         overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
             or of the reference stands in for every change that the log has of them. The plant is not replayed then.
         progress: Called now and then with the share that is done, 0…1.
+        ends: Which ends to replay; the plant takes most of the time.
 
     Raises:
         ReviewError: It cannot be read, or has no controller's configuration.
@@ -233,12 +242,12 @@ def replay(paths: Sequence[Path], overrides: Sequence[str] = (), progress: Progr
     try:
         run = Run(paths, progress)
         run.longest  # noqa: B018  # raises where there is no session
-        return _replayed(run, overrides)
+        return _replayed(run, overrides, ends)
     except ValidationError as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
 
 
-def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
+def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Replay:
     own_gains = any(override.startswith("law.") for override in overrides)
     own_reference = any(override.startswith("reference") for override in overrides)
     replayers: dict[Which, Replayer] = {}
@@ -248,11 +257,11 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
         source = arrived.source
         which = source.vehicle, arrived.header.session
         if source.end == "plant":
-            batch = None if overrides else read_batch(arrived.payload)
+            batch = None if overrides or "plant" not in ends else read_batch(arrived.payload)
             if batch is not None:
                 plants.take(source, batch)
             continue
-        if which not in run.extents:
+        if which not in run.extents or "controller" not in ends:
             continue
         if which not in joins:
             settings = load_over(run.files.settings(source.vehicle), overrides)
@@ -270,6 +279,9 @@ def _replayed(run: Run, overrides: Sequence[str]) -> Replay:
     reasons = {} if sessions else {"controller": "the log has no trace of a controller"}
     if overrides:
         reason = "the plant of a log does not follow another configuration"
+    reasons |= {end: _NOT_ASKED for end in ENDS if end not in ends}
+    if "plant" not in ends:
+        reason = _NOT_ASKED
     if reason is not None:
         reasons["plant"] = reason
     return Replay(

@@ -1,11 +1,11 @@
 """The recorder process: what both ends and all others publish, into MCAP files.
 
 It subscribes, and asks nobody: traces, messages and contracts are published from caches, so a recorder that starts late
-or again recovers the last minute. Five times a second it takes what was received and writes it, so log times are exact
-to 0.2 s. A channel per key holds the raw payloads, decoded channels stand beside them at a bounded rate, and what was
+or again recovers the last minute. Twice a second it takes what was received and writes it, so log times are exact
+to 0.5 s. A channel per key holds the raw payloads, decoded channels stand beside them at a bounded rate, and what was
 lost is published and recorded.
 
-A crash costs this process what the open chunk holds and 0.2 s; its successor recovers that from the caches.
+A crash costs this process what the open chunk holds and 0.5 s; its successor recovers that from the caches.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from service.recording.rolling import RollingLog
 from service.recording.subscriptions import Subscriptions
 from service.settings import RecorderSettings
 
-WORK_EVERY_S: Final = 0.2
+WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
 
 STATUS_EVERY_S: Final = 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 
 from plant_emulator.emulator import EmulatorOnZenoh
+from plant_emulator.replay import PlantReplay, PlantReplayed
 from plant_emulator.settings import PlantSettings
 from protocol import topics
 from protocol.clock import LoopSettings
@@ -14,7 +15,6 @@ from protocol.publication import RecoveringSubscriber
 from protocol.role import Role
 from protocol.trace import Batch, Outcome, read_batch
 from protocol.wire import WireSpec
-from service.logs.plant_replay import PlantReplay, PlantReplayed
 from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
 
 WIRE = WireSpec()

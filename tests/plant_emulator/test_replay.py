@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from plant_emulator.emulator import Emulator
 from plant_emulator.faults import Fault
+from plant_emulator.replay import PlantReplay, PlantReplayed, why_not
 from plant_emulator.settings import PlantSettings
 from plant_emulator.wind import WindSettings
 from protocol.clock import LoopSettings
@@ -23,7 +24,6 @@ from protocol.states import TripCause
 from protocol.trace import Batch, OperationKind, Outcome
 from protocol.transmit import SILENCE, Transmit
 from protocol.wire import SignalSpec, WireSpec
-from service.logs.plant_replay import PlantReplay, PlantReplayed, why_not
 from tests.plant_emulator.stage import Stage
 
 TICKS = 400
