@@ -27,6 +27,7 @@ from protocol.messages import (
     Truth,
     summary,
 )
+from protocol.trace import Operation, Tail
 from protocol.verbs import (
     Advance,
     Answer,
@@ -115,6 +116,12 @@ MESSAGES: list[Message] = [
     Inject(fault=None),
     Advance(seconds=0.5),
     Answer(done=True, text="armed"),
+    Operation(tick=-1, kind="inject", name="rate:off@2"),
+    Tail(
+        state={"uptime": 3},
+        changes=[Change(session="5f0c", tick=0)],
+        operations=[Operation(tick=7, kind="release", name="5f0c")],
+    ),
 ]
 
 every_message = pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)

@@ -306,7 +306,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
             self.tick(WIRE.command.pack((self.answered - self.first) % COUNTERS, pair), ticks)
         elif what == "malformed":
             self.refused += self.session is not None
-            self.tick((b"", b"\x00", b"\x57\xe1\x00")[ago % 3], ticks)
+            self.tick((b"", b"\x00", b"\x57\xe1\x0f")[ago % 3], ticks)
         else:
             self.tick(None, ticks)
 
