@@ -116,6 +116,7 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
             story.changed(block.changes)
             frames.take(block)
             session.take(block)
+        session.finish()
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
     figures = _figures(session, story, run, which)

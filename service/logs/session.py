@@ -65,6 +65,7 @@ class Session:
         self._watch = watch
         self._observer: Observer | None = None
         self._truths: deque[bytes] = deque(maxlen=WAITING)
+        self._session: str | None = None
 
     @property
     def observer(self) -> Observer:
@@ -83,10 +84,8 @@ class Session:
             self._observer = Observer(self.settings, self._trial(block.changes))
         observer, trial = self._observer, self._observer.trial
         trial.changed(block.changes)
-        for truth in _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]"):
-            if truth.session == block.which[1]:
-                trial.truth(truth.session_tick, truth.attitude, truth.rate)
-        self._truths.clear()
+        self._session = block.which[1]
+        self._give_truths(trial)
         self._count(block)
         found = self.reader.take(block)
         for tick in found.missed.tolist():
@@ -99,6 +98,18 @@ class Session:
         observer.ticks(found.judged)
         if self._watch is not None and len(found.judged.k):
             self._watch(found.judged)
+
+    def finish(self) -> None:
+        """Review what came after the last block."""
+        if self._observer is not None:
+            self._give_truths(self._observer.trial)
+            self._observer.trial.finish()
+
+    def _give_truths(self, trial: Trial) -> None:
+        for truth in _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]"):
+            if truth.session == self._session:
+                trial.truth(truth.session_tick, truth.attitude, truth.rate)
+        self._truths.clear()
 
     def _count(self, block: Block) -> None:
         """Count what went otherwise than one frame each way a tick."""

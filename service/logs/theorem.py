@@ -138,18 +138,31 @@ class Trial:
         before, self._before = self._before, ticks
         if self._truths and self._truths[0][0] <= ticks.k[-1]:
             late = [] if before is None or before.k[-1] < self._truths[0][0] else [before]
-            both = Ticks.joined([*late, ticks])
-            truths = self._take_truths(int(both.k[0]), int(both.k[-1]))
-            place = np.searchsorted(both.k, truths.k)
-            there = both.k[place] == truths.k
-            if there.any():
-                at = both.where(place[there])
-                found = self._try(at, Truths(*(column[there] for column in truths)))
-                known = np.vstack([self._drawn, np.column_stack([at.k, *found])])
+            if (found := self._judge_truths(Ticks.joined([*late, ticks]))) is not None:
+                known = np.vstack([self._drawn, found])
                 self._drawn = known[-1:]
                 # A line is drawn from one to the next.
                 true = np.array([np.interp(ticks.k, known[:, 0], values, left=nan) for values in known.T[1:]])
         return true[2], np.column_stack([z, true[0], V, true[1]])
+
+    def finish(self) -> None:
+        """Judge the last block's true states that came after it."""
+        if self._truths and self._before is not None:
+            self._judge_truths(self._before)
+
+    def _judge_truths(self, ticks: Ticks) -> Array | None:
+        """Judge the true states of these ticks.
+
+        Returns:
+            Tick, true ‖z‖, V and error [deg] of each, shape (n, 4); None without one.
+        """
+        truths = self._take_truths(int(ticks.k[0]), int(ticks.k[-1]))
+        place = np.searchsorted(ticks.k, truths.k)
+        there = ticks.k[place] == truths.k
+        if not there.any():
+            return None
+        at = ticks.where(place[there])
+        return np.column_stack([at.k, *self._try(at, Truths(*(column[there] for column in truths)))])
 
     def _settle(self, ticks: Ticks, z: Array) -> None:
         """The largest ‖z‖ and attitude error after the transient."""

@@ -147,7 +147,7 @@ class Run:
         return after, np.vstack(computed), sent
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(
     wire=st.sampled_from(sorted(WIRES)),
     seed=st.integers(0, 2**32 - 1),

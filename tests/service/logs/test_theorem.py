@@ -238,6 +238,10 @@ def test_a_true_state_that_comes_after_its_block_still_counts_and_long_silence_c
         late.truth(k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     drawn = late.ticks(block(9 * BLOCK - 10, 10))
     assert late.findings()[0].samples == 11
+    late.ticks(block(9 * BLOCK, 10))
+    late.truth(9 * BLOCK + 9, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    late.finish()
+    assert late.findings()[0].samples == 12
     assert all(np.isfinite(lines).all() for lines in drawn)
 
 
