@@ -92,6 +92,7 @@ class Recorder:
             self._take_all()
             self._publish_losses()
             self._take_all()
+            self._publish_losses()  # and those of which the publisher was not known a moment ago
             self._publish_status()
             self._take_all()
             self.log.close(len(self._backlog))

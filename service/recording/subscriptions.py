@@ -59,6 +59,7 @@ class Subscriptions:
         self._keys: dict[_Source, str] = {}
         self._following: dict[_Source, int] = {}  # the number that comes next
         self._gaps: Counter[_Source] = Counter()  # numbers that were skipped since losses were last asked for
+        self._unnamed: list[tuple[_Source, str, int]] = []  # losses of publishers of which nothing was taken yet
         self._reported: Counter[_Source] = Counter()  # numbers that were reported missing, and not yet skipped
 
     def take(self) -> Iterator[Delivery]:
@@ -75,13 +76,20 @@ class Subscriptions:
                 yield read_sample(sample)
 
     def losses(self) -> list[Lost]:
-        """What was found lost since this was last called."""
-        found = []
+        """What was found lost since this was last called.
+
+        Messages of a publisher of which nothing was taken yet wait for the next call: by then their key may be known.
+        """
+        found = [Lost(self._keys.get(source, key), count, "network") for source, key, count in self._unnamed]
+        self._unnamed.clear()
         for expression, subscriber in self._topics.items():
             for miss in subscriber.missed():
                 source = miss.source.zid, miss.source.eid
                 self._reported[source] += miss.missing
-                found.append(Lost(self._keys.get(source, expression), miss.missing, "network"))
+                if source in self._keys:
+                    found.append(Lost(self._keys[source], miss.missing, "network"))
+                else:
+                    self._unnamed.append((source, expression, miss.missing))
         for source, gap in self._gaps.items():
             reported = min(gap, self._reported[source])
             self._reported[source] -= reported
