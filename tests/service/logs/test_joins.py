@@ -19,7 +19,7 @@ from tests.service.logs.made_log import SESSION, VEHICLE, Logged, made, make_log
 from tests.service.logs.retold import Said, edited, retell, told
 from tests.service.logs.rough_log import Known, rough_loop
 
-SEEDS = range(16)
+SEEDS = range(8)
 
 
 def end_of(message: Logged) -> str:
