@@ -1,8 +1,7 @@
 """Roles as child processes of this one: what the demo and the tests on real processes start and stop.
 
-Each child runs the same command a user would type, with the effective configuration in a file of its own. A child asks
-the kernel to be told when its parent dies, so that nothing is left behind. ^C reaches only the parent, which stops its
-children one by one.
+Each child runs the same command a user would type, with the effective configuration in a file of its own. It ends when
+its parent does, so that nothing is left behind. ^C reaches only the parent, which stops its children one by one.
 """
 
 from __future__ import annotations
@@ -27,8 +26,11 @@ from protocol.can_link import CanSettings
 from protocol.errors import AeroloopError
 from protocol.network import join
 from service.config import ENV_PREFIX, Settings
+from service.fork_server import ForkedProcess, fork_server
 
 RoleName = Literal["controller", "plant", "can-node", "recorder"]
+
+Child = subprocess.Popen[bytes] | ForkedProcess
 
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
@@ -70,7 +72,7 @@ class Bench:
         self._folder = tempfile.TemporaryDirectory(prefix="aeroloop-")
         self._config = Path(self._folder.name) / "aeroloop.toml"
         self._config.write_text(settings.toml())
-        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._children: dict[str, Child] = {}
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # on purpose
         self._changed = threading.Condition()
@@ -96,28 +98,32 @@ class Bench:
             self.start("can-node")
         self.start("plant")
 
-    def start(
-        self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None
-    ) -> subprocess.Popen[bytes]:
+    def start(self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None) -> Child:
         """Start a role; it is not yet on the network when this returns.
 
         Args:
             role: Which.
             arguments: For its command line, besides the configuration of all.
-            environment: For its environment, besides this process's.
+            environment: For its environment, besides this process's. A process with one is started from nothing, since
+                the dynamic linker reads it, too; any other is a fork (see `fork_server`).
         """
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
-        own = ["--config", str(self._config), "--with-parent", "--quiet"]
-        command = [sys.executable, "-m", "service.cli", role, *own, *arguments]
+        server = None if environment else fork_server()
+        parent = server.pid if server else os.getpid()
+        words = [role, "--config", str(self._config), f"--with-parent={parent}", "--quiet", *arguments]
+        child: Child
         with self._log(role).open("ab") as stderr:
-            child = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=stderr,
-                env={**inherited, **(environment or {})},
-                start_new_session=True,
-            )
+            if server:
+                child = server.start(words, inherited, stderr.fileno())
+            else:
+                child = subprocess.Popen(
+                    [sys.executable, "-m", "service.cli", *words],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=stderr,
+                    env={**inherited, **(environment or {})},
+                    start_new_session=True,
+                )
         self._children[role] = child
         self._killed.discard(role)
         return child

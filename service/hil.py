@@ -286,7 +286,11 @@ class Hil:
             while not condition():
                 if time.monotonic() > deadline:
                     states = ", ".join(f"{role} {status.state}" for role, status in sorted(self._statuses.items()))
-                    raise HilError(f"not within {timeout_s:g} s: {what} ({states or 'nobody told a status'})")
+                    last = "; ".join(f"{event.role} {event.kind}: {event.text}" for event in self.events[-3:])
+                    raise HilError(
+                        f"not within {timeout_s:g} s: {what} ({states or 'no status was received'}"
+                        f"{f'; last events: {last}' if last else ''})"
+                    )
                 self._changed.wait(0.05)
 
     def finish(self) -> None:

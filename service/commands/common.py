@@ -41,7 +41,7 @@ BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say only warnings and errors on stderr.")]
 LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="What lines on stderr look like.")]
-WithParent = Annotated[bool, typer.Option("--with-parent", hidden=True)]
+WithParent = Annotated[int, typer.Option("--with-parent", metavar="PID", help="End with this process.", hidden=True)]
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -116,7 +116,7 @@ def checked(make: Callable[[], T]) -> T:
 
 
 def run_role(
-    kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, log_format: str, with_parent: bool
+    kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, log_format: str, with_parent: int
 ) -> None:
     """Join the network as a role and run until a signal says stop."""
     _prepare(quiet=quiet, log_format=log_format, with_parent=with_parent)
@@ -133,7 +133,7 @@ def run_role(
     guarded(live)
 
 
-def run_alone(run: Callable[[Event], None], *, quiet: bool, log_format: str, with_parent: bool) -> None:
+def run_alone(run: Callable[[Event], None], *, quiet: bool, log_format: str, with_parent: int) -> None:
     """Run a process that is on no Zenoh network until a signal says stop."""
     from threading import Event
 
@@ -144,14 +144,17 @@ def run_alone(run: Callable[[Event], None], *, quiet: bool, log_format: str, wit
     guarded(lambda: run(stop))
 
 
-def _prepare(*, quiet: bool, log_format: str, with_parent: bool) -> None:
+def _prepare(*, quiet: bool, log_format: str, with_parent: int) -> None:
     from service.log_lines import set_up_logging
 
     set_up_logging(logging.WARNING if quiet else logging.INFO, as_json=log_format == "json")
     if with_parent:
         import ctypes
+        import os
 
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != with_parent:  # it died before the kernel was asked to watch it
+            raise typer.Exit(0)
 
 
 def print_figures(figures: Figures, json: bool) -> None:

@@ -166,7 +166,7 @@ def live(
 
         serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
 
-    run_alone(run, quiet=False, log_format="text", with_parent=False)
+    run_alone(run, quiet=False, log_format="text", with_parent=0)
 
 
 @group.command()

@@ -101,7 +101,7 @@ def controller(
     overrides: Overrides = None,
     quiet: Quiet = False,
     log_format: LogFormat = "text",
-    with_parent: WithParent = False,
+    with_parent: WithParent = 0,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
     options = [f"controller.duration_s={duration}"] if duration is not None else []
@@ -138,7 +138,7 @@ def emulator(
     overrides: Overrides = None,
     quiet: Quiet = False,
     log_format: LogFormat = "text",
-    with_parent: WithParent = False,
+    with_parent: WithParent = 0,
 ) -> None:
     """Run the emulated plant until SIGTERM."""
     settings, load = reloadable(config, [*(overrides or []), "plant.via=emulator", *_fault_options(faults)])
@@ -151,7 +151,7 @@ def plant(
     overrides: Overrides = None,
     quiet: Quiet = False,
     log_format: LogFormat = "text",
-    with_parent: WithParent = False,
+    with_parent: WithParent = 0,
 ) -> None:
     """Run the plant end that `plant.via` names, until SIGTERM: emulator, CAN bridge or Quanser's board."""
     settings, load = reloadable(config, overrides or [])
@@ -164,7 +164,7 @@ def bridge(
     overrides: Overrides = None,
     quiet: Quiet = False,
     log_format: LogFormat = "text",
-    with_parent: WithParent = False,
+    with_parent: WithParent = 0,
 ) -> None:
     """Run the bridge to a plant on the configured CAN bus, until SIGTERM."""
     settings, load = reloadable(config, [*(overrides or []), "plant.via=can"])
@@ -178,7 +178,7 @@ def can_node(
     overrides: Overrides = None,
     quiet: Quiet = False,
     log_format: LogFormat = "text",
-    with_parent: WithParent = False,
+    with_parent: WithParent = 0,
 ) -> None:
     """Run the emulated plant as a node on the configured CAN bus, until SIGTERM."""
     settings = settings_of(config, [*(overrides or []), *_fault_options(faults)])
@@ -198,7 +198,7 @@ def _fault_options(faults: list[str] | None) -> list[str]:
 
 
 def _run_plant(
-    settings: Settings, load: Callable[[], Settings], *, quiet: bool, log_format: str, with_parent: bool
+    settings: Settings, load: Callable[[], Settings], *, quiet: bool, log_format: str, with_parent: int
 ) -> None:
     def run(role: Role) -> None:
         from service.plants import run_plant
@@ -215,7 +215,7 @@ def recorder(
     overrides: Overrides = None,
     quiet: Quiet = False,
     log_format: LogFormat = "text",
-    with_parent: WithParent = False,
+    with_parent: WithParent = 0,
 ) -> None:
     """Record traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
     options = [f"recorder.path={dumps(str(log))}"] if log is not None else []

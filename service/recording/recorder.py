@@ -107,7 +107,7 @@ class Recorder:
             pass
         now = last = time.monotonic()
         deadline = now + GOES_ON_S
-        while now < deadline and now - last < QUIET_S:
+        while now < deadline and (now - last < QUIET_S or self._subscriptions.joining):
             time.sleep(0.0 if self._behind else QUIET_S / 10)
             now = time.monotonic()
             if self._take():
@@ -119,14 +119,14 @@ class Recorder:
         return self.log.writable and len(self._backlog) > 0
 
     def _take_all(self) -> None:
-        self._take()
+        self._take(held=True)
         while self._behind:
             self._write()
 
-    def _take(self) -> int:
+    def _take(self, *, held: bool = False) -> int:
         """Take what was received, and write some of what waits. How many messages were received."""
         count, now = 0, time.time_ns()
-        for received in self._subscriptions.take():
+        for received in self._subscriptions.take(held=held):
             count += 1
             address = _address(received.key)
             if address is not None and address.topic.name == "contract":

@@ -62,10 +62,19 @@ class Subscriptions:
         self._unnamed: list[tuple[_Source, str, int]] = []  # losses of publishers of which nothing was taken yet
         self._reported: Counter[_Source] = Counter()  # numbers that were reported missing, and not yet skipped
 
-    def take(self) -> Iterator[Delivery]:
-        """What was received and not yet taken, topic by topic, contracts first. Waits for caches of new publishers."""
+    @property
+    def joining(self) -> bool:
+        """Whether messages are held back until the cache of a new publisher has answered."""
+        return any(subscriber.joining for subscriber in self._topics.values())
+
+    def take(self, *, held: bool = False) -> Iterator[Delivery]:
+        """What was received and not yet taken, topic by topic, contracts first. Never waits.
+
+        Args:
+            held: Also take what is held back.
+        """
         for subscriber in self._topics.values():
-            for received in islice(subscriber.take(), self._waiting):
+            for received in islice(subscriber.take(held=held), self._waiting):
                 if received.source is not None:
                     self._follow(received.key, (received.source.zid, received.source.eid), received.sequence)
                 yield received

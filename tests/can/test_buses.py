@@ -7,6 +7,8 @@ machine with two cores, where a process can be kept waiting for hundreds of mill
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -24,6 +26,7 @@ from protocol.states import PlantState, TripCause
 from service.bench import free_rendezvous
 from service.config import load
 from service.figures import Figures
+from service.fork_server import fork_server
 from service.hil import Hil, HilLog
 from service.lab.experiment import run_experiment
 from service.logs.review import review
@@ -63,15 +66,14 @@ class Node:
         self._said = folder / "node.stderr"
         sets = [argument for override in overrides for argument in ("--set", override)]
         with self._said.open("wb") as stderr:
-            self._process = subprocess.Popen(
-                [*AEROLOOP, "can-node", "--config", str(config), *sets], stdin=subprocess.DEVNULL, stderr=stderr
-            )
+            words = ["can-node", "--config", str(config), *sets]
+            self._process = fork_server().start(words, os.environ, stderr.fileno())
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.terminate()
+        self._process.send_signal(signal.SIGTERM)
         self._process.wait(30)
 
     @property

@@ -38,7 +38,7 @@ def test_frames_cross_on_a_real_socketcan() -> None:
     try:
         done = run_with_socketcan(pytest_inside, ROOT, TIMEOUT_S)
     except NoSocketCan as reason:
-        pytest.skip(str(reason))
+        pytest.skip(f"a user-mode kernel with SocketCAN cannot run on this machine: {reason}")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "passed" in done.stdout, done.stdout
     assert "skipped" not in done.stdout, done.stdout

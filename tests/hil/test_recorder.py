@@ -200,12 +200,12 @@ exit $code
 def unshare() -> str:
     found = shutil.which("unshare")
     if found is None:
-        pytest.skip("there is no unshare(1) here")
+        pytest.skip("a full disk needs unshare(1), which is not installed")
     tried = subprocess.run(
         [found, "-rm", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True, text=True, check=False
     )
     if tried.returncode:
-        pytest.skip(f"this system lets nobody mount a disk of his own: {tried.stderr.strip()}")
+        pytest.skip(f"a full disk needs a mount of its own, which this system refuses: {tried.stderr.strip()}")
     return found
 
 

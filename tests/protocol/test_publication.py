@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import zenoh
+from zenoh.handlers import RingChannel
 
+from protocol import publication
 from protocol.publication import CachedPublisher, Delivery, RecoveringSubscriber
 from tests.protocol.gathering import Gathering, eventually
 
@@ -104,3 +107,56 @@ def test_a_plain_publisher_is_received_too_and_says_no_time(network: Gathering) 
     assert found[0][:2] == (KEY, b"plain")
     assert found[0].published_ns is None
     assert isinstance(session, zenoh.Session)
+
+
+class Unreachable:
+    """A session from which the first few queries reach no cache."""
+
+    def __init__(self, session: zenoh.Session, queries: int) -> None:
+        self._session = session
+        self.left = queries
+
+    def get(self, key: str, *arguments: Any, **options: Any) -> Any:
+        self.left -= 1
+        return self._session.get(key if self.left < 0 else "nowhere", *arguments, **options)
+
+
+def sixth(network: Gathering, session: zenoh.Session) -> tuple[CachedPublisher, Delivery]:
+    """A publisher and its sixth message, as a subscriber that asks for no history receives it."""
+    publisher = CachedPublisher(network.join(network.settings), KEY, per_s=1)
+    for i in range(5):
+        publisher.put(payload(i))
+    subscriber = session.declare_subscriber(KEY, RingChannel(1))
+    eventually("the link", lambda: bool(list(session.info.peers_zid())))
+    time.sleep(0.2)  # for the declaration to cross it
+    publisher.put(payload(5))
+    return publisher, publication.read_sample(subscriber.recv())
+
+
+def test_a_cache_that_is_not_yet_known_is_queried_again_and_what_is_received_meanwhile_follows(
+    network: Gathering,
+) -> None:
+    session = network.join(network.settings)
+    _publisher, first = sixth(network, session)
+    unreachable = Unreachable(session, queries=2)
+    join = publication.Join(unreachable, first)  # type: ignore[arg-type]  # a double
+    later = first._replace(sequence=6)
+    join.held.append(later)
+    eventually("the answer", join.finished)
+    assert unreachable.left == -1
+    assert [each.sequence for each in join.deliver()] == [0, 1, 2, 3, 4, 5, 6]
+    assert_complete(join.deliver()[:6], 6)
+
+
+def test_a_cache_that_never_answers_holds_messages_back_for_a_while_only(
+    network: Gathering, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publication, "JOIN_S", 0.3)
+    session = network.join(network.settings)
+    _publisher, first = sixth(network, session)
+    unreachable = Unreachable(session, queries=1000)
+    join = publication.Join(unreachable, first)  # type: ignore[arg-type]  # a double
+    assert not join.finished()
+    eventually("giving up", join.finished)
+    assert unreachable.left < 999
+    assert join.deliver() == [first]
