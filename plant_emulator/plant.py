@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from protocol.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
 
 class Measurement(NamedTuple):

@@ -6,20 +6,20 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from plant_emulator.aero import Aero, AeroSettings
-from plant_emulator.emulated import EmulatedPlant
-from plant_emulator.faults import Fault
-from plant_emulator.faulty import FaultyPlant
-from plant_emulator.friction import FrictionSettings
-from plant_emulator.limits import Guard, LimitSettings
-from plant_emulator.mechanism import Mechanism
-from plant_emulator.plant import Plant
-from plant_emulator.quanser_usb import QuanserSettings
-from plant_emulator.rigid_body import RigidBody, RigidBodySettings
-from plant_emulator.rotor import RotorSettings
-from plant_emulator.sensors import Sensors, SensorSettings
-from plant_emulator.wind import Wind, WindSettings
-from protocol.clock import WATCHDOG_S
+from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.faults.signals import FaultyPlant
+from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
+from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.mechanism import Mechanism
+from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
+from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
+from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.plant import Plant
+from aeroloop.plant_emulator.quanser_settings import QuanserSettings
+from aeroloop.protocol.wire.loop import WATCHDOG_S
 
 
 class PlantSettings(BaseModel):

@@ -21,18 +21,18 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from plant_emulator.settings import PlantSettings
-from protocol import topics
-from protocol.can_link import CanSettings
-from protocol.clock import LoopSettings
-from protocol.errors import AeroloopError
-from protocol.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
-from protocol.network import NetworkSettings
-from protocol.quantizer import MAX_BITS, MIN_BITS
-from protocol.verbs import Reference, Sinusoid
-from protocol.wire import WireSpec
-from service.law import LawSettings
-from service.settings import ControllerSettings, RecorderSettings
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.operator import Reference, Sinusoid
+from aeroloop.protocol.transport.can_link import CanSettings
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.settings import ControllerSettings, RecorderSettings
 
 ENV_PREFIX = "AEROLOOP_"
 

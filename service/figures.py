@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.attitude import angle
-from protocol.clock import WATCHDOG_S
-from protocol.frames import FrameFormat
-from protocol.messages import Percentiles
-from protocol.wire import WireSpec
+from aeroloop.protocol.messages.models import Percentiles
+from aeroloop.protocol.wire.attitude import angle
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.loop import WATCHDOG_S
+from aeroloop.protocol.wire.spec import WireSpec
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

@@ -17,6 +17,7 @@ ROOT = Path(__file__).parent.parent
         ("ruff", "check", "."),
         ("ruff", "format", "--check", "."),
         ("mypy",),
+        ("mypy", "tests"),
         ("lint-imports", "--no-logo"),
     ],
     ids=" ".join,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import execute
-from service.commands.show import EXAMPLES
-from service.config import load
-from service.lab.experiment import run_experiment
+from aeroloop.service.cli.main import execute
+from aeroloop.service.cli.show import EXAMPLES
+from aeroloop.service.config import load
+from aeroloop.service.lab.experiment import run_experiment
 
 ROOT = Path(__file__).parent.parent
 

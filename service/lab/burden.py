@@ -13,14 +13,14 @@ from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.transmit import Policy
-from service.config import Settings
-from service.figures import Figures
-from service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings
-from service.lab.experiment import LoopEndedError, run_experiment
-from service.lab.traffic import Traffic, codes_of, sent_ticks, traffic
-from service.lab.workers import Workers
-from service.lab.zenoh_bytes import LinkBytes, count_bytes
+from aeroloop.protocol.wire.transmit import Policy
+from aeroloop.service.config import Settings
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings
+from aeroloop.service.lab.experiment import LoopEndedError, run_experiment
+from aeroloop.service.lab.traffic import Traffic, codes_of, sent_ticks, traffic
+from aeroloop.service.lab.workers import Workers
+from aeroloop.service.lab.zenoh_bytes import LinkBytes, count_bytes
 
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 

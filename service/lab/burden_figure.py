@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from service.lab.burden import Burden, Point
-from service.lab.burden_grid import BurdenError
-from service.lab.burden_table import short_name
+from aeroloop.service.lab.burden import Burden, Point
+from aeroloop.service.lab.burden_grid import BurdenError
+from aeroloop.service.lab.burden_table import short_name
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
 # Colours that differ in brightness as well, for print and for eyes that see no red.

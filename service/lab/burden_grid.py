@@ -12,11 +12,11 @@ from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import ValidationError
 
-from protocol.errors import AeroloopError
-from protocol.quantizer import MAX_BITS, MIN_BITS
-from protocol.transmit import Transmit
-from protocol.wire import Kind, SignalSpec, WireSpec
-from service.config import Settings
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
+from aeroloop.protocol.wire.transmit import Transmit
+from aeroloop.service.config import Settings
 
 BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
 FLOAT64: Final = (None, None)

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from protocol.frames import MIN_COUNTER_BITS
-from service.lab.burden import Burden, Point
+from aeroloop.protocol.wire.frames import MIN_COUNTER_BITS
+from aeroloop.service.lab.burden import Burden, Point
 
 HEADER: Final = (
     "bits out/in",

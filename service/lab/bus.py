@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from protocol.can_link import CLASSIC_BYTES
+from aeroloop.protocol.transport.can_link import CLASSIC_BYTES
 
 BITRATE: Final = 1_000_000
 """Bits a second of the bus whose load is reckoned, the most that classic CAN has."""

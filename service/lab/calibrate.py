@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.errors import AeroloopError
-from service.config import Settings
-from service.lab import paper
-from service.lab.cells import Cell, Pool
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.config import Settings
+from aeroloop.service.lab import paper
+from aeroloop.service.lab.cells import Cell, Pool
 
 MEASURED_YAW_COULOMB: Final = 0.0037
 """Coulomb friction of the yaw axis as measured from spin-downs of another Aero [N·m]."""

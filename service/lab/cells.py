@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from service.config import Settings
-from service.lab.experiment import run_experiment
-from service.lab.paper import DURATION_S
-from service.lab.workers import Workers
+from aeroloop.service.config import Settings
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.paper import DURATION_S
+from aeroloop.service.lab.workers import Workers
 
 
 class Cell(NamedTuple):

@@ -10,13 +10,13 @@ import gc
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant import Plant
-from protocol.messages import Claim, Refusal
-from protocol.transmit import SILENCE
-from service.config import Settings
-from service.controller import Controller
-from service.figures import Figures, Score
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.plant import Plant
+from aeroloop.protocol.messages.models import Claim, Refusal
+from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.figures import Figures, Score
 
 NO_CLOCK = "lockstep without a network has no latency"
 

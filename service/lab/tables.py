@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.config import Settings
-from service.lab import paper
-from service.lab.cells import Cell, Pool, Result
+from aeroloop.service.config import Settings
+from aeroloop.service.lab import paper
+from aeroloop.service.lab.cells import Cell, Pool, Result
 
 CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
 Rows = list[list[float]]

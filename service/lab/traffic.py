@@ -12,10 +12,10 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import Field
 
-from protocol.frames import FrameFormat
-from protocol.transmit import Policy, Sender
-from service.figures import Stream
-from service.lab.bus import BITRATE, bus_bits, classic_frames
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.transmit import Policy, Sender
+from aeroloop.service.figures import Stream
+from aeroloop.service.lab.bus import BITRATE, bus_bits, classic_frames
 
 Codes: TypeAlias = tuple[float, ...]
 

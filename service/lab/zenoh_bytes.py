@@ -19,10 +19,10 @@ from typing import Final, NamedTuple, Self
 
 import zenoh
 
-from protocol import topics
-from protocol.errors import AeroloopError
-from protocol.links import Mailbox, ZenohLink
-from protocol.network import NetworkSettings, join
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.link import Mailbox, ZenohLink
+from aeroloop.protocol.transport.network import NetworkSettings, join
 
 _VEHICLE: Final = "aero"
 _SESSION: Final = "1ab0ra70"

@@ -1,7 +1,7 @@
 """The controller over thousands of ticks at once, bit for bit what it computes a tick at a time.
 
 A log has all the measurements, so only the attitude's sign and θ̂ go from tick to tick. The law and the reference are
-the loop's own CasADi instructions, run over columns with a row a tick (protocol/symbolic.py, `law_of_many`), so the
+the loop's own CasADi instructions, run over columns with a row a tick (symbolic.py, `law_of_many`), so the
 bits are the loop's (tests/service/logs/test_batch.py); a tick costs a microsecond instead of 15.
 """
 
@@ -15,16 +15,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.symbolic import Buffer, Compiled, in_columns
-from protocol.transmit import Sender
-from protocol.verbs import Change, Gains, Reference
-from protocol.wire import WireSpec
-from service.controller import ControllerState, resume
-from service.law import LawSettings, law_of_many
-from service.logs.codes import encoded_by, levels
-from service.logs.report import Array
-from service.logs.traces import Integers
-from service.reference import Motion, reference_function
+from aeroloop.protocol.messages.operator import Change, Gains, Reference
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
+from aeroloop.protocol.wire.transmit import Sender
+from aeroloop.service.control.controller import ControllerState, resume
+from aeroloop.service.control.law import LawSettings, law_of_many
+from aeroloop.service.control.reference import Motion, reference_function
+from aeroloop.service.logs.codes import encoded_by, levels
+from aeroloop.service.logs.traces import Array, Integers
 
 ROWS: Final = 1024
 """Ticks that CasADi is given at once: so many that calls cost little, so few that columns stay in the cache."""
@@ -78,7 +77,7 @@ class BatchController:
         law: Parameters and gains.
         reference: What the body shall do from tick 0 on.
         period: Time between ticks [s].
-        rows: Ticks that CasADi is given at once; a multiple of `protocol.symbolic.UNROLLED`.
+        rows: Ticks that CasADi is given at once; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
 
     Raises:
         ValueError: The law's B cannot be inverted.

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from service.logs.report import Array
+from aeroloop.service.logs.traces import Array
 
 WINDOW: Final = 512
 """Ticks of a fit; two crystals part by less than a microsecond in a second."""

@@ -1,4 +1,4 @@
-"""Frames, codes and levels, thousands at once, to the last bit what protocol/frames.py and quantizer.py make of each.
+"""Frames, codes and levels, thousands at once, to the last bit what protocol/wire makes of each.
 
 Codes stand in rows of doubles, which hold those of 16 bits and those that are not quantized alike.
 """
@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.frames import FrameFormat
-from protocol.hysteresis import HysteresisQuantizer
-from protocol.logarithmic import LogarithmicQuantizer
-from protocol.quantizer import TIE, CodedQuantizer, Quantizer, UniformQuantizer
-from protocol.wire import SignalSpec
-from service.logs.report import Array
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
+from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import TIE, CodedQuantizer, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.logs.traces import Array
 
 
 def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array:

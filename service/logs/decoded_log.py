@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 from mcap.records import Message
 
-from protocol import topics
-from service.logs.decoded import Decoder
-from service.logs.files import LogFiles
-from service.logs.mcap_copy import Follow, McapCopy
-from service.logs.mcap_file import Damage
+from aeroloop.protocol.messages import topics
+from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.mcap_copy import Follow, McapCopy
+from aeroloop.service.logs.mcap_file import Damage
+from aeroloop.service.viewers.channels import Decoder
 
 
 class Written(NamedTuple):

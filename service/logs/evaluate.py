@@ -13,15 +13,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.trace import Received
-from protocol.verbs import Change
-from service.config import Settings
-from service.controller import Codes, ControllerState
-from service.logs.batch import BatchController, Commands, Computed
-from service.logs.codes import codes_in
-from service.logs.report import Array
-from service.logs.runs import Block
-from service.logs.traces import Integers
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import Received
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Codes, ControllerState
+from aeroloop.service.logs.batch import BatchController, Commands, Computed
+from aeroloop.service.logs.codes import codes_in
+from aeroloop.service.logs.runs import Block
+from aeroloop.service.logs.traces import Array, Integers
 
 
 class Used(NamedTuple):

@@ -15,16 +15,16 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from protocol.host import versions
-from protocol.messages import Truth
-from protocol.topics import Address
-from service.config import ConfigError, Settings
-from service.logs.files import LogFiles, Progress, ReviewError
-from service.logs.runs import Block, Run, Taker
-from service.logs.table import Rows, Truths, groups
-from service.logs.table_files import FILES, ExportError, TableFile
-from service.logs.tick_reader import TickReader
-from service.logs.traces import Integers, Which
+from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.messages.topics import Address
+from aeroloop.protocol.runtime.host_facts import versions
+from aeroloop.service.config import ConfigError, Settings
+from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
+from aeroloop.service.logs.runs import Block, Run, Taker
+from aeroloop.service.logs.table import Rows, Truths, groups
+from aeroloop.service.logs.table_files import FILES, ExportError, TableFile
+from aeroloop.service.logs.tick_reader import TickReader
+from aeroloop.service.logs.traces import Integers, Which
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
 ALL: Final = "all"
@@ -85,7 +85,7 @@ def export(
 
 
 def _log(paths: Sequence[Path], part: Path, session: str | None, progress: Progress | None) -> Exported:
-    from service.logs.decoded_log import write_decoded
+    from aeroloop.service.logs.decoded_log import write_decoded
 
     if session is not None:
         raise ExportError("--session chooses the rows of a table; --to mcap writes the log with all its sessions")

@@ -10,13 +10,13 @@ from typing import Any, Final, TypeVar
 from mcap.records import Channel, Message, Metadata
 from pydantic import ValidationError
 
-from plant_emulator.settings import PlantSettings
-from protocol import topics
-from protocol.errors import AeroloopError
-from protocol.messages import PROTOCOL_VERSION, Contract
-from protocol.verbs import Change
-from service.config import Settings, from_contract
-from service.logs.mcap_file import (
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.service.config import Settings, from_contract
+from aeroloop.service.logs.mcap_file import (
     CHANGE_METADATA,
     CONTRACT_METADATA,
     Damage,
@@ -26,7 +26,7 @@ from service.logs.mcap_file import (
     records,
     skim,
 )
-from service.logs.traces import Which
+from aeroloop.service.logs.traces import Which
 
 METADATA_PREFIX: Final = "aeroloop."
 

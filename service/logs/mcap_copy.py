@@ -14,7 +14,7 @@ from typing import BinaryIO
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
 
-from service.logs.mcap_file import CHUNK_BYTES, Damage, records
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, Damage, records
 
 Follow = Callable[[Message], None]
 """Called with each message of a channel after it was copied."""

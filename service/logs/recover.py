@@ -11,9 +11,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.errors import AeroloopError
-from service.logs.mcap_copy import McapCopy
-from service.logs.mcap_file import Damage, NotMcapError
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.logs.mcap_copy import McapCopy
+from aeroloop.service.logs.mcap_file import Damage, NotMcapError
 
 
 class RecoverError(AeroloopError):

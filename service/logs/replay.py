@@ -2,7 +2,7 @@
 
 The controller is sans-I/O, and its rows hold all that it had, so the same rows must give the same commands: which were
 sent, which silence stood for, and every bit of them. The emulated plant is replayed from its own rows
-(plant_emulator/replay.py).
+(plant_emulator/hosts/replay.py).
 With another configuration it says what would have been commanded instead; the plant of the log does not follow that, so
 it is no simulation.
 """
@@ -17,20 +17,19 @@ from typing import Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from plant_emulator.replay import PlantReplay, PlantReplayed, why_not
-from protocol.messages import Contract
-from protocol.topics import Address
-from protocol.trace import ENDS, Batch, End, Sent, read_batch
-from protocol.wire import SignalSpec
-from service.config import Settings, from_contract, load_over
-from service.controller import Codes
-from service.figures import added, squares
-from service.logs.codes import codes_in, frames_of, levels
-from service.logs.evaluate import Evaluator, held_codes
-from service.logs.files import Progress, ReviewError
-from service.logs.report import Array
-from service.logs.runs import Block, Join, Run, Taker
-from service.logs.traces import Source, Which
+from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
+from aeroloop.protocol.messages.models import Contract
+from aeroloop.protocol.messages.topics import Address
+from aeroloop.protocol.messages.trace import ENDS, Batch, End, Sent, read_batch
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.config import Settings, from_contract, load_over
+from aeroloop.service.control.controller import Codes
+from aeroloop.service.figures import added, squares
+from aeroloop.service.logs.codes import codes_in, frames_of, levels
+from aeroloop.service.logs.evaluate import Evaluator, held_codes
+from aeroloop.service.logs.files import Progress, ReviewError
+from aeroloop.service.logs.runs import Block, Join, Run, Taker
+from aeroloop.service.logs.traces import Array, Source, Which
 
 _NOT_ASKED: Final = "only the other end was replayed"
 

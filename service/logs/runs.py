@@ -16,11 +16,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.topics import Address
-from protocol.trace import NEVER, End, Header, Outcome, Received, join_columns
-from protocol.verbs import Change
-from service.logs.files import LogFiles, Progress, ReviewError
-from service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, TraceIndex, Which
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.topics import Address
+from aeroloop.protocol.messages.trace import NEVER, End, Header, Outcome, Received, join_columns
+from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
+from aeroloop.service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, TraceIndex, Which
 
 BLOCK: Final = 4096
 """Ticks of a block, about: numpy is quick with so many, and they stay in the cache."""

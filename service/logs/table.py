@@ -14,8 +14,8 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.wire import WireSpec
-from service.logs.ticks import Ticks
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.logs.ticks import Ticks
 
 Array = npt.NDArray[Any]
 Kind = Literal["double", "int64", "int8", "bool", "text"]
@@ -158,7 +158,7 @@ def groups(wire: WireSpec, period: float) -> list[Group]:
 
 
 def euler_deg(q: Array) -> Array:
-    """Roll, pitch and yaw in degrees as `protocol.attitude.to_euler` has them. Shape (n, 4) to (n, 3)."""
+    """Roll, pitch and yaw in degrees as `aeroloop.protocol.wire.attitude.to_euler` has them. Shape (n, 4) to (n, 3)."""
     w, x, y, z = q.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))

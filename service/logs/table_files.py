@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from protocol.errors import AeroloopError
-from service.logs.table import Array, Group, Rows
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.logs.table import Array, Group, Rows
 
 MAT_LIMIT: Final = 2**31 - 1
 """Bytes that a variable of a MATLAB v5 file may have."""

@@ -11,16 +11,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.trace import Received, Sent
-from service.config import Settings
-from service.controller import Codes
-from service.logs.clocks import ClockOffset
-from service.logs.codes import codes_in, levels
-from service.logs.evaluate import Evaluator, Used, held_codes
-from service.logs.report import Array
-from service.logs.runs import Block, Rows
-from service.logs.ticks import Ticks
-from service.logs.traces import Integers
+from aeroloop.protocol.messages.trace import Received, Sent
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Codes
+from aeroloop.service.logs.clocks import ClockOffset
+from aeroloop.service.logs.codes import codes_in, levels
+from aeroloop.service.logs.evaluate import Evaluator, Used, held_codes
+from aeroloop.service.logs.runs import Block, Rows
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.traces import Array, Integers
 
 Flags = npt.NDArray[np.bool_]
 

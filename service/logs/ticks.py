@@ -8,8 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from service.logs.report import Array
-from service.logs.traces import Integers
+from aeroloop.service.logs.traces import Array, Integers
 
 
 class Ticks(NamedTuple):

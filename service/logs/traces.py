@@ -17,8 +17,18 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from protocol.trace import HEADER_BYTES, NEVER, End, Header, Received, Tail, batch_bytes, read_header, row_dtype
-from protocol.verbs import Change
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import (
+    HEADER_BYTES,
+    NEVER,
+    End,
+    Header,
+    Received,
+    Tail,
+    batch_bytes,
+    read_header,
+    row_dtype,
+)
 
 Which = tuple[str, str]
 """A vehicle and a session."""
@@ -31,6 +41,7 @@ NO_TICK: Final = -1
 _SESSION_TICK, _ANSWERED = (row_dtype("plant", 1, 1, 2).fields[name][1] for name in ("session_tick", "answered"))  # type: ignore[index]  # it has fields
 """Bytes of a row before these columns, whatever the frames' sizes."""
 
+Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 

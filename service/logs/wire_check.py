@@ -11,11 +11,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from protocol.topics import Address
-from protocol.trace import Sent
-from protocol.wire import WireSpec
-from service.logs.runs import Block, Rows, Taker
-from service.logs.traces import Integers, Which
+from aeroloop.protocol.messages.topics import Address
+from aeroloop.protocol.messages.trace import Sent
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.logs.runs import Block, Rows, Taker
+from aeroloop.service.logs.traces import Integers, Which
 
 
 class WireCheck:

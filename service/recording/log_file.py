@@ -14,13 +14,13 @@ from typing import Final
 
 from mcap.writer import Writer
 
-from protocol import topics
-from protocol.host import versions
-from protocol.messages import model_of
-from protocol.publication import Delivery
-from service.logs.decoded import Decoded
-from service.logs.mcap_file import CHUNK_BYTES
-from service.logs.schemas import Shape, json_shape
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import model_of
+from aeroloop.protocol.runtime.host_facts import versions
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES
+from aeroloop.service.viewers.channels import Decoded
+from aeroloop.service.viewers.schemas import Shape, json_shape
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
 TRACE_ENCODING: Final = "x-aeroloop-trace"

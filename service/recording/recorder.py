@@ -17,16 +17,16 @@ from typing import Final, Literal
 
 from pydantic import ValidationError
 
-from protocol import topics
-from protocol.messages import Contract, Loss, Status
-from protocol.publication import Delivery
-from protocol.role import Role
-from protocol.trace import read_batch
-from service.logs.decoded import Decoded, Decoder
-from service.recording.backlog import Backlog
-from service.recording.rolling import RollingLog
-from service.recording.subscriptions import Subscriptions
-from service.settings import RecorderSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Contract, Loss, Status
+from aeroloop.protocol.messages.trace import read_batch
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.recording.backlog import Backlog
+from aeroloop.service.recording.rolling import RollingLog
+from aeroloop.service.recording.subscriptions import Subscriptions
+from aeroloop.service.settings import RecorderSettings
+from aeroloop.service.viewers.channels import Decoded, Decoder
 
 WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""

@@ -18,13 +18,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from protocol.errors import AeroloopError
-from protocol.publication import Delivery
-from protocol.verbs import Change
-from service.logs.decoded import Decoded
-from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA, RECORDER_METADATA, opening
-from service.recording.log_file import LogFile
-from service.settings import RecorderSettings
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA, RECORDER_METADATA, opening
+from aeroloop.service.recording.log_file import LogFile
+from aeroloop.service.settings import RecorderSettings
+from aeroloop.service.viewers.channels import Decoded
 
 RETRY_S: Final = 1.0
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)

@@ -15,8 +15,8 @@ from typing import Final, Literal, NamedTuple
 import zenoh
 from zenoh.handlers import RingChannel
 
-from protocol import topics
-from protocol.publication import WAITING, Delivery, RecoveringSubscriber, read_sample
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.publication import WAITING, Delivery, RecoveringSubscriber, read_sample
 
 _MASK: Final = 0xFFFF_FFFF
 """Publishers' numbers have 32 bits and begin again at 0."""

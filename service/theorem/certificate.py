@@ -19,13 +19,13 @@ from typing import Any, Final, get_type_hints
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.verbs import Reference
-from protocol.wire import SignalSpec, WireSpec
-from service.law import LawSettings
-from service.settings import ControllerSettings
-from service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
-from service.theorem.extremes import Extremes, extremes
-from service.theorem.remedies import Remedy, remedies
+from aeroloop.protocol.messages.operator import Reference
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.settings import ControllerSettings
+from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
+from aeroloop.service.theorem.extremes import Extremes, extremes
+from aeroloop.service.theorem.remedies import Remedy, remedies
 
 _ROUNDS: Final = 500
 _AGREED: Final = 1e-9

@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from protocol.errors import AeroloopError
-from protocol.verbs import Reference, Stream
-from service.reference import Angles, Floats, Plan
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import Reference, Stream
+from aeroloop.service.control.reference import Angles, Floats, Plan
 
 _SLACK: Final = 1.005
 

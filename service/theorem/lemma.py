@@ -18,8 +18,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from service.law import LawSettings
-from service.theorem.bounds import Known, Lemma
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.theorem.bounds import Known, Lemma
 
 Floats: TypeAlias = NDArray[np.float64]
 

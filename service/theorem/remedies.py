@@ -13,10 +13,10 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.quantizer import MAX_BITS, MIN_BITS
-from protocol.verbs import MAX_GAIN
-from protocol.wire import WireSpec
-from service.law import LawSettings
+from aeroloop.protocol.messages.operator import MAX_GAIN
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.law import LawSettings
 
 Holds = Callable[[WireSpec, LawSettings], bool]
 

@@ -21,11 +21,11 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from protocol import topics
-from protocol.network import join
-from protocol.publication import CachedPublisher
-from service.bench import Bench, free_rendezvous
-from service.config import Settings, load
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.service.config import Settings, load
+from aeroloop.service.testing.process_group import Bench, free_rendezvous
 from tests.service.recording.ends import VEHICLE, Ends, contract_of
 
 LOOP_S = 20.0

@@ -14,9 +14,9 @@ from time import process_time
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from service.config import load
-from service.logs.replay import EndReplay, replay
-from service.logs.review import review
+from aeroloop.service.config import load
+from aeroloop.service.logs.replay import EndReplay, replay
+from aeroloop.service.review.review import review
 from tests.service.logs.made_log import make_log
 
 ROUNDS = 3

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant_trace import PlantTrace
-from plant_emulator.settings import PlantSettings
-from protocol.clock import LoopSettings
-from protocol.links import Arrival
-from protocol.messages import Claim
-from protocol.verbs import Sinusoid
-from protocol.wire import WireSpec
-from service.controller import Controller
-from service.law import LawSettings
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Claim
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.law import LawSettings
 from tests.service import numpy_twin as twin
 from tests.service.twin_body import body_of
 

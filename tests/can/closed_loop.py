@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from threading import Event, Thread
 
-from plant_emulator.can_node import CanFront
-from plant_emulator.emulator import Emulator
-from protocol.can_link import HEARTBEAT_S, CanLink, CanSettings, Heartbeat, fingerprint
-from protocol.states import PlantState
-from protocol.transmit import SILENCE
-from service.config import Settings
-from service.controller import Controller
-from service.figures import Figures, Score
+from aeroloop.plant_emulator.hosts.can_node import CanFront
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.transport.can_link import HEARTBEAT_S, CanLink, CanSettings, Heartbeat, fingerprint
+from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.figures import Figures, Score
 
 PATIENCE_S = 20.0
 

@@ -11,5 +11,5 @@ from tests.can.in_process import Flaws
 def flaws(monkeypatch: pytest.MonkeyPatch) -> Flaws:
     """Every link that is opened from now on is on a virtual bus that fails as they say."""
     flaws = Flaws()
-    monkeypatch.setattr("protocol.can_link.can.Bus", flaws.bus)
+    monkeypatch.setattr("aeroloop.protocol.transport.can_link.can.Bus", flaws.bus)
     return flaws

@@ -14,8 +14,14 @@ from typing import Any, Self
 import can
 from can.interfaces.virtual import VirtualBus
 
-from protocol.can_link import CONTROLLER_HEARTBEAT_ID, PLANT_HEARTBEAT_ID, CanLink, CanSettings, Heartbeat
-from protocol.states import PlantState
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.transport.can_link import (
+    CONTROLLER_HEARTBEAT_ID,
+    PLANT_HEARTBEAT_ID,
+    CanLink,
+    CanSettings,
+    Heartbeat,
+)
 from tests.protocol.gathering import PATIENCE_S, eventually
 
 

@@ -13,17 +13,17 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from plant_emulator.can_bridge import Bridge
-from plant_emulator.settings import PlantSettings
-from protocol import topics
-from protocol.can_link import CanLink, Heartbeat, fingerprint, number_of
-from protocol.clock import LoopSettings
-from protocol.messages import Claim, Event, Grant, Refusal, Release
-from protocol.role import Role
-from protocol.states import PlantState, TripCause
-from protocol.trace import Batch, Outcome, read_batch
-from protocol.verbs import Answer, Ask
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.hosts.can_bridge import Bridge
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release
+from aeroloop.protocol.messages.operator import Answer, Ask
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.can_link import CanLink, Heartbeat, fingerprint, number_of
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
 from tests.can.in_process import virtual
 from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
 

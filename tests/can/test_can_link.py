@@ -17,7 +17,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.can_link import (
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_link import (
     COMMAND_ID,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
@@ -29,9 +30,8 @@ from protocol.can_link import (
     fingerprint,
     number_of,
 )
-from protocol.quantizer import MAX_BITS, MIN_BITS
-from protocol.states import PlantState, TripCause
-from protocol.wire import WireSpec
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import WireSpec
 from tests.can.in_process import Flaws, Stranger, virtual
 from tests.protocol.gathering import PATIENCE_S, eventually
 

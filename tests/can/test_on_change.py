@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from plant_emulator.can_bridge import Relay
-from plant_emulator.can_node import CanFront
-from plant_emulator.endpoint import Endpoint
-from protocol.can_link import COMMAND_ID, MEASUREMENT_ID, CanLink
-from protocol.clock import LoopSettings
-from protocol.messages import Claim, Grant
-from protocol.states import PlantState
-from protocol.transmit import SILENCE, Policy, Transmit
-from protocol.wire import WireSpec
-from service.config import load
-from service.hil import Hil
-from service.lab.experiment import run_experiment
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.can_bridge import Relay
+from aeroloop.plant_emulator.hosts.can_node import CanFront
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.transport.can_link import COMMAND_ID, MEASUREMENT_ID, CanLink
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
+from aeroloop.service.config import load
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.testing.hil import Hil
 from tests.can.closed_loop import PATIENCE_S, run_on_bus
 from tests.can.in_process import Stranger, virtual
 from tests.can.test_relay import FIRST_MEASUREMENT_NS, NOW, PERIOD_NS, WATCHDOG_NS, Still, command, measurement
@@ -41,7 +41,7 @@ BOTH = wire_of("on_change", "on_change")
 def test_in_lockstep_the_figures_over_a_bus_are_those_of_the_experiment(
     measurement: Policy, command: Policy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plant_emulator.can_node.SILENT_S", PATIENCE_S)  # a slow machine is no silent peer
+    monkeypatch.setattr(CanLink, "silent", False)  # a slow machine is no silent peer
     settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
     settings = settings.model_copy(update={"wire": wire_of(measurement, command)})
     direct = run_experiment(settings, 0.5)

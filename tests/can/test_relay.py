@@ -13,12 +13,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant_emulator.can_bridge import Relay
-from plant_emulator.can_node import CanFront
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant import Measurement, Plant
-from protocol.attitude import IDENTITY
-from protocol.can_link import (
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.can_bridge import Relay
+from aeroloop.plant_emulator.hosts.can_node import CanFront
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.transport.can_link import (
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     CanLink,
@@ -26,11 +28,9 @@ from protocol.can_link import (
     Heartbeat,
     fingerprint,
 )
-from protocol.clock import LoopSettings
-from protocol.messages import Claim, Grant, Refusal
-from protocol.states import PlantState, TripCause
-from protocol.trace import Outcome
-from protocol.wire import WireSpec
+from aeroloop.protocol.wire.attitude import IDENTITY
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
 from tests.can.in_process import Flaws, Stranger, virtual
 from tests.protocol.gathering import PATIENCE_S
 
@@ -487,7 +487,7 @@ def hasty_bus() -> Iterator[Bus]:
 @pytest.fixture
 def bus(hasty_bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Bus:
     """The same, where half a second in which this test is kept waiting does not end a session that is to go on."""
-    monkeypatch.setattr("plant_emulator.can_node.SILENT_S", PATIENCE_S)
+    monkeypatch.setattr(CanLink, "silent", False)
     return hasty_bus
 
 

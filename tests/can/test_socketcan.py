@@ -12,11 +12,11 @@ from pathlib import Path
 import can
 import pytest
 
-from protocol.can_link import CanLink, CanSettings, Heartbeat
-from protocol.states import PlantState, TripCause
-from protocol.wire import WireSpec
-from service.config import load
-from service.lab.experiment import run_experiment
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_link import CanLink, CanSettings, Heartbeat
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.config import load
+from aeroloop.service.lab.experiment import run_experiment
 from tests.can.closed_loop import run_on_bus
 from tests.can.in_process import virtual
 from tests.can.kernel import NoSocketCan, run_with_socketcan, vcan_is_up
@@ -52,7 +52,7 @@ def assert_the_loop_is_the_experiment(
     bus: CanSettings, wire: WireSpec, duration_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Figures to the last bit. Nothing here depends on real time: a slow machine is no silent peer."""
-    monkeypatch.setattr("plant_emulator.can_node.SILENT_S", PATIENCE_S)
+    monkeypatch.setattr(CanLink, "silent", False)
     settings = load(overrides=["loop.lockstep=true", f"plant.answer_timeout_s={PATIENCE_S}"])
     settings = settings.model_copy(update={"wire": wire})
     assert run_on_bus(bus, settings, duration_s).model_dump(exclude={"reasons"}) == run_experiment(

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from protocol.trace import End
-from service.bench import Bench, free_rendezvous
-from service.config import load
-from service.hil import HilLog
+from aeroloop.protocol.messages.trace import End
+from aeroloop.service.config import load
+from aeroloop.service.testing.hil import HilLog
+from aeroloop.service.testing.process_group import Bench, free_rendezvous
 from tests.hil.test_processes import eventually
 from tests.hil.test_recorder import PATIENT, RATE, Statuses, assert_whole
 

@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from protocol import topics
-from protocol.messages import Event, Truth
-from protocol.network import NetworkSettings, join
-from service.bench import free_rendezvous
-from service.hil import Hil, HilLog
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Truth
+from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.service.testing.hil import Hil, HilLog
+from aeroloop.service.testing.process_group import free_rendezvous
 from tests.hil.cable import Cable
 
-AEROLOOP = [sys.executable, "-m", "service.cli"]
+AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 WATCHDOG_S = 0.1
 SLACK_S = 0.15
 """For a loop that other work on the machine keeps waiting: it must run to notice anything."""
@@ -324,8 +324,8 @@ def test_commands_that_are_late_for_good_are_refused_although_their_echo_looks_f
 
 @pytest.mark.parametrize("fault", ["rate:noise=0.1@0.5", "attitude:drop=0.1@0.5", "motors:garble=0.05@0.5"])
 def test_a_fault_does_over_the_network_what_it_does_in_one_process(lockstep: Hil, fault: str) -> None:
-    from service.config import load
-    from service.lab.experiment import run_experiment
+    from aeroloop.service.config import load
+    from aeroloop.service.lab.experiment import run_experiment
 
     lockstep.start(settings={"plant.faults": [fault]})
     lockstep.run(2)

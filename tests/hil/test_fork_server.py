@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from service.bench import free_rendezvous
-from service.fork_server import ForkedProcess, fork_server
+from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
+from aeroloop.service.testing.process_group import free_rendezvous
 
 PATIENCE_S = 20.0
 """For what takes a tenth of a second here, or two where the server must be started first; CI may have other work."""
@@ -64,7 +64,7 @@ def test_a_signal_ends_it_with_the_code_that_a_child_of_this_process_would_have(
 
 ORPHANS = """
 import os, time
-from service.fork_server import fork_server
+from aeroloop.service.testing.fork_server import fork_server
 server = fork_server()
 words = ["can-node", f"--with-parent={server.pid}", "--set", "can.options.hop_limit=0"]
 with open(os.devnull) as null:

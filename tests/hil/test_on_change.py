@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import pytest
 
-from protocol.messages import Event, Status
-from service.cli import execute
-from service.figures import Figures
-from service.hil import Hil, HilLog
-from service.logs.replay import replay
-from service.logs.review import read, review
-from service.logs.ticks import Ticks
+from aeroloop.protocol.messages.models import Event, Status
+from aeroloop.service.cli.main import execute
+from aeroloop.service.figures import Figures
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.review import read, review
+from aeroloop.service.testing.hil import Hil, HilLog
 from tests.hil.test_faults import PATIENT, SLACK_S, TOLD, WATCHDOG_S, last_command_ns, seconds_driven_after
 from tests.hil.test_operate import done
 from tests.hil.test_processes import FIGURES, aeroloop

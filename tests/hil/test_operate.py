@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol import topics
-from protocol.attitude import to_euler
-from protocol.messages import Event, Telemetry, Truth
-from protocol.verbs import Setpoint
-from service.hil import Hil
-from service.logs.review import read
-from service.logs.ticks import Ticks
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Telemetry, Truth
+from aeroloop.protocol.messages.operator import Setpoint
+from aeroloop.protocol.wire.attitude import to_euler
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.review import read
+from aeroloop.service.testing.hil import Hil
 from tests.hil.test_faults import PATIENT
 
-AEROLOOP = [sys.executable, "-m", "service.cli"]
+AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 
 
 def op(hil: Hil, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -20,16 +20,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Channel
 
-from protocol import topics
-from protocol.messages import Event, Truth
-from service.bench import Bench, free_rendezvous
-from service.config import load
-from service.hil import HilLog
-from service.logs.files import ReviewError
-from service.logs.mcap_file import records
-from service.logs.review import review
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Truth
+from aeroloop.service.config import load
+from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.mcap_file import records
+from aeroloop.service.review.review import review
+from aeroloop.service.testing.hil import HilLog
+from aeroloop.service.testing.process_group import Bench, free_rendezvous
 
-AEROLOOP = [sys.executable, "-m", "service.cli"]
+AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 FIGURES = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command")
 
 START_S = 30.0

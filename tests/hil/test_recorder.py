@@ -17,15 +17,15 @@ from typing import Any
 
 import pytest
 
-from protocol.messages import Status
-from protocol.topics import key
-from service.bench import Bench, free_rendezvous
-from service.config import Settings, load
-from service.hil import Hil
-from service.logs.files import LogFiles
-from service.logs.replay import replay
-from service.logs.report import Findings
-from service.logs.review import read, review
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.messages.topics import key
+from aeroloop.service.config import Settings, load
+from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.review.report import Findings
+from aeroloop.service.review.review import read, review
+from aeroloop.service.testing.hil import Hil
+from aeroloop.service.testing.process_group import Bench, free_rendezvous
 from tests.hil.cable import Cable
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
 from tests.protocol.gathering import free_port

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.bench import free_rendezvous
-from service.cli import execute as run
-from service.units import UNITS
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.host.units import UNITS
+from aeroloop.service.testing.process_group import free_rendezvous
 
 
 def test_a_daemon_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(tmp_path: Path) -> None:
@@ -21,7 +21,7 @@ def test_a_daemon_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(path))
         manager.settimeout(30)  # a process starts within about a second; CI may be busy
-        command = [sys.executable, "-m", "service.cli", "emulator", "--log-format", "json"]
+        command = [sys.executable, "-P", "-m", "aeroloop", "emulator", "--log-format", "json"]
         daemon = subprocess.Popen(
             [*command, "--set", f"network.rendezvous={free_rendezvous()}"],
             env={**os.environ, "NOTIFY_SOCKET": str(path)},
@@ -62,7 +62,7 @@ def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, t
     config = tmp_path / "aeroloop.toml"
     config.write_text('[network]\nrendezvous = ""\nlisten = ["tcp/192.0.2.1:1"]\n')  # an address that is not ours
     arguments = start.replace("/etc/aeroloop/aeroloop.toml", str(config)).replace("%L", str(tmp_path)).split()[1:]
-    command = [sys.executable, "-m", "service.cli", *arguments]
+    command = [sys.executable, "-P", "-m", "aeroloop", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
     assert "cannot listen on tcp/192.0.2.1:1" in done.stderr

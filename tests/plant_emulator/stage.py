@@ -12,17 +12,17 @@ from collections import deque
 from collections.abc import Callable
 from unittest.mock import patch
 
-from plant_emulator.driver import Driver
-from plant_emulator.emulator import Emulator
-from plant_emulator.front import Front
-from plant_emulator.plant_trace import PlantTrace
-from plant_emulator.settings import PlantSettings
-from protocol.clock import LoopSettings
-from protocol.links import Arrival, Link
-from protocol.messages import Claim, Grant, Refusal
-from protocol.trace import Batch, read_batch
-from protocol.transmit import SILENCE
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal
+from aeroloop.protocol.messages.trace import Batch, read_batch
+from aeroloop.protocol.transport.link import Arrival, Link
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
 
 RUN = 0x0123_4567_89AB_CDEF
 
@@ -126,9 +126,9 @@ class Stage(Front):
         """Run so many ticks of the plant, and leave."""
         self._ends = ticks
         with (
-            patch("plant_emulator.driver.TickGrid", lambda _: Grid(self._skip)),
-            patch("plant_emulator.driver.prepare_process", lambda _: []),
-            patch("plant_emulator.driver.IDLE_WAIT_S", 0.0),
+            patch("aeroloop.plant_emulator.hosts.driver.TickGrid", lambda _: Grid(self._skip)),
+            patch("aeroloop.plant_emulator.hosts.driver.prepare_process", lambda _: []),
+            patch("aeroloop.plant_emulator.hosts.driver.IDLE_WAIT_S", 0.0),
         ):
             self.driver.run(self)
         return self

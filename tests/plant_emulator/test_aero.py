@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from plant_emulator.aero import Aero, AeroSettings, aero_dynamics
-from plant_emulator.emulated import EmulatedPlant
-from plant_emulator.sensors import Sensors
-from plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS
-from plant_emulator.wind import Wind, WindSettings
+from aeroloop.plant_emulator.model.aero import Aero, AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
+from aeroloop.plant_emulator.model.sensors import Sensors
+from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS
 
 LOSSLESS = AeroSettings(damping=(0.0, 0.0, 0.0), inertia=(0.01, 0.02, 0.03), centre_of_mass=(0.001, 0.002, -0.0038))
 """At 0 V it keeps its energy. J_x and J_z differ, which the paper's do not: that couples pitch and yaw."""

@@ -6,14 +6,14 @@ import threading
 
 import pytest
 
-from plant_emulator import driver
-from plant_emulator.driver import Driver
-from plant_emulator.front import Front
-from plant_emulator.settings import PlantSettings
-from protocol.clock import LoopSettings
-from protocol.links import Arrival, Link
-from protocol.messages import Claim, Grant
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.hosts import driver
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.transport.link import Arrival, Link
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
 
 LOOP = LoopSettings(realtime="off")
 CLAIMED_AT, HELD_UP, ENDS = 3, 5, 20

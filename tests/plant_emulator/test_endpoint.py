@@ -11,12 +11,12 @@ from math import inf, isnan, nan
 
 import pytest
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant import Measurement, Plant
-from protocol.attitude import IDENTITY, Vector
-from protocol.messages import PROTOCOL_VERSION, Claim, Grant, Refusal
-from protocol.states import PlantState, TripCause
-from protocol.wire import SignalSpec, WireSpec
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Grant, Refusal
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.wire.attitude import IDENTITY, Vector
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 WIRE = WireSpec()
 COUNTERS = WIRE.measurement.counters

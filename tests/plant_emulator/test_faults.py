@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.faults import SIGNALS, Fault
-from plant_emulator.faulty import GARBLED_RATE, FaultyPlant
-from plant_emulator.faulty_stream import FaultyStream
-from plant_emulator.limits import Guard, LimitSettings
-from plant_emulator.plant import Measurement, Plant
-from protocol.attitude import IDENTITY, Quaternion, Vector
-from protocol.messages import Claim, Grant
-from protocol.states import PlantState
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
+from aeroloop.plant_emulator.faults.language import SIGNALS, Fault
+from aeroloop.plant_emulator.faults.signals import GARBLED_RATE, FaultyPlant
+from aeroloop.plant_emulator.faults.streams import FaultyStream
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
+from aeroloop.protocol.wire.spec import WireSpec
 
 PERIOD = 0.1
 LIMIT = 24.0

@@ -8,11 +8,11 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant_emulator.endpoint import Endpoint
-from protocol.messages import Claim, Grant
-from protocol.states import TripCause
-from protocol.trace import Outcome
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.wire.spec import WireSpec
 from tests.plant_emulator.test_endpoint import OFF, Notebook
 
 PERIOD_NS = 2_000_000

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import settings, strategies
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.limits import Guard, LimitSettings
-from plant_emulator.plant import Measurement, Plant
-from protocol.attitude import IDENTITY
-from protocol.frames import DEFAULT_COUNTER_BITS
-from protocol.messages import Claim, Grant, Refusal
-from protocol.states import PlantState
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.wire.attitude import IDENTITY
+from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
+from aeroloop.protocol.wire.spec import WireSpec
 
 COUNTERS = 1 << DEFAULT_COUNTER_BITS
 

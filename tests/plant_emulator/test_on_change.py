@@ -9,13 +9,13 @@ from math import nan
 
 import pytest
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant import Measurement
-from protocol.attitude import IDENTITY, Vector
-from protocol.messages import Claim, Grant
-from protocol.states import PlantState, TripCause
-from protocol.transmit import SILENCE, Policy, Transmit
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.wire.attitude import IDENTITY, Vector
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
 from tests.plant_emulator.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, Notebook
 
 HEARTBEAT = 15

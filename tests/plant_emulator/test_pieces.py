@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from plant_emulator.aero import Aero, AeroSettings, aero_dynamics
-from plant_emulator.emulated import EmulatedPlant, step_function
-from plant_emulator.friction import FrictionSettings, friction_torque
-from plant_emulator.plant import Measurement, State
-from plant_emulator.rigid_body import RigidBody, RigidBodySettings
-from plant_emulator.rotor import RotorSettings, rotor_derivative, thrust_voltage
-from plant_emulator.sensors import FilteredDerivative, Sensors, SensorSettings
-from plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
-from plant_emulator.wind import Wind, WindSettings
-from protocol.attitude import IDENTITY, Quaternion, Vector
+from aeroloop.plant_emulator.model.aero import Aero, AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant, step_function
+from aeroloop.plant_emulator.model.friction import FrictionSettings, friction_torque
+from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
+from aeroloop.plant_emulator.model.rotor import RotorSettings, rotor_derivative, thrust_voltage
+from aeroloop.plant_emulator.model.sensors import FilteredDerivative, Sensors, SensorSettings
+from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.plant import Measurement, State
+from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import threading
 
-from plant_emulator.emulator import EmulatorOnZenoh
-from plant_emulator.replay import PlantReplay, PlantReplayed
-from plant_emulator.settings import PlantSettings
-from protocol import topics
-from protocol.clock import LoopSettings
-from protocol.links import ZenohLink
-from protocol.messages import Claim, Grant, Release
-from protocol.publication import RecoveringSubscriber
-from protocol.role import Role
-from protocol.trace import Batch, Outcome, read_batch
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
+from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Claim, Grant, Release
+from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.link import ZenohLink
+from aeroloop.protocol.transport.publication import RecoveringSubscriber
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
 from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
 
 WIRE = WireSpec()

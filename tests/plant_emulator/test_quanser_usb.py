@@ -17,23 +17,26 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from plant_emulator import quanser_fake, quanser_interface, quanser_usb
-from plant_emulator.emulated import EmulatedPlant
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant import Measurement, Plant
-from plant_emulator.quanser_fake import BufferOverflowMode, FakeQuanser, HILError, MisuseError
-from plant_emulator.quanser_interface import Hardware, QuanserError
-from plant_emulator.quanser_usb import COLOURS, QuanserPlant, QuanserSettings
-from plant_emulator.sensors import FilteredDerivative, SensorSettings
-from plant_emulator.settings import PlantSettings
-from plant_emulator.wind import WindSettings
-from protocol.attitude import IDENTITY
-from protocol.messages import Claim, Grant
-from protocol.states import PlantState
-from service.config import Settings, with_bits
-from service.controller import Controller
-from service.figures import Score
-from service.lab.experiment import run_experiment
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.quanser import fake as quanser_fake
+from aeroloop.plant_emulator.hosts.quanser import interface as quanser_interface
+from aeroloop.plant_emulator.hosts.quanser import usb as quanser_usb
+from aeroloop.plant_emulator.hosts.quanser.fake import BufferOverflowMode, FakeQuanser, HILError, MisuseError
+from aeroloop.plant_emulator.hosts.quanser.interface import Hardware, QuanserError
+from aeroloop.plant_emulator.hosts.quanser.usb import COLOURS, QuanserPlant
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
+from aeroloop.plant_emulator.model.sensors import FilteredDerivative, SensorSettings
+from aeroloop.plant_emulator.model.wind import WindSettings
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.quanser_settings import QuanserSettings
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.wire.attitude import IDENTITY
+from aeroloop.service.config import Settings, with_bits
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.figures import Score
+from aeroloop.service.lab.experiment import run_experiment
 
 PERIOD = 0.002
 PERIOD_NS = 2_000_000

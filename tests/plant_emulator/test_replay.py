@@ -14,16 +14,16 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from plant_emulator.emulator import Emulator
-from plant_emulator.faults import Fault
-from plant_emulator.replay import PlantReplay, PlantReplayed, why_not
-from plant_emulator.settings import PlantSettings
-from plant_emulator.wind import WindSettings
-from protocol.clock import LoopSettings
-from protocol.states import TripCause
-from protocol.trace import Batch, OperationKind, Outcome
-from protocol.transmit import SILENCE, Transmit
-from protocol.wire import SignalSpec, WireSpec
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
+from aeroloop.plant_emulator.model.wind import WindSettings
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import Batch, OperationKind, Outcome
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Transmit
 from tests.plant_emulator.stage import Stage
 
 TICKS = 400

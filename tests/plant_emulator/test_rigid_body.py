@@ -13,12 +13,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from plant_emulator.aero import AeroSettings, aero_dynamics
-from plant_emulator.emulated import EmulatedPlant
-from plant_emulator.friction import FrictionSettings
-from plant_emulator.rigid_body import RigidBody, RigidBodySettings
-from plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
-from plant_emulator.wind import WindSettings
+from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
+from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
+from aeroloop.plant_emulator.model.wind import WindSettings
+from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 

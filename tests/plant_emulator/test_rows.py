@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from plant_emulator.emulator import Emulator
-from plant_emulator.faults import Fault
-from plant_emulator.settings import PlantSettings
-from protocol.clock import LoopSettings
-from protocol.publication import KEPT_S
-from protocol.states import TripCause
-from protocol.trace import MAX_ROWS, Batch, Operation, Outcome, Sent, batches_per_s
-from protocol.transmit import SILENCE, Transmit
-from protocol.wire import WireSpec
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Operation, Outcome, Sent, batches_per_s
+from aeroloop.protocol.transport.publication import KEPT_S
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Transmit
 from tests.plant_emulator.stage import RUN, Stage
 
 LOOP = LoopSettings(realtime="off", trace_s=10)

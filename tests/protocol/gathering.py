@@ -10,7 +10,7 @@ from typing import Self
 
 import zenoh
 
-from protocol.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import NetworkSettings, join
 
 PATIENCE_S = 20.0
 """How long to wait for what takes milliseconds: a shared machine can keep a process waiting."""

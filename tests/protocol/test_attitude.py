@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from protocol import attitude
-from protocol.attitude import IDENTITY, Quaternion, Vector, received_quaternion, sent_vector, to_euler
-from protocol.quantizer import UniformQuantizer
+from aeroloop.protocol.wire import attitude
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector, received_quaternion, sent_vector, to_euler
+from aeroloop.protocol.wire.quantizer import UniformQuantizer
 
 Array: TypeAlias = NDArray[np.float64]
 

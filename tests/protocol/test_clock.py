@@ -17,16 +17,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from protocol import clock
-from protocol.clock import (
-    Histogram,
-    LoopSettings,
-    LoopTiming,
-    RealtimeError,
-    RollingHistogram,
-    TickGrid,
-    prepare_process,
-)
+from aeroloop.protocol.runtime import tick_grid, timing
+from aeroloop.protocol.runtime.realtime import RealtimeError, prepare_process
+from aeroloop.protocol.runtime.tick_grid import TickGrid
+from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram
+from aeroloop.protocol.wire.loop import LoopSettings
 
 START = 123_456_789_012_345
 PERIOD = 2_000_000
@@ -55,7 +50,8 @@ class FakeTime:
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
     """The fake clock in place of the module's `time`."""
     time = FakeTime()
-    monkeypatch.setattr(clock, "time", time)
+    for module in (tick_grid, timing):
+        monkeypatch.setattr(module, "time", time)
     return time
 
 
@@ -233,7 +229,8 @@ def test_a_histogram_is_of_fixed_size_however_long_it_runs() -> None:
 
 PREPARED = """
 import ctypes, gc, json, os
-from protocol.clock import LoopSettings, prepare_process
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.wire.loop import LoopSettings
 refused = prepare_process(LoopSettings())
 slack = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK [ns]
 print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, os.sched_getscheduler(0) == os.SCHED_FIFO]))

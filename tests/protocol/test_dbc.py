@@ -1,6 +1,6 @@
 """The DBC, read back by cantools, tells of every code in every frame what `protocol` itself would tell.
 
-Frames are packed by `protocol.frames` and padded to the CAN payload's length here; cantools knows nothing but the text.
+Frames are packed by frames.py and padded to the CAN payload's length here; cantools knows nothing but the text.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from cantools.database.can import Database, Message, Signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.can_link import Heartbeat, number_of
-from protocol.dbc import dbc
-from protocol.frames import FrameFormat
-from protocol.quantizer import UniformQuantizer
-from protocol.states import PlantState, TripCause
-from protocol.wire import SignalSpec, WireSpec
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_link import Heartbeat, number_of
+from aeroloop.protocol.transport.dbc import dbc
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.quantizer import UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from tests.protocol.test_frames import codes_of, specs
 from tests.protocol.test_spec_document import FRAME_ROWS, Row, as_bits
 

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from protocol.frames import FrameFormat, TickCounter
-from protocol.quantizer import Continuous, UniformQuantizer
-from protocol.wire import SignalSpec, WireSpec
+from aeroloop.protocol.wire.frames import FrameFormat, TickCounter
+from aeroloop.protocol.wire.quantizer import Continuous, UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 Widths = tuple[int | None, ...]
 

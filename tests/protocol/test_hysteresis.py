@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.hysteresis import HysteresisQuantizer
-from protocol.quantizer import MAX_BITS, MIN_BITS, UniformQuantizer
+from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS, UniformQuantizer
 from tests.protocol.test_quantizer import EPS, Exact
 
 within = st.floats(-1.0, 1.0)

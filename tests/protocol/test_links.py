@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-import protocol.links
-from protocol.links import Arrival, Link, Mailbox, ZenohLink
+from aeroloop.protocol.transport import link
+from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, ZenohLink
 from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
 
 
@@ -139,7 +139,7 @@ def test_of_many_frames_only_the_newest_is_given(
             if frame == b"last":
                 all_are_here.set()
 
-    monkeypatch.setattr(protocol.links, "Mailbox", Watched)
+    monkeypatch.setattr(link, "Mailbox", Watched)
     plant, controller = links(pair)
     for i in range(100):
         plant.send(bytes([i]))

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.logarithmic import MIN_LOGARITHMIC_BITS, LogarithmicQuantizer
-from protocol.quantizer import MAX_BITS, UniformQuantizer
+from aeroloop.protocol.wire.logarithmic import MIN_LOGARITHMIC_BITS, LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import MAX_BITS, UniformQuantizer
 from tests.protocol.test_quantizer import EPS
 
 DIGITS = 50

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from protocol.clock import Histogram
-from protocol.messages import (
+from aeroloop.protocol.messages.models import (
     PROTOCOL_VERSION,
     Claim,
     Contract,
@@ -25,10 +24,8 @@ from protocol.messages import (
     Telemetry,
     Timing,
     Truth,
-    summary,
 )
-from protocol.trace import Operation, Tail
-from protocol.verbs import (
+from aeroloop.protocol.messages.operator import (
     Advance,
     Answer,
     Ask,
@@ -43,7 +40,9 @@ from protocol.verbs import (
     Stream,
     Track,
 )
-from protocol.wire import SignalSpec, WireSpec
+from aeroloop.protocol.messages.trace import Operation, Tail
+from aeroloop.protocol.runtime.timing import Histogram, summary
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
 

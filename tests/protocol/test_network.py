@@ -11,7 +11,7 @@ import pytest
 import zenoh
 from pydantic import ValidationError
 
-from protocol.network import NetworkError, NetworkSettings
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings
 from tests.protocol.gathering import Gathering, accepts, eventually, free_port
 
 

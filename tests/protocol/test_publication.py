@@ -10,8 +10,8 @@ import pytest
 import zenoh
 from zenoh.handlers import RingChannel
 
-from protocol import publication
-from protocol.publication import CachedPublisher, Delivery, RecoveringSubscriber
+from aeroloop.protocol.transport import publication
+from aeroloop.protocol.transport.publication import CachedPublisher, Delivery, RecoveringSubscriber
 from tests.protocol.gathering import Gathering, eventually
 
 KEY = "aeroloop/aero/trace/plant"

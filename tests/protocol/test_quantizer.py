@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
 
 EPS = 2.0**-52
 

@@ -12,14 +12,14 @@ from typing import Final
 
 import pytest
 
-import protocol
-from protocol.frames import FrameFormat
-from protocol.messages import PROTOCOL_VERSION
-from protocol.quantizer import UniformQuantizer
-from protocol.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
-from protocol.topics import TOPICS
-from protocol.transmit import Sender, Transmit
-from protocol.wire import SignalSpec, WireSpec
+from aeroloop import protocol
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION
+from aeroloop.protocol.messages.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
+from aeroloop.protocol.messages.topics import TOPICS
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.quantizer import UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.transmit import Sender, Transmit
 
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
 

@@ -17,13 +17,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.plant import Measurement, Plant
-from protocol import clock
-from protocol.attitude import IDENTITY
-from protocol.clock import Throttle
-from protocol.messages import Claim, Grant, Refusal
-from protocol.states import (
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal
+from aeroloop.protocol.messages.states import (
     CONTROLLER_TABLE,
     PLANT_TABLE,
     ControllerState,
@@ -33,7 +30,10 @@ from protocol.states import (
     PlantTrigger,
     TripCause,
 )
-from protocol.wire import WireSpec
+from aeroloop.protocol.runtime import throttle
+from aeroloop.protocol.runtime.throttle import Throttle
+from aeroloop.protocol.wire.attitude import IDENTITY
+from aeroloop.protocol.wire.spec import WireSpec
 
 # The tables
 
@@ -429,7 +429,7 @@ class FakeTime:
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
     """The fake clock in place of the module's `time`."""
     time = FakeTime()
-    monkeypatch.setattr(clock, "time", time)
+    monkeypatch.setattr(throttle, "time", time)
     return time
 
 

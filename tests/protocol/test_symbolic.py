@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.symbolic import UNROLLED, Compiled, along_rows, buffer, in_columns
+from aeroloop.protocol.wire.symbolic import UNROLLED, Compiled, along_rows, buffer, in_columns
 
 ROWS = UNROLLED
 

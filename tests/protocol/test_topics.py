@@ -10,9 +10,9 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.messages import model_of
-from protocol.topics import FRAMES, NAME, RECORDED, TOPICS, Address, Topic, key, read_key
-from protocol.verbs import Message
+from aeroloop.protocol.messages.models import model_of
+from aeroloop.protocol.messages.operator import Message
+from aeroloop.protocol.messages.topics import FRAMES, NAME, RECORDED, TOPICS, Address, Topic, key, read_key
 
 every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS))
 

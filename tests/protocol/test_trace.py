@@ -13,10 +13,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import protocol
-from protocol.trace import HEADER_BYTES, MAX_ROWS, NEVER, End, Operation, TraceWriter, read_batch, row_dtype
-from protocol.verbs import Change, Gains
-from protocol.wire import WireSpec
+from aeroloop import protocol
+from aeroloop.protocol.messages.operator import Change, Gains
+from aeroloop.protocol.messages.trace import (
+    HEADER_BYTES,
+    MAX_ROWS,
+    NEVER,
+    End,
+    Operation,
+    TraceWriter,
+    read_batch,
+    row_dtype,
+)
+from aeroloop.protocol.wire.spec import WireSpec
 
 SPEC: Final = (Path(protocol.__file__).parent / "SPEC.md").read_text(encoding="utf-8")
 WIRE: Final = WireSpec()

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.transmit import Sender, Transmit
-from protocol.wire import WireSpec
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import Sender, Transmit
 
 PERIOD_NS = 2_000_000
 COUNTERS = 16

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.hysteresis import HysteresisQuantizer
-from protocol.logarithmic import LogarithmicQuantizer
-from protocol.quantizer import CodedQuantizer, UniformQuantizer
-from protocol.wire import Kind, SignalSpec, WireSpec
+from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
+from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import CodedQuantizer, UniformQuantizer
+from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 
-from protocol.clock import LoopSettings
-from protocol.links import Arrival, Link
-from protocol.transmit import Policy, Transmit
-from protocol.wire import WireSpec
+from aeroloop.protocol.transport.link import Arrival, Link
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import Policy, Transmit
 
 PERIOD_NS = 2_000_000
 LOOP = LoopSettings(rate_hz=500)

@@ -6,11 +6,11 @@ import threading
 
 import pytest
 
-from protocol.verbs import Gains, Hold, Reference, Sinusoid, Stream, Track
-from protocol.wire import WireSpec
-from service.assurance import UncertifiedError, gains_of
-from service.law import LawSettings
-from service.settings import ControllerSettings
+from aeroloop.protocol.messages.operator import Gains, Hold, Reference, Sinusoid, Stream, Track
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.daemon.certificate_gate import UncertifiedError, gains_of
+from aeroloop.service.settings import ControllerSettings
 from tests.service.test_live import LAW, Loop
 
 WIRE = WireSpec()

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import execute as run
-from service.config import load
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import load
 
 
 def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:

@@ -11,15 +11,15 @@ from math import cos, isnan, nan, pi, radians, sin
 import numpy as np
 import pytest
 
-from plant_emulator.endpoint import Endpoint
-from plant_emulator.settings import IDEAL_AERO, PlantSettings
-from protocol.attitude import Quaternion, Vector, sent_vector
-from protocol.frames import DEFAULT_COUNTER_BITS
-from protocol.messages import Claim, Grant
-from protocol.verbs import Sinusoid
-from protocol.wire import WireSpec
-from service.controller import Controller
-from service.law import LawSettings
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.wire.attitude import Quaternion, Vector, sent_vector
+from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.law import LawSettings
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.config import ConfigError, load
+from aeroloop.service.config import ConfigError, load
 
 
 @settings(max_examples=200, deadline=None)

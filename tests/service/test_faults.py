@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import pytest
 
-from service.config import load
-from service.figures import Figures
-from service.lab.experiment import run_experiment
+from aeroloop.service.config import load
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.experiment import run_experiment
 
 ONSET_S = 3.0
 

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from protocol.attitude import IDENTITY, Quaternion, received_quaternion
-from protocol.symbolic import Compiled
-from service.law import Law, LawSettings, build_law, law_function, law_steps, projection
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quaternion
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.control.law import Law, LawSettings, build_law, law_function, law_steps, projection
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of

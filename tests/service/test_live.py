@@ -15,12 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import clock, role, topics
-from protocol.messages import Event
-from protocol.network import NetworkSettings
-from protocol.role import Role
-from protocol.trace import TraceWriter
-from protocol.verbs import (
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.operator import (
     Answer,
     Change,
     Gains,
@@ -33,13 +30,17 @@ from protocol.verbs import (
     Stream,
     Track,
 )
-from protocol.wire import SignalSpec, WireSpec
-from service import live
-from service.assurance import Assurance
-from service.controller import Controller
-from service.law import LawSettings
-from service.live import Live
-from service.settings import ControllerSettings
+from aeroloop.protocol.messages.trace import TraceWriter
+from aeroloop.protocol.runtime import role, throttle
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.daemon import operator_changes as live
+from aeroloop.service.daemon.certificate_gate import Assurance
+from aeroloop.service.daemon.operator_changes import Live
+from aeroloop.service.settings import ControllerSettings
 
 PERIOD = 0.002
 LAW = LawSettings()
@@ -264,7 +265,7 @@ class Loop:
 def time(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
     """The fake clock in place of `time` wherever it is looked at."""
     fake = FakeTime()
-    for module in (clock, role, live):
+    for module in (throttle, role, live):
         monkeypatch.setattr(module, "time", fake)
     return fake
 
@@ -736,7 +737,7 @@ def test_from_the_logged_changes_a_fresh_controller_gives_the_same_commands_byte
 ) -> None:
     fake = FakeTime()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (clock, role, live):
+        for module in (throttle, role, live):
             patch.setattr(module, "time", fake)
         loop = Loop(configured, ControllerSettings(max_reference_rate=50.0))
         loop.begin()

@@ -19,8 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from protocol.symbolic import buffer
-from protocol.verbs import (
+from aeroloop.protocol.messages.operator import (
     MAX_POINTS,
     Gains,
     Hold,
@@ -32,7 +31,8 @@ from protocol.verbs import (
     Stream,
     Track,
 )
-from service.reference import Angles, FollowError, Limits, Motion, Plan
+from aeroloop.protocol.wire.symbolic import buffer
+from aeroloop.service.control.reference import Angles, FollowError, Limits, Motion, Plan
 from tests.service.numpy_twin import Array, Sinusoids
 
 EPS: Final = 2.0**-52

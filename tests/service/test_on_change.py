@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-import service.examples
-from protocol.attitude import sent_vector
-from protocol.frames import DEFAULT_COUNTER_BITS
-from protocol.transmit import SILENCE, Policy, Transmit
-from protocol.verbs import Sinusoid
-from protocol.wire import WireSpec
-from service.config import ConfigError, Settings, load, with_bits
-from service.controller import Controller, ControllerState
-from service.figures import Figures
-from service.lab.experiment import run_experiment
-from service.law import LawSettings
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.wire.attitude import sent_vector
+from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
+from aeroloop.service import examples
+from aeroloop.service.config import ConfigError, Settings, load, with_bits
+from aeroloop.service.control.controller import Controller, ControllerState
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.experiment import run_experiment
 
 COUNTERS = 1 << DEFAULT_COUNTER_BITS
 
@@ -29,7 +29,7 @@ POLICIES: list[tuple[Policy, Policy]] = [
     ("periodic", "on_change"),
 ]
 GAPS = ('plant.faults=["rate:off@0.2..0.3", "attitude.z:off@0.6..0.602"]', "plant.limits.max_invalid_s=1")
-RIGID_BODY = Path(service.examples.__path__[0]) / "rigid-body.toml"
+RIGID_BODY = Path(examples.__path__[0]) / "rigid-body.toml"
 LOOPS = {
     "Aero": load(),
     "Aero with gaps": load(overrides=GAPS),

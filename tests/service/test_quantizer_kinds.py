@@ -9,16 +9,16 @@ from typing import get_args
 import pyarrow.parquet
 import pytest
 
-from protocol.wire import Kind
-from service.cli import execute as run
-from service.config import ConfigError, Settings, load, load_over, with_bits
-from service.lab.cells import Cell, run_cell
-from service.lab.experiment import run_experiment
-from service.logs.export import export
-from service.logs.replay import SessionReplay, replay
-from service.logs.review import read, review
-from service.logs.runs import Run
-from service.theorem.certificate import Certificate, certify
+from aeroloop.protocol.wire.spec import Kind
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import ConfigError, Settings, load, load_over, with_bits
+from aeroloop.service.lab.cells import Cell, run_cell
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.replay import SessionReplay, replay
+from aeroloop.service.logs.runs import Run
+from aeroloop.service.review.review import read, review
+from aeroloop.service.theorem.certificate import Certificate, certify
 from tests.service.logs.made_log import AN_OPERATORS_WORDS, lockstep, make_log
 
 SIGNALS = ("attitude", "rate", "voltage")
@@ -77,7 +77,7 @@ def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str, monkey
         seen.append(settings)
         return run_experiment(settings, duration_s / 500)
 
-    monkeypatch.setattr("service.lab.cells.run_experiment", instead)
+    monkeypatch.setattr("aeroloop.service.lab.cells.run_experiment", instead)
     run_cell(throughout(kind).contract(), Cell(bits_out=9, bits_in=7))
     wire = seen[0].wire
     assert [(signal.kind, signal.bits) for signal in (wire.attitude, wire.rate, wire.voltage)] == [

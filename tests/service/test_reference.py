@@ -7,9 +7,9 @@ from math import pi
 import numpy as np
 import pytest
 
-from protocol.symbolic import buffer
-from protocol.verbs import Reference, Sinusoid
-from service.reference import Motion
+from aeroloop.protocol.messages.operator import Reference, Sinusoid
+from aeroloop.protocol.wire.symbolic import buffer
+from aeroloop.service.control.reference import Motion
 from tests.service.numpy_twin import Array, Sinusoids
 
 PAPER = Sinusoid()

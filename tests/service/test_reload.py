@@ -8,12 +8,12 @@ from typing import Any, cast
 
 import pytest
 
-from protocol.errors import AeroloopError
-from protocol.role import Action, Role
-from protocol.verbs import Points
-from service.config import Settings, load
-from service.operate import OperatorError, read_points
-from service.reload import LIVE, differences, reload_on_hangup
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import Points
+from aeroloop.protocol.runtime.role import Action, Role
+from aeroloop.service.config import Settings, load
+from aeroloop.service.daemon.reload import LIVE, differences, reload_on_hangup
+from aeroloop.service.host.operator import OperatorError, read_points
 
 ROLES = ("controller", "plant", "recorder")
 

@@ -16,12 +16,12 @@ from math import cos, radians, sin, sqrt
 import numpy as np
 import pytest
 
-from plant_emulator.endpoint import Endpoint
-from protocol.messages import Claim, Grant
-from protocol.verbs import Sinusoid
-from protocol.wire import SignalSpec
-from service.config import Settings, load, with_bits
-from service.controller import Controller
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.control.controller import Controller
 from tests.service import numpy_twin as twin
 from tests.service.numpy_twin import Array
 from tests.service.twin_body import body_of

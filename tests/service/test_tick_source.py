@@ -10,13 +10,13 @@ from collections.abc import Iterable, Mapping
 
 import pytest
 
-from protocol.clock import LoopSettings
-from protocol.links import Arrival
-from protocol.trace import Received
-from protocol.transmit import SILENCE, Sender
-from protocol.wire import WireSpec
-from service import tick_source
-from service.tick_source import PlantTick, TickSource
+from aeroloop.protocol.messages.trace import Received
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.service.daemon import tick_source
+from aeroloop.service.daemon.tick_source import PlantTick, TickSource
 from tests.service.simulated_link import LOOP, PERIOD_NS, SimulatedLink, wire_of
 
 WIRE = wire_of("on_change", "on_change")
@@ -56,7 +56,7 @@ class Source:
         self.link = SimulatedLink(sorted(arrivals, key=lambda each: each.at_ns), tick_source.MAILBOX)
         monkeypatch.setattr(tick_source, "time", self.link)
         if own_grid:
-            monkeypatch.setattr("protocol.clock.time", self.link)
+            monkeypatch.setattr("aeroloop.protocol.runtime.tick_grid.time", self.link)
         self.source = TickSource(self.link, loop, wire, own_grid=own_grid, stale_s=stale_s)
         self.taken: list[tuple[PlantTick, int]] = []  # and when
 

@@ -6,10 +6,10 @@ from io import StringIO
 
 from rich.console import Console
 
-from protocol.messages import PROTOCOL_VERSION, Contract, Event, Status, Telemetry, Truth
-from protocol.verbs import Message
-from service.config import load
-from service.top import SILENT_S, Top
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.operator import Message
+from aeroloop.service.config import load
+from aeroloop.service.terminal.monitor import SILENT_S, Top
 
 
 def text(top: Top) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.law import LawSettings
+from aeroloop.service.control.law import LawSettings
 from tests.service.numpy_twin import Body
 
 

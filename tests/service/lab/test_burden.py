@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
-from service.cli import execute
-from service.config import load
-from service.lab.burden import Burden, measure_burden, pareto_front
-from service.lab.burden_figure import draw_burden
-from service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
-from service.lab.burden_table import HEADER, markdown
-from service.lab.workers import Workers
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import load
+from aeroloop.service.lab.burden import Burden, measure_burden, pareto_front
+from aeroloop.service.lab.burden_figure import draw_burden
+from aeroloop.service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
+from aeroloop.service.lab.burden_table import HEADER, markdown
+from aeroloop.service.lab.workers import Workers
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
@@ -123,7 +123,7 @@ class InThisProcess(Workers):
 
 
 def test_where_float64_makes_no_error_there_is_nothing_to_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.lab.burden.Workers", InThisProcess)
+    monkeypatch.setattr("aeroloop.service.lab.burden.Workers", InThisProcess)
     still = load(overrides=["reference.kind=hold"])
     with pytest.raises(BurdenError, match=r"^float64 makes no error, sensors perfect"):
         measure_burden(still, grid(still, ["cont"], sensors=["perfect"]), 0.1)

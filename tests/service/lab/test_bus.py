@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.lab.bus import bus_bits, classic_frame_bits, classic_frames
+from aeroloop.service.lab.bus import bus_bits, classic_frame_bits, classic_frames
 
 
 def stuffed_length(identifier: int, data: bytes) -> int:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config import Settings, load, with_bits
-from service.figures import Figures
-from service.lab.experiment import run_experiment
+from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.experiment import run_experiment
 from tests.service.numpy_twin import Sinusoids
 
 IDEAL = load(overrides=["plant.ideal=true"])

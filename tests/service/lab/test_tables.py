@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from service.config import load
-from service.lab import paper
-from service.lab.calibrate import TOLERANCE
-from service.lab.cells import Cell, Pool, Result, run_cell
-from service.lab.tables import Tables, markdown, predict
+from aeroloop.service.config import load
+from aeroloop.service.lab import paper
+from aeroloop.service.lab.calibrate import TOLERANCE
+from aeroloop.service.lab.cells import Cell, Pool, Result, run_cell
+from aeroloop.service.lab.tables import Tables, markdown, predict
 
 BENCH = load()
 
@@ -89,10 +89,10 @@ def test_the_papers_numbers_are_those_of_its_tables() -> None:
 
 
 def test_figures_of_the_paper_are_drawn_from_a_log_under_their_numbers(tmp_path: Path) -> None:
-    from service.demo import run_demo
-    from service.logs.plots import draw_figures
-    from service.logs.review import read
-    from service.logs.ticks import Ticks
+    from aeroloop.service.lab.demo import run_demo
+    from aeroloop.service.logs.ticks import Ticks
+    from aeroloop.service.report.plots import draw_figures
+    from aeroloop.service.review.review import read
 
     for overrides, numbers in (
         (["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"], {"C.4", "C.5", "C.6"}),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.frames import FrameFormat
-from protocol.transmit import SILENCE
-from service.config import Settings, load
-from service.lab.burden import POLICIES, observe
-from service.lab.experiment import run_experiment
-from service.lab.traffic import codes_of, sent_ticks, traffic
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import Settings, load
+from aeroloop.service.lab.burden import POLICIES, observe
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.traffic import codes_of, sent_ticks, traffic
 
 KIND = FrameFormat([6, 6], 4)
 CODES = [(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)]

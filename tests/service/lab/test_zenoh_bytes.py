@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from protocol.network import NetworkSettings
-from service.lab.zenoh_bytes import Relay, count_bytes
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.service.lab.zenoh_bytes import Relay, count_bytes
 
 SEVEN, THREE = b"1234567", b"123"
 KEEPALIVES = 60

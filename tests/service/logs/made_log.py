@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
 
-from plant_emulator.emulator import Emulator, truth_of
-from plant_emulator.plant_trace import PlantTrace
-from protocol import topics
-from protocol.links import Arrival
-from protocol.messages import PROTOCOL_VERSION, Claim, Contract, Grant
-from protocol.publication import Delivery as Message
-from protocol.trace import End, Received, Sent, TraceWriter, read_batch
-from protocol.verbs import Change, Gains, Hold, Reference
-from service.config import Settings, load
-from service.controller import Controller
-from service.logs.mcap_file import CONTRACT_METADATA
-from service.recording.log_file import LogFile
-from service.telling import telemetry_of
-from service.tick_source import PlantTick
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Contract, Grant
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
+from aeroloop.protocol.messages.trace import End, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.transport.publication import Delivery as Message
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.daemon.telemetry import telemetry_of
+from aeroloop.service.daemon.tick_source import PlantTick
+from aeroloop.service.logs.mcap_file import CONTRACT_METADATA
+from aeroloop.service.recording.log_file import LogFile
 
 START_NS: Final = 1_800_000_000_000_000_000
 """When tick 0 is measured, on the plant's wall clock."""
@@ -207,7 +207,7 @@ def made(
     plant_clock, clock = Clock("plant"), Clock("controller")
     emulator = Emulator(loop, wire, settings.plant, threading.Event())
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
-    with patch("plant_emulator.plant_trace.time", plant_clock):
+    with patch("aeroloop.plant_emulator.endpoint.trace_rows.time", plant_clock):
         plant_clock.now_ns = at_ns
         trace = PlantTrace(
             loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n

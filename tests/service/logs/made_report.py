@@ -7,9 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from protocol.messages import Percentiles
-from service.figures import Stream
-from service.logs.report import Check, Findings, Gap, LemmaCheck, Line, Mark, Panel, Report, Spread, TheoremFindings
+from aeroloop.protocol.messages.models import Percentiles
+from aeroloop.service.figures import Stream
+from aeroloop.service.review.report import (
+    Check,
+    Findings,
+    Gap,
+    LemmaCheck,
+    Line,
+    Mark,
+    Panel,
+    Report,
+    Spread,
+    TheoremFindings,
+)
 
 BINS = [(2 ** (i / 16), count) for i, count in ((148, 90), (149, 400), (150, 300), (151, 60), (180, 3), (200, 1))]
 MARKS = (

@@ -14,15 +14,15 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from protocol import topics
-from protocol.attitude import IDENTITY, Quaternion
-from protocol.trace import HEADER_BYTES, STEPS, End, read_batch
-from protocol.verbs import Message as Model
-from service.config import load
-from service.logs.grounds import Library
-from service.logs.observe import Observer
-from service.logs.theorem import Trial
-from service.logs.ticks import Ticks
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.operator import Message as Model
+from aeroloop.protocol.messages.trace import HEADER_BYTES, STEPS, End, read_batch
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
+from aeroloop.service.config import load
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.certificate_cache import Library
+from aeroloop.service.review.observe import Observer
+from aeroloop.service.review.theorem_check import Trial
 from tests.service.logs.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000

@@ -12,16 +12,16 @@ from collections import deque
 from dataclasses import dataclass, field
 from unittest.mock import patch
 
-from plant_emulator.emulator import Emulator, truth_of
-from plant_emulator.faults import Fault
-from plant_emulator.plant_trace import PlantTrace
-from protocol.links import Arrival, Link
-from protocol.messages import Claim, Grant
-from protocol.trace import Outcome, Received
-from protocol.transmit import SILENCE
-from protocol.verbs import Gains, Hold
-from service.config import Settings, load
-from service.tick_source import MAILBOX, TickSource
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.operator import Gains, Hold
+from aeroloop.protocol.messages.trace import Outcome, Received
+from aeroloop.protocol.transport.link import Arrival, Link
+from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import Settings, load
+from aeroloop.service.daemon.tick_source import MAILBOX, TickSource
 from tests.service.logs.made_log import RUNS, SESSION, Clock, ControllerEnd, Messages
 
 
@@ -181,9 +181,9 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
     sparse = settings.wire.transmit.measurement == "on_change"
     world = World(known, chance, plant_clock, clock, MAILBOX if sparse else 1)
     with (
-        patch("plant_emulator.plant_trace.time", plant_clock),
-        patch("service.tick_source.time", world),
-        patch("protocol.clock.time", world),
+        patch("aeroloop.plant_emulator.endpoint.trace_rows.time", plant_clock),
+        patch("aeroloop.service.daemon.tick_source.time", world),
+        patch("aeroloop.protocol.runtime.tick_grid.time", world),
     ):
         endpoint, loop, wire = world.emulator.endpoint, settings.loop, settings.wire
         claim = Claim(

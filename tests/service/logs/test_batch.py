@@ -13,17 +13,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from protocol.frames import FrameFormat
-from protocol.logarithmic import LogarithmicQuantizer
-from protocol.quantizer import CodedQuantizer, Quantizer
-from protocol.transmit import SILENCE
-from protocol.verbs import Change, Gains, Hold, Points, Reference, Sinusoid, Stream
-from protocol.wire import SignalSpec
-from service.config import Settings, load
-from service.controller import Controller, ControllerState
-from service.figures import Score
-from service.logs.batch import BatchController, Commands, Computed
-from service.logs.codes import codes_in, encoded_by, frames_of, levels
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Points, Reference, Sinusoid, Stream
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import CodedQuantizer, Quantizer
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller, ControllerState
+from aeroloop.service.figures import Score
+from aeroloop.service.logs.batch import BatchController, Commands, Computed
+from aeroloop.service.logs.codes import codes_in, encoded_by, frames_of, levels
 
 TICKS = 300
 ROWS = 64

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import execute as run
-from service.config import load
-from service.logs.compare import Comparison, broken_limits, named_apart
-from service.logs.report import Check
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import load
+from aeroloop.service.review.compare import Comparison, broken_limits, named_apart
+from aeroloop.service.review.report import Check
 from tests.service.logs.made_log import make_log
 from tests.service.logs.made_report import made_report
 

@@ -11,10 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import topics
-from protocol.attitude import Quaternion, distance, sent_vector, to_euler
-from protocol.frames import FrameFormat
-from protocol.messages import (
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import (
     PROTOCOL_VERSION,
     Contract,
     Event,
@@ -26,14 +24,16 @@ from protocol.messages import (
     Truth,
     model_of,
 )
-from protocol.quantizer import Quantizer
-from protocol.trace import ENDS, End, Outcome, Sent, TraceWriter
-from protocol.trace import Received as ReceivedAs
-from protocol.verbs import Message, Setpoint
-from protocol.wire import WireSpec
-from service.config import load
-from service.logs.decoded import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder
-from service.logs.schemas import json_shape, plain_schema
+from aeroloop.protocol.messages.operator import Message, Setpoint
+from aeroloop.protocol.messages.trace import ENDS, End, Outcome, Sent, TraceWriter
+from aeroloop.protocol.messages.trace import Received as ReceivedAs
+from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector, to_euler
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.quantizer import Quantizer
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.config import load
+from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder
+from aeroloop.service.viewers.schemas import json_shape, plain_schema
 from tests.service.logs.viewer import fields, orientation, quaternion
 
 NOW = 1_800_000_000_000_000_000

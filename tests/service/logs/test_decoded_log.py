@@ -10,14 +10,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from protocol import topics
-from service.config import load
-from service.logs.decoded import Decoder
-from service.logs.export import export
-from service.logs.files import LogFiles
-from service.logs.mcap_file import CONTRACT_METADATA
-from service.logs.review import review
-from service.logs.table_files import ExportError
+from aeroloop.protocol.messages import topics
+from aeroloop.service.config import load
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.mcap_file import CONTRACT_METADATA
+from aeroloop.service.logs.table_files import ExportError
+from aeroloop.service.review.review import review
+from aeroloop.service.viewers.channels import Decoder
 from tests.service.logs.made_log import SESSION, VEHICLE, make_log
 from tests.service.logs.retold import Said, tell
 

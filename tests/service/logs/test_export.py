@@ -15,18 +15,18 @@ import pyarrow.parquet
 import pytest
 import scipy.io
 
-from protocol.attitude import to_euler
-from protocol.messages import Telemetry
-from protocol.wire import WireSpec
-from service.cli import execute
-from service.config import Settings, from_contract, load
-from service.logs.export import export
-from service.logs.files import LogFiles
-from service.logs.review import review
-from service.logs.runs import Run
-from service.logs.table import Rows, Truths, euler_deg, groups
-from service.logs.table_files import ExportError, ParquetFile
-from service.logs.ticks import Ticks
+from aeroloop.protocol.messages.models import Telemetry
+from aeroloop.protocol.wire.attitude import to_euler
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import Settings, from_contract, load
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.runs import Run
+from aeroloop.service.logs.table import Rows, Truths, euler_deg, groups
+from aeroloop.service.logs.table_files import ExportError, ParquetFile
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.review import review
 from tests.service.logs.made_log import SESSION, START_NS, VEHICLE, made, write
 from tests.service.logs.retold import PERIOD_NS
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.messages import Event, Loss
-from protocol.trace import Outcome, Received
-from service.cli import execute
-from service.config import load
-from service.logs.display import sparkline
-from service.logs.limits import Limit
-from service.logs.report import Check, Findings, Mark, Spread
-from service.logs.review import read, report, review
+from aeroloop.protocol.messages.models import Event, Loss
+from aeroloop.protocol.messages.trace import Outcome, Received
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import load
+from aeroloop.service.review.report import Check, Findings, Mark, Spread
+from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.review import read, report, review
+from aeroloop.service.terminal.log_tables import sparkline
 from tests.service.logs.made_log import AN_OPERATORS_WORDS, START_NS, make_log
 from tests.service.logs.retold import Said, edited, retell, told
 

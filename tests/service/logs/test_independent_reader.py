@@ -21,13 +21,13 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
-from protocol.publication import Delivery
-from service.logs.export import export
-from service.logs.mcap_file import records
-from service.logs.recover import RecoverError, recover
-from service.logs.review import review
-from service.recording import rolling
-from service.settings import RecorderSettings
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.mcap_file import records
+from aeroloop.service.logs.recover import RecoverError, recover
+from aeroloop.service.recording import rolling
+from aeroloop.service.review.review import review
+from aeroloop.service.settings import RecorderSettings
 from tests.service.logs.made_log import make_log
 
 READERS = Path(__file__).parents[2] / "readers"
@@ -133,7 +133,11 @@ def test_the_log_of_a_real_run(reader: Reader, tmp_path: Path) -> None:
     log = tmp_path / "demo.mcap"
     command = ["demo", "--lockstep", "--duration", "1", "--json", "--log", str(log)]
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-P", "-m", "aeroloop", *command],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
     )
     assert done.returncode == 0, done.stderr
     assert_all_read(reader, log)

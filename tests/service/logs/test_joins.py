@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.trace import Outcome, read_batch
-from service.config import load
-from service.logs.files import ReviewError
-from service.logs.replay import replay
-from service.logs.review import read, review
-from service.logs.ticks import Ticks
-from service.logs.traces import Missing
+from aeroloop.protocol.messages.trace import Outcome, read_batch
+from aeroloop.service.config import load
+from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.traces import Missing
+from aeroloop.service.review.review import read, review
 from tests.service.logs.made_log import SESSION, VEHICLE, Logged, made, make_log, write
 from tests.service.logs.retold import Said, edited, retell, told
 from tests.service.logs.rough_log import Known, rough_loop

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from service.cli import execute
-from service.logs.decoded import SHAPES
-from service.logs.layout import layout
+from aeroloop.service.cli.main import execute
+from aeroloop.service.viewers.channels import SHAPES
+from aeroloop.service.viewers.layout import layout
 
 PANELS = {
     "3D": {"followTf", "followMode", "cameraState", "scene", "topics", "transforms", "layers"},

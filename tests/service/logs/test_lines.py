@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.attitude import Quaternion
-from protocol.messages import Truth
-from service.config import load
-from service.logs.review import read, report
-from service.logs.thin import ThinnedLines
-from service.logs.ticks import Ticks
+from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.wire.attitude import Quaternion
+from aeroloop.service.config import load
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.downsample import ThinnedLines
+from aeroloop.service.review.review import read, report
 from tests.service.logs.made_log import SESSION, START_NS, make_log
 from tests.service.logs.retold import LATENCY_NS, PERIOD_NS, observer_of, retell, ticks_of, told
 

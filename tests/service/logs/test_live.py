@@ -18,19 +18,19 @@ from queue import Queue
 
 import pytest
 
-from plant_emulator.endpoint import Endpoint
-from protocol.attitude import Quaternion, angle, distance
-from protocol.messages import Claim, Event, Status
-from protocol.network import NetworkSettings
-from protocol.role import Role
-from protocol.topics import key
-from service.bench import free_rendezvous
-from service.cli import execute
-from service.config import Settings, load
-from service.controller import Controller
-from service.logs.decoded import SHAPES, Decoded
-from service.logs.live import LiveError, Outlet, serve
-from service.telling import telemetry_of
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.protocol.messages.models import Claim, Event, Status
+from aeroloop.protocol.messages.topics import key
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.wire.attitude import Quaternion, angle, distance
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.daemon.telemetry import telemetry_of
+from aeroloop.service.testing.process_group import free_rendezvous
+from aeroloop.service.viewers.channels import SHAPES, Decoded
+from aeroloop.service.viewers.foxglove_server import LiveError, Outlet, serve
 from tests.service.logs.viewer import PATIENCE_S, Shown, Viewer, orientation
 
 NOW = 1_800_000_000_000_000_000
@@ -233,7 +233,7 @@ def test_a_port_in_use_is_one_clear_line(settings: Settings, capfd: pytest.Captu
 @pytest.mark.processes
 def test_the_command_says_where_it_is_and_stops_on_a_signal(settings: Settings) -> None:
     """A process of its own; it may take 20 s to start and to stop, where a second is enough."""
-    command = [sys.executable, "-m", "service.cli", "log", "live", "--port", "0"]
+    command = [sys.executable, "-P", "-m", "aeroloop", "log", "live", "--port", "0"]
     command += ["--set", f"network.rendezvous={settings.network.rendezvous}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

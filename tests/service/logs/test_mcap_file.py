@@ -21,11 +21,20 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, Writer
 
-from service.logs.files import LogFiles, ReviewError
-from service.logs.mcap_file import CONTRACT_METADATA, MAX_CHUNK, MAX_RECORD, Damage, messages, opening, records, skim
-from service.logs.recover import recover
-from service.logs.replay import replay
-from service.logs.review import review
+from aeroloop.service.logs.files import LogFiles, ReviewError
+from aeroloop.service.logs.mcap_file import (
+    CONTRACT_METADATA,
+    MAX_CHUNK,
+    MAX_RECORD,
+    Damage,
+    messages,
+    opening,
+    records,
+    skim,
+)
+from aeroloop.service.logs.recover import recover
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.review.review import review
 from tests.service.logs.made_log import AN_OPERATORS_WORDS, make_log
 
 TICKS: Final = 600

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.messages import Percentiles, Status
-from service.config import load
-from service.logs.report import Findings
-from service.logs.review import read
+from aeroloop.protocol.messages.models import Percentiles, Status
+from aeroloop.service.config import load
+from aeroloop.service.review.report import Findings
+from aeroloop.service.review.review import read
 from tests.service.logs.made_log import START_NS, make_log
 from tests.service.logs.retold import Said, edited, observer_of, retell, ticks_of, told
 

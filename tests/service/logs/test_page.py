@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
-from service.logs.files import ReviewError
-from service.logs.page.data import page_data
-from service.logs.page.markup import tag
-from service.logs.page.page import page, write_page
-from service.logs.report import Check, Mark, Panel, Report
-from service.logs.rows import figure_rows, micros, percent
+from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.report.page.data import page_data
+from aeroloop.service.report.page.markup import tag
+from aeroloop.service.report.page.page import page, write_page
+from aeroloop.service.report.rows import figure_rows, micros, percent
+from aeroloop.service.review.report import Check, Mark, Panel, Report
 from tests.service.logs.made_report import MARKS, made_report, made_theorem
 
 HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""

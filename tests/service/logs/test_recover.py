@@ -12,8 +12,8 @@ from typing import NamedTuple
 import pytest
 from mcap.reader import make_reader
 
-from service.logs.recover import RecoverError, recover
-from service.logs.review import review
+from aeroloop.service.logs.recover import RecoverError, recover
+from aeroloop.service.review.review import review
 from tests.service.logs.made_log import make_log
 
 TICKS = 400

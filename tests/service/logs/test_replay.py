@@ -9,17 +9,17 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
-from protocol import topics
-from protocol.messages import PROTOCOL_VERSION, Contract
-from service.config import load
-from service.figures import Figures, Stream
-from service.lab.experiment import run_experiment
-from service.logs.files import LogFiles, ReviewError
-from service.logs.limits import Limit, LimitError
-from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
-from service.logs.replay import EndReplay, SessionReplay, replay
-from service.logs.review import read, review
-from service.logs.runs import Run
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract
+from aeroloop.service.config import load
+from aeroloop.service.figures import Figures, Stream
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.logs.files import LogFiles, ReviewError
+from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
+from aeroloop.service.logs.runs import Run
+from aeroloop.service.review.requirements import Limit, LimitError
+from aeroloop.service.review.review import read, review
 from tests.service.logs.made_log import AN_OPERATORS_WORDS, START_NS, lockstep, made, make_log, write
 from tests.service.logs.retold import Said, retell, tell
 

@@ -11,23 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plant_emulator.settings import PlantSettings
-from protocol.messages import PROTOCOL_VERSION, Contract, Truth
-from protocol.verbs import Change, Gains, Hold, Stream
-from service.config import Settings, load
-from service.logs import grounds
-from service.logs.display import review_account
-from service.logs.grounds import Library, damping_of
-from service.logs.limits import Limit
-from service.logs.mcap_file import CONTRACT_METADATA
-from service.logs.plots import draw_theorem
-from service.logs.report import Findings, Line, TheoremFindings
-from service.logs.review import read, report
-from service.logs.runs import BLOCK
-from service.logs.theorem import Trial
-from service.logs.ticks import Ticks
-from service.theorem.certificate import Evaluated, bounds_of, certify
-from service.theorem.lemma import coordinates
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Truth
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Stream
+from aeroloop.service.config import Settings, load
+from aeroloop.service.logs.mcap_file import CONTRACT_METADATA
+from aeroloop.service.logs.runs import BLOCK
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.report.plots import draw_theorem
+from aeroloop.service.review import certificate_cache as grounds
+from aeroloop.service.review.certificate_cache import Library, damping_of
+from aeroloop.service.review.report import Findings, Line, TheoremFindings
+from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.review import read, report
+from aeroloop.service.review.theorem_check import Trial
+from aeroloop.service.terminal.log_tables import review_account
+from aeroloop.service.theorem.certificate import Evaluated, bounds_of, certify
+from aeroloop.service.theorem.lemma import coordinates
 from tests.service import numpy_twin as twin
 from tests.service.logs.made_log import SESSION, make_log
 from tests.service.logs.retold import Said, retell

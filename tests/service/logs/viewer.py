@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from protocol.attitude import Quaternion
+from aeroloop.protocol.wire.attitude import Quaternion
 
 SUBPROTOCOL = Subprotocol("foxglove.sdk.v1")
 PATIENCE_S = 20.0

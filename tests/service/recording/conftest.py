@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from protocol import topics
-from protocol.publication import Delivery
-from protocol.verbs import Change, Gains, Hold
-from service.config import load
-from service.recording import rolling
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.operator import Change, Gains, Hold
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.config import load
+from aeroloop.service.recording import rolling
 from tests.service.recording.ends import SESSION, VEHICLE, Ends, contract_of
 from tests.service.recording.recording import Arrived, Clock, Disk, Story
 

@@ -6,12 +6,12 @@ import random
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from protocol import topics
-from protocol.messages import PROTOCOL_VERSION, Contract, Status, Telemetry, Truth
-from protocol.trace import Outcome, Sent, TraceWriter
-from protocol.trace import Received as ReceivedAs
-from protocol.verbs import Change
-from service.config import Settings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Status, Telemetry, Truth
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter
+from aeroloop.protocol.messages.trace import Received as ReceivedAs
+from aeroloop.service.config import Settings
 
 VEHICLE, SESSION = "aero", "s1"
 TELEMETRY_EVERY, TRUTH_EVERY, STATUS_EVERY = 20, 10, 500

@@ -14,16 +14,16 @@ from typing import NamedTuple
 import pytest
 from mcap.reader import make_reader
 
-from protocol import topics
-from protocol.messages import Contract
-from protocol.publication import Delivery
-from protocol.trace import read_batch
-from protocol.verbs import Change
-from service.logs.decoded import Decoded, Decoder
-from service.recording import log_file as writer
-from service.recording import rolling
-from service.recording.rolling import RollingLog
-from service.settings import RecorderSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Contract
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import read_batch
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.recording import log_file as writer
+from aeroloop.service.recording import rolling
+from aeroloop.service.recording.rolling import RollingLog
+from aeroloop.service.settings import RecorderSettings
+from aeroloop.service.viewers.channels import Decoded, Decoder
 
 TICK_S = 0.002
 EVERYTHING = 1 << 60

@@ -10,10 +10,10 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.records import Message
 
-from service.logs.mcap_file import Damage, records
-from service.logs.recover import recover
-from service.recording import rolling
-from service.recording.rolling import RecorderError
+from aeroloop.service.logs.mcap_file import Damage, records
+from aeroloop.service.logs.recover import recover
+from aeroloop.service.recording import rolling
+from aeroloop.service.recording.rolling import RecorderError
 from tests.service.recording.recording import (
     EVERYTHING,
     Clock,

@@ -15,19 +15,19 @@ import pytest
 import zenoh
 from mcap.reader import make_reader
 
-from protocol import topics
-from protocol.messages import Loss, Status
-from protocol.publication import CachedPublisher
-from protocol.role import Role
-from protocol.trace import read_batch
-from protocol.verbs import Change
-from service.config import load
-from service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
-from service.recording import backlog, rolling
-from service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
-from service.recording.recorder import Recorder
-from service.recording.rolling import RecorderError, parts
-from service.settings import RecorderSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Loss, Status
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import read_batch
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.service.config import load
+from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from aeroloop.service.recording import backlog, rolling
+from aeroloop.service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
+from aeroloop.service.recording.recorder import Recorder
+from aeroloop.service.recording.rolling import RecorderError, parts
+from aeroloop.service.settings import RecorderSettings
 from tests.protocol.gathering import Gathering, eventually
 from tests.service.recording.conftest import CHANGES
 from tests.service.recording.ends import Ends, contract_of

@@ -10,16 +10,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
-from protocol.verbs import Change
-from service.logs.mcap_file import (
-    CHANGE_METADATA,
-    CHUNK_BYTES,
-    CONTRACT_METADATA,
-    RECORDER_METADATA,
-    records,
-)
-from service.recording import rolling
-from service.recording.rolling import RecorderError
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CHUNK_BYTES, CONTRACT_METADATA, RECORDER_METADATA, records
+from aeroloop.service.recording import rolling
+from aeroloop.service.recording.rolling import RecorderError
 from tests.service.recording.conftest import START_NS
 from tests.service.recording.recording import (
     TICK_S,

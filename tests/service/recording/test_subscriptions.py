@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from protocol.publication import CachedPublisher, Delivery
-from service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlog
-from service.recording.subscriptions import Subscriptions
+from aeroloop.protocol.transport.publication import CachedPublisher, Delivery
+from aeroloop.service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlog
+from aeroloop.service.recording.subscriptions import Subscriptions
 from tests.protocol.gathering import Gathering, eventually
 
 EVENT, TRUTH = "aeroloop/aero/event", "aeroloop/v2/truth"

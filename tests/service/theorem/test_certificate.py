@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.attitude import IDENTITY, received_quaternion, sent_vector
-from protocol.symbolic import Compiled
-from protocol.verbs import Hold, Points, Reference, Sinusoid, Stream
-from protocol.wire import SignalSpec, WireSpec
-from service.cli import execute as run
-from service.config import Settings, load, load_over
-from service.controller import Controller
-from service.law import LawSettings
-from service.reference import Plan, reference_function
-from service.settings import ControllerSettings
-from service.theorem.bounds import attitude_error
-from service.theorem.certificate import Certificate, bounds_of, certify
-from service.theorem.extremes import BoundlessError, extremes
-from service.theorem.lemma import Samples, coordinates, lemma_inequalities
+from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid, Stream
+from aeroloop.protocol.wire.attitude import IDENTITY, received_quaternion, sent_vector
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import Settings, load, load_over
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.reference import Plan, reference_function
+from aeroloop.service.settings import ControllerSettings
+from aeroloop.service.theorem.bounds import attitude_error
+from aeroloop.service.theorem.certificate import Certificate, bounds_of, certify
+from aeroloop.service.theorem.extremes import BoundlessError, extremes
+from aeroloop.service.theorem.lemma import Samples, coordinates, lemma_inequalities
 from tests.service import numpy_twin as twin
 
 PAPER = Settings()

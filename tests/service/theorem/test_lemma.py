@@ -12,16 +12,16 @@ from math import asin, floor, radians, sin, sqrt
 import numpy as np
 import pytest
 
-from protocol.attitude import IDENTITY, Vector, received_quaternion, sent_vector
-from protocol.quantizer import Quantizer
-from protocol.symbolic import Compiled
-from protocol.verbs import Sinusoid
-from protocol.wire import SignalSpec, WireSpec
-from service.law import LawSettings
-from service.reference import Plan, reference_function
-from service.theorem.certificate import Evaluated, evaluate, known
-from service.theorem.extremes import extremes
-from service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.wire.attitude import IDENTITY, Vector, received_quaternion, sent_vector
+from aeroloop.protocol.wire.quantizer import Quantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.reference import Plan, reference_function
+from aeroloop.service.theorem.certificate import Evaluated, evaluate, known
+from aeroloop.service.theorem.extremes import extremes
+from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.service import numpy_twin as twin
 from tests.service.twin_body import body_of
 

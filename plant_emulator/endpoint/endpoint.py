@@ -1,0 +1,213 @@
+"""The plant end of the loop, sans-I/O: measure → frame; frame → actuate; and the watchdog.
+
+It knows no socket and no clock: time is the tick index. Its owner feeds it the newest command frame, once a tick, and
+sends what it returns. A command acts from the start of the period in which it arrived, and until another says something
+else; when none has come in time the watchdog trips: the session ends, and the motors have 0 V until the plant is armed
+and a controller claims it.
+
+A command is fresh by ticks alone: its echo tells how many ticks ago the measurement was made that it answers.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from aeroloop.plant_emulator.endpoint.envelope import Guard
+from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCause
+from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.wire.attitude import sent_vector
+from aeroloop.protocol.wire.loop import WATCHDOG_S
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Sender
+
+
+class Endpoint(Tenancy):
+    """One plant, one controller at a time.
+
+    Args:
+        plant: What to measure and to actuate.
+        wire: How frames are read and written here.
+        period_ns: Period of a tick [ns].
+        lockstep: Whether each answer is waited for; a claim must say the same.
+        watchdog_s: 0 V after this long without a fresh command [s].
+        guard: What else makes it trip; None for nothing.
+        armed: Whether the first claim is granted without anybody arming it.
+
+    Raises:
+        ValueError: The wire commands another number of actuators than the plant has.
+
+    Attributes:
+        accepted: Commands acted upon so far.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        wire: WireSpec,
+        period_ns: int,
+        *,
+        lockstep: bool = False,
+        watchdog_s: float = WATCHDOG_S,
+        guard: Guard | None = None,
+        armed: bool = False,
+    ) -> None:
+        if plant.actuators != wire.actuators:
+            raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
+        super().__init__(wire, period_ns, lockstep=lockstep, armed=armed)
+        self.plant = plant
+        self.accepted = 0
+        self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
+        self._encode = [quantizer.encode for quantizer in self._quantizers]
+        self._level = wire.voltage.quantizer().level
+        self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
+        transmit = wire.transmit
+        self._counters = wire.measurement.counters
+        heartbeat = transmit.heartbeat_ticks(period_ns, self._counters)
+        self._sender = Sender(transmit.measurement, heartbeat, self._counters)
+        self._hears_silence = lockstep and transmit.command == "on_change"
+        # Who hears silence on a clock learns that values are valid again from the next frame that reaches it in time.
+        clocked = transmit.measurement == "on_change" and not lockstep
+        self._forgiven = heartbeat if clocked else 0
+        self.protect(watchdog_s, guard)
+        self._start = 0  # tick of the session's first measurement
+        self._unmeasured_yet = False
+        self._fresh_tick = 0  # tick of the last fresh command, or of the session's first measurement
+        self._unmeasured = [False] * self._counters  # whether the last measurement of each counter had no valid value
+        self._said: tuple[float, ...] = ()  # codes of the last fresh command
+        self._echo = -1  # its echo
+        self._answered = -1  # and the tick of the measurement that it answered; before the session's first for none
+
+    def protect(self, watchdog_s: float, guard: Guard | None) -> None:
+        """Use another watchdog time [s] and other limits from now on."""
+        watchdog_ns = round(watchdog_s * 1e9)
+        self._watchdog = max(1, round(watchdog_ns / self.period_ns))
+        self._first_command = max(1, self.first_command_ns(watchdog_ns) // self.period_ns)
+        self._guard = guard
+
+    @property
+    def saturated(self) -> int:
+        """Measured values beyond their quantizer's range so far."""
+        return sum(quantizer.saturated for quantizer in self._quantizers)
+
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """Let the time since the last tick pass under the newest command, and measure.
+
+        Args:
+            frame: The newest command frame that came since the last tick, or None; in lockstep SILENCE, if the
+                controller has nothing new to say.
+            k: Tick index, from 0, rising; where it skips, the plant's time passes all the same. The very first call
+                takes no command: nothing was measured before it.
+
+        Returns:
+            The measurement frame; SILENCE if there is none to send, because it would say what the last one said; None
+            while no session runs.
+        """
+        if self.ticked < 0:
+            self.ticked, self.outcome = 0, Outcome.NONE
+        else:
+            self.outcome = Outcome.NONE if frame is None or self.session is None else self._command(frame)
+        while self.ticked < k:
+            self._watch(self.ticked + 1)
+            self.plant.actuate(self.voltages)
+            self.plant.advance()
+            self.ticked += 1
+        if self.session is None:
+            return None
+        if self._unmeasured_yet:
+            self._unmeasured_yet = False
+            self._start = self._fresh_tick = self.ticked
+            self._answered = self.ticked - 1
+        seen = self.plant.measure()
+        if self._guard is not None and (trip := self._guard.check(seen, self.voltages)) is not None:
+            self._trip(*trip)
+            self.plant.actuate(self.voltages)
+            return None
+        codes = self._encoded(seen)
+        counter = self.counter
+        self._unmeasured[counter] = codes is self._no_measurement
+        return self.wire.measurement.pack(counter, codes) if self._sender.due(k, codes) else SILENCE
+
+    @property
+    def session_tick(self) -> int:
+        """Tick of the last measurement since the session's first, which has 0; −1 before that."""
+        return self.ticked - self._start
+
+    @property
+    def answered(self) -> int:
+        """Session tick that the command in force answers; −1 for none."""
+        return self._answered - self._start
+
+    @property
+    def counter(self) -> int:
+        """Counter of the last measurement."""
+        return (self.ticked - self._start) % self._counters
+
+    def _encoded(self, seen: Measurement) -> list[float]:
+        attitude, rate = seen
+        if not isfinite(sum(attitude) + sum(rate)):
+            return self._no_measurement
+        values = (*sent_vector(attitude), *rate)
+        return [encode(value) for encode, value in zip(self._encode, values, strict=True)]
+
+    def _command(self, frame: bytes) -> Outcome:
+        """Act on a command frame if it is well-formed, fresh and valid."""
+        if frame == SILENCE and self._hears_silence and self._said:
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._said)
+        else:
+            read = self.wire.command.unpack(frame)
+        if read is None:
+            self.refused += 1
+            return Outcome.MALFORMED
+        echo, codes = read
+        # The echo is a tick modulo `counters`: the latest measurement with that counter. An echo that never changes is
+        # a sender that repeats itself, however long ago it began.
+        age = (self.ticked - self._start - echo) % self._counters
+        answered = self.ticked - age
+        if echo == self._echo or answered <= self._answered:
+            return Outcome.REPEATED
+        if age > self._watchdog:
+            self.stale += 1
+            return Outcome.STALE
+        voltages = tuple(self._level(code) for code in codes)
+        if not isfinite(sum(voltages)):
+            if any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1)):
+                voltages = self.off  # the right answer; how long it may go on is the guard's to say
+            else:
+                self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
+                return Outcome.INVALID
+        self.voltages = voltages
+        self._said, self._echo, self._answered = codes, echo, answered
+        self._fresh_tick = self.ticked
+        self._machine.fire(PlantTrigger.COMMAND)
+        self.accepted += 1
+        return Outcome.ACTED
+
+    def _watch(self, tick: int) -> None:
+        """End the session when no fresh command came in time."""
+        if self.session is None or self._unmeasured_yet:
+            return
+        waited = tick - 1 - self._fresh_tick
+        if self.state is PlantState.DRIVEN and waited >= self._watchdog:
+            text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms"
+        elif self.state is PlantState.GRANTED and waited >= self._first_command:
+            text = f"no first command within {self._first_command * self.period_ns * 1e-9:.3g} s"
+        else:
+            return
+        self._trip(TripCause.COMMAND_TIMEOUT, text)
+
+    def _begin(self) -> None:
+        if self._guard is not None:
+            self._guard.reset()
+        for quantizer in self._quantizers:
+            quantizer.reset()
+        self._start = self._fresh_tick = self.ticked + 1
+        self._unmeasured = [False] * self._counters
+        self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
+        self._said, self._echo, self._answered = (), -1, self.ticked
+        self._sender.forget()
+
+    def _rest(self) -> None:
+        self.voltages = self.off
+        self._answered = self._start - 1

@@ -1,0 +1,96 @@
+"""The plant end's trace: a row for every tick of a session, and what was done between ticks.
+
+The owner adds rows once a tick's measurement is out, and calls `follow` whenever a session may have begun or ended. A
+session's rows are published to the last when it ends; operations outside of sessions at once, without rows.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+
+from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from aeroloop.protocol.messages.trace import Sent, TraceWriter
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+
+class PlantTrace:
+    """Writes one plant end's trace.
+
+    Args:
+        loop: The grid, and how often a batch is published.
+        wire: Sizes of the frames.
+        publish: Called with every batch.
+        run: A random number of this process; drawn if None.
+    """
+
+    def __init__(
+        self, loop: LoopSettings, wire: WireSpec, publish: Callable[[bytes], None], run: int | None = None
+    ) -> None:
+        self._publish = publish
+        self._command_bytes = wire.command.size
+        run = secrets.randbits(64) if run is None else run
+        self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
+
+    def row(self, end: Tenancy, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Add the row of the last tick, and publish what is due. Nothing without a session.
+
+        Args:
+            end: After the tick.
+            measurement: As the endpoint made it; SILENCE where it has nothing new, None where it tripped.
+            arrival: What was received since the last tick; None for nothing.
+            sent_ns: When the measurement was sent, on the monotonic clock [ns].
+        """
+        writer = self._writer
+        if not writer.session:
+            return
+        if arrival is None:
+            command, received_ns, received_as = b"", 0, 0
+        else:
+            command, received_ns = arrival
+            if len(command) == self._command_bytes:
+                received_as = 1
+            else:
+                received_as, command = (Sent.SILENT if command == SILENCE else Sent.MALFORMED), b""
+        writer.plant_row(
+            end.ticked,
+            end.session_tick,
+            1 if measurement else 0 if measurement is None else 2,
+            received_as,
+            end.outcome,
+            end.trip.number if end.session is None and end.trip is not None else 0,
+            end.answered,
+            sent_ns,
+            received_ns,
+            measurement or b"",
+            command,
+            end.voltages,
+        )
+        if writer.due(sent_ns):
+            self._take(final=False)
+
+    def follow(self, end: Tenancy) -> None:
+        """Take over the end's operations; publish all that waits where its session ended or there is none."""
+        writer = self._writer
+        if end.operations:
+            writer.operations += end.operations
+            end.operations.clear()
+        session = end.session or ""
+        if session != writer.session:
+            if writer.session or not writer.empty:  # a session's last batch says so, with or without rows
+                self._take(final=bool(writer.session))
+            writer.session = session
+        elif not session and not writer.empty:
+            self._take(final=False)
+
+    def finish(self) -> None:
+        """The process ends: publish all that waits."""
+        if self._writer.session or not self._writer.empty:
+            self._take(final=bool(self._writer.session))
+
+    def _take(self, *, final: bool) -> None:
+        self._publish(self._writer.take(time.monotonic_ns(), time.time_ns(), final=final))

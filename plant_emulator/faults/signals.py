@@ -1,0 +1,305 @@
+"""Faults at work on a plant: its sensors and motors fail as they are told, and repeat from a seed.
+
+A FaultyPlant stands between the endpoint and any plant. Voltages pass its motor faults on their way in, as of the
+period's beginning; samples pass its sensor faults on their way out, as of the period's end. Faults on one signal act
+one after another, in the order in which they came, each with its own random numbers: one more fault leaves the noise of
+the others as it was. Those that have ended are forgotten.
+
+Instants are rounded to the nanosecond, so that a fault begins at the tick that a person means.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from math import cos, hypot, inf, nan, sin
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.plant import Measurement, Plant
+
+Values: TypeAlias = tuple[float, ...]
+
+GARBLED_RATE: Final = 10.0
+"""A garbled angular velocity lies within ± this about each axis [rad/s]."""
+
+
+class ValueFault(ABC):
+    """A fault at work on what is sampled once a period.
+
+    Args:
+        fault: What goes wrong and when.
+        random: Where its random numbers come from.
+        size: Components that can be in error.
+        last: The values just before, if they are known.
+
+    Attributes:
+        fault: What goes wrong and when.
+    """
+
+    def __init__(self, fault: Fault, random: np.random.Generator, size: int, last: Values | None) -> None:
+        self.fault = fault
+        self._value = 0.0 if fault.value is None else fault.value
+        self._random, self._size, self._last = random, size, last
+        part = fault.target.part
+        self._parts = range(size) if part is None else range(part, part + 1)
+        self._history: deque[tuple[float, Values]] = deque() if last is None else deque([(-inf, last)])
+
+    def apply(self, values: Values, t: float) -> Values:
+        """What becomes of the values of time t [s]. Call it at every sample: before it begins, a fault looks on."""
+        kind = self.fault.kind
+        delayed = self._delayed(values, t) if kind == "delay" else values
+        if not self.fault.active(t):
+            self._last = values
+            return values
+        if kind == "delay":
+            return self.replaced(values, delayed)
+        if kind == "stuck":
+            self._last = values if self._last is None else self._last
+            return self.replaced(values, self._last)
+        if kind == "bias":
+            return self.shifted(values, self._within_parts([self._value] * self._size))
+        if kind == "noise":
+            noise: list[float] = (self._value * self._random.standard_normal(self._size)).tolist()
+            return self.shifted(values, self._within_parts(noise))
+        if kind == "off":
+            return self.missing(values)
+        if self._random.random() >= self._value:
+            return values
+        return self.missing(values) if kind == "drop" else self.replaced(values, self.garbled())
+
+    @abstractmethod
+    def missing(self, values: Values) -> Values:
+        """What there is instead of values that are not there."""
+
+    @abstractmethod
+    def garbled(self) -> Values:
+        """Random values."""
+
+    def shifted(self, values: Values, error: Sequence[float]) -> Values:
+        """The values with an error added. Shape of error: (size,)."""
+        return tuple(value + part for value, part in zip(values, error, strict=True))
+
+    def replaced(self, values: Values, by: Values) -> Values:
+        """The values with the fault's parts replaced by others."""
+        return tuple(by[i] if i in self._parts else value for i, value in enumerate(values))
+
+    def _within_parts(self, error: Sequence[float]) -> Sequence[float]:
+        return [part if i in self._parts else 0.0 for i, part in enumerate(error)]
+
+    def _delayed(self, values: Values, t: float) -> Values:
+        history, then = self._history, round(t - self._value, 9)
+        history.append((t, values))
+        while len(history) > 1 and history[1][0] <= then:
+            history.popleft()
+        return history[0][1]
+
+
+class AttitudeFault(ValueFault):
+    """A fault at work on a quaternion. Errors are rotation vectors in the body frame [rad]."""
+
+    def missing(self, values: Values) -> Values:
+        """No valid value."""
+        return (nan,) * len(values)
+
+    def garbled(self) -> Values:
+        """Any attitude, each as likely as the others."""
+        w, x, y, z = self._random.standard_normal(4).tolist()
+        length = hypot(w, x, y, z)
+        return w / length, x / length, y / length, z / length
+
+    def shifted(self, values: Values, error: Sequence[float]) -> Values:
+        """`q ⊗ exp(error / 2)`: the body, turned further about its own axes."""
+        angle = hypot(*error)
+        if angle == 0.0:
+            return values
+        scale = sin(angle / 2) / angle
+        (w, x, y, z), (a, b, c), d = values, (scale * part for part in error), cos(angle / 2)
+        return (
+            w * d - x * a - y * b - z * c,
+            w * a + x * d + y * c - z * b,
+            w * b - x * c + y * d + z * a,
+            w * c + x * b - y * a + z * d,
+        )
+
+    def replaced(self, values: Values, by: Values) -> Values:
+        """The other attitude, whole: a fault that replaces it has no axis."""
+        del values
+        return by
+
+
+class RateFault(ValueFault):
+    """A fault at work on an angular velocity [rad/s]."""
+
+    def missing(self, values: Values) -> Values:
+        """No valid value: without one axis, the rate is not known."""
+        return (nan,) * len(values)
+
+    def garbled(self) -> Values:
+        """Any rate within the range of a gyro gone mad."""
+        return tuple(self._random.uniform(-GARBLED_RATE, GARBLED_RATE, self._size).tolist())
+
+
+class MotorFault(ValueFault):
+    """A fault at work on the motors' voltages [V], all of which pass through it.
+
+    Args:
+        fault: What goes wrong and when.
+        random: Where its random numbers come from.
+        last: The motors' voltages now [V]. Shape (actuators,).
+        limit: Largest voltage of a garbled one [V].
+
+    Raises:
+        ValueError: The plant has no such motor.
+    """
+
+    def __init__(self, fault: Fault, random: np.random.Generator, last: Values, limit: float) -> None:
+        super().__init__(fault, random, len(last), last)
+        self._limit = limit
+        if self._parts.stop > len(last):
+            there = ", ".join(f"motor{i + 1}" for i in range(len(last)))
+            raise ValueError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
+
+    def missing(self, values: Values) -> Values:
+        """0 V."""
+        return self.replaced(values, (0.0,) * len(values))
+
+    def garbled(self) -> Values:
+        """Any voltages the supply can give."""
+        return tuple(self._random.uniform(-self._limit, self._limit, self._size).tolist())
+
+
+class FaultyPlant(Plant):
+    """A plant with faults. Until `start` is called nothing fails, and time stands still.
+
+    Args:
+        plant: The plant that is meant to fail.
+        faults: What goes wrong; those of streams are left to FaultyStream.
+        period: Time that `advance` lets pass [s].
+        voltage_limit: Largest voltage of a garbled command [V].
+        seed: Of all random numbers, from 0 up.
+
+    Raises:
+        ValueError: A fault of a motor that the plant does not have.
+
+    Attributes:
+        plant: The plant itself.
+        actuators: Number of its motors.
+    """
+
+    def __init__(
+        self, plant: Plant, faults: Sequence[Fault], period: float, *, voltage_limit: float, seed: int = 0
+    ) -> None:
+        self.plant = plant
+        self.actuators = plant.actuators
+        self._period, self._limit, self._seed = period, voltage_limit, seed
+        self._started = False
+        self._ticks = 0
+        self._attached = 0
+        self._commanded: Values = (0.0,) * plant.actuators
+        self._applied = self._commanded
+        self._actuated = False  # since the last period
+        self._seen: Measurement | None = None
+        self._motors: list[MotorFault] = []
+        self._sensors: list[ValueFault] = []
+        for fault in faults:
+            self._attach(fault)
+
+    @property
+    def time(self) -> float:
+        """Seconds of plant time since `start`; 0 before."""
+        return round(self._ticks * self._period, 9)
+
+    def start(self) -> None:
+        """Time begins, at 0. Once is enough."""
+        if not self._started:
+            self._started = True
+            self._seen = None
+
+    def inject(self, fault: Fault) -> None:
+        """Add a fault whose start and end are counted from now. A sample that was measured already stays as it is.
+
+        Raises:
+            ValueError: A fault of a motor that the plant does not have.
+        """
+        self._attach(fault.later(self.time))
+
+    def clear(self) -> None:
+        """No faults any more; the motors have what is commanded."""
+        self._sensors = []
+        if self._motors:
+            self._motors = []
+            self.plant.actuate(self._commanded)
+            self._applied = self._commanded
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Put voltages [V] on the motors, as far as these do as they are told. Shape (actuators,)."""
+        self._commanded = self._applied = tuple(voltages)
+        self._actuated = True
+        if self._motors:
+            t = self._now()
+            for fault in self._motors:
+                self._applied = fault.apply(self._applied, t)
+            self._motors = [fault for fault in self._motors if not fault.fault.over(t)]
+        self.plant.actuate(self._applied)
+
+    def advance(self) -> None:
+        """Let one period pass."""
+        if self._motors and not self._actuated:
+            self.actuate(self._commanded)  # a motor fails, and recovers, under a voltage that is merely held
+        self._actuated = False
+        self.plant.advance()
+        self._ticks += self._started
+        self._seen = None
+        if self._sensors:
+            self.measure()  # what holds and delays values needs every sample, also those nobody asks for
+
+    def measure(self) -> Measurement:
+        """What the sensors say, right or wrong: the same until the next period is over."""
+        if self._seen is None:
+            self._seen = self.plant.measure()
+            if self._sensors:
+                self._seen = self._sensed(self._seen)
+        return self._seen
+
+    def close(self) -> None:
+        """0 V, whatever is faulty: no fault acts from here on."""
+        self._motors, self._sensors = [], []
+        self._commanded = self._applied = (0.0,) * self.actuators
+        self.plant.close()
+
+    def _now(self) -> float:
+        return self.time if self._started else -inf
+
+    def _sensed(self, seen: Measurement) -> Measurement:
+        attitude: Values = seen.attitude
+        rate: Values = seen.rate
+        t = self._now()
+        for fault in self._sensors:
+            if fault.fault.target.whole == "attitude":
+                attitude = fault.apply(attitude, t)
+            else:
+                rate = fault.apply(rate, t)
+        self._sensors = [fault for fault in self._sensors if not fault.fault.over(t)]
+        w, x, y, z = attitude
+        a, b, c = rate
+        return Measurement((w, x, y, z), (a, b, c))
+
+    def _attach(self, fault: Fault) -> None:
+        whole, seen = fault.target.whole, self._seen
+        random = generator(self._seed, self._attached, fault)
+        if whole == "motors":
+            self._motors.append(MotorFault(fault, random, self._applied, self._limit))
+        elif whole == "attitude":
+            self._sensors.append(AttitudeFault(fault, random, 3, seen.attitude if seen else None))
+        elif whole == "rate":
+            self._sensors.append(RateFault(fault, random, 3, seen.rate if seen else None))
+        self._attached += 1
+
+
+def generator(seed: int, number: int, fault: Fault) -> np.random.Generator:
+    """Random numbers of one fault: others for each signal, or both streams would lose the same ticks."""
+    return np.random.default_rng([seed, number, *fault.signal.encode()])

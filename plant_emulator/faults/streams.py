@@ -1,0 +1,158 @@
+"""Faults at work on frames: a stream in one direction that loses, delays, repeats and garbles them as it is told.
+
+Faults act one after another, in the order in which they came, each with its own random numbers.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.faults.signals import generator
+
+
+class StreamFault:
+    """A fault at work on frames.
+
+    Args:
+        fault: What goes wrong and when.
+        random: Where its random numbers come from.
+        last: The frame that passed last, if there was one.
+
+    Attributes:
+        fault: What goes wrong and when.
+    """
+
+    def __init__(self, fault: Fault, random: np.random.Generator, last: bytes | None) -> None:
+        self.fault = fault
+        self._value = 0.0 if fault.value is None else fault.value
+        self._random, self._last = random, last
+        self._held: deque[tuple[float, bytes]] = deque()  # when each is due, and what
+
+    def apply(self, frames: list[bytes], t: float) -> list[bytes]:
+        """What passes at time t [s], of these frames and of those held back. Call it once a tick."""
+        match self.fault.kind:
+            case "delay":
+                return self._delayed(frames, t)
+            case "duplicate":
+                return self._duplicated(frames, t)
+            case "reorder":
+                return self._reordered(frames, t)
+            case "stuck":
+                return self._stuck(frames, t)
+            case "garble":
+                return [self._flipped(frame) if frame and self._happens(t) else frame for frame in frames]
+            case "drop":
+                return [frame for frame in frames if not self._happens(t)]
+            case _:
+                return [] if self.fault.active(t) else frames
+
+    def done(self, t: float) -> bool:
+        """Whether it has ended by time t [s] and holds nothing back."""
+        return self.fault.over(t) and not self._held
+
+    def forget(self) -> None:
+        """Hold nothing back any more."""
+        self._held.clear()
+
+    def _happens(self, t: float) -> bool:
+        return self.fault.active(t) and bool(self._random.random() < self._value)
+
+    def _delayed(self, frames: list[bytes], t: float) -> list[bytes]:
+        """When the fault ends, what is on its way comes at once, ahead of what is not late any more."""
+        active = self.fault.active(t)
+        self._held.extend((round(t + self._value, 9), frame) for frame in frames)
+        passed = []
+        while self._held and (not active or self._held[0][0] <= t):
+            passed.append(self._held.popleft()[1])
+        return passed
+
+    def _duplicated(self, frames: list[bytes], t: float) -> list[bytes]:
+        again = [frame for _, frame in self._held]
+        self._held = deque((t, frame) for frame in frames if self._happens(t))
+        return again + frames
+
+    def _reordered(self, frames: list[bytes], t: float) -> list[bytes]:
+        passed = []
+        for frame in frames:
+            if self._held:
+                passed += [frame, self._held.popleft()[1]]
+            elif self._happens(t):
+                self._held.append((t, frame))
+            else:
+                passed.append(frame)
+        return passed
+
+    def _stuck(self, frames: list[bytes], t: float) -> list[bytes]:
+        if not frames:
+            return []
+        if not self.fault.active(t):
+            self._last = frames[-1]
+            return frames
+        if self._last is None:
+            self._last = frames[0]
+        return [self._last] * len(frames)
+
+    def _flipped(self, frame: bytes) -> bytes:
+        bit = int(self._random.integers(8 * len(frame)))
+        flipped = bytearray(frame)
+        flipped[bit // 8] ^= 0x80 >> bit % 8
+        return bytes(flipped)
+
+
+class FaultyStream:
+    """Frames of one direction, with faults.
+
+    Args:
+        signal: Which direction it is.
+        faults: What goes wrong; those of other signals are left to others.
+        seed: Of all random numbers, from 0 up.
+    """
+
+    def __init__(self, signal: Literal["measurement", "command"], faults: Sequence[Fault], seed: int = 0) -> None:
+        self._signal, self._seed = signal, seed
+        self._attached = 0
+        self._last: bytes | None = None
+        self._faults: list[StreamFault] = []
+        for fault in faults:
+            self.inject(fault, 0.0)
+
+    def passes(self, frame: bytes | None, t: float) -> list[bytes]:
+        """Take in the frame of a tick, and say what comes out.
+
+        Args:
+            frame: The frame, or None.
+            t: The plant's time [s], rising.
+
+        Returns:
+            What passes at this tick, in the order in which it does.
+        """
+        frames = [] if frame is None else [frame]
+        if self._faults:
+            t = round(t, 9)
+            for fault in self._faults:
+                frames = fault.apply(frames, t)
+            self._faults = [fault for fault in self._faults if not fault.done(t)]
+        if frames:
+            self._last = frames[-1]
+        return frames
+
+    def inject(self, fault: Fault, now: float) -> None:
+        """Add a fault whose start and end are counted from `now` [s], if it is one of this signal."""
+        if fault.signal == self._signal:
+            random = generator(self._seed, self._attached, fault)
+            self._faults.append(StreamFault(fault.later(now), random, self._last))
+            self._attached += 1
+
+    def forget(self) -> None:
+        """Frames that are held back are lost: another session's key is not theirs."""
+        for fault in self._faults:
+            fault.forget()
+
+    def clear(self) -> None:
+        """No faults any more; a frame that one held back is lost."""
+        self._faults = []

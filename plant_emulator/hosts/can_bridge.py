@@ -1,0 +1,332 @@
+"""The bridge: a plant on a CAN bus, as controllers on Zenoh see it.
+
+On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace. On
+the bus it is the controller's side. Frames pass as they are, byte for byte. It keeps a watchdog of its own, besides the
+node's, and trips when the bus fails or the node falls silent, has another wire spec or trips itself; when the bus is
+back it takes it up again by itself, and the plant is driven again once it is armed.
+
+A tick of the bridge is a measurement that passes. Commands count as fresh by the same rule as at the node.
+"""
+
+from __future__ import annotations
+
+import time
+from math import isfinite
+from threading import Condition
+from typing import Final, Literal
+
+from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from aeroloop.plant_emulator.hosts.presence import Presence
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCause
+from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.can_link import HEARTBEAT_S, CanLink, CanSettings, Heartbeat, fingerprint
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+WAIT_S: Final = 0.01
+REOPEN_S: Final = 0.5
+SESSIONS: Final = 16
+
+
+class Relay(Tenancy):
+    """Who may drive a plant that is elsewhere, and the watchdog on this side of the wire; sans-I/O.
+
+    Args:
+        wire: What the frames are.
+        period_ns: Period of a tick [ns].
+        lockstep: Whether each answer is waited for.
+        watchdog_s: The session ends after this long without a fresh command [s].
+        armed: Whether the first claim is granted without anybody arming it.
+
+    Attributes:
+        number: Of the session, as the bus knows it.
+        counter: Of the last measurement that passed.
+    """
+
+    def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
+        super().__init__(wire, period_ns, lockstep=lockstep, armed=armed)
+        self.number = 0
+        self.counter = 0
+        self._counters = wire.measurement.counters
+        self._level = wire.voltage.quantizer().level
+        self.protect(watchdog_s)
+        self._begun = False  # the first measurement of a session has counter 0; what comes before is of another
+        self._session_tick = -1
+        self._fresh_ns: int | None = None  # when the last fresh command passed, or the session began
+        self._judged = Outcome.NONE  # of the last command since the last tick
+        self._said: tuple[float, ...] = ()  # codes of the last fresh command
+        self._echo = self._answered = -1
+
+    @property
+    def session_tick(self) -> int:
+        """Tick of the last measurement since the session's first, by its counter: a whole round lost is not seen."""
+        return self._session_tick
+
+    @property
+    def answered(self) -> int:
+        """Session tick that the last fresh command answers; −1 for none."""
+        return self._answered
+
+    def protect(self, watchdog_s: float) -> None:
+        """Use another watchdog time from now on [s]."""
+        self._watchdog_ns = round(watchdog_s * 1e9)
+        self._watchdog = max(1, round(self._watchdog_ns / self.period_ns))
+        self._first_command_ns = self.first_command_ns(self._watchdog_ns)
+
+    def measurement(self, frame: bytes) -> bytes | None:
+        """A frame from the bus; returned if it may pass, and then it is a tick."""
+        if self.session is None:
+            return None
+        if self._is_silence(frame, "measurement"):
+            if not self._begun:
+                return None
+            self.counter = (self.counter + 1) % self._counters
+            self._count(1)
+            return frame
+        read = self.wire.measurement.unpack(frame)
+        if read is None:
+            self.refused += 1
+            return None
+        last, self.counter = self.counter, read[0]
+        if self._begun:
+            self._count((self.counter - last - 1) % self._counters + 1)
+        elif self.counter == 0:
+            self._begun, self._fresh_ns = True, None
+            self._count(1)
+        return frame if self._begun else None
+
+    def command(self, frame: bytes, now_ns: int) -> bytes | None:
+        """A frame from the controller that has the session; returned if it may pass.
+
+        The node judges again what passes; what is not fresh here does not feed the watchdog.
+        """
+        if self.session is None:
+            return None
+        if self._is_silence(frame, "command") and self.state is PlantState.DRIVEN:
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._said)
+        else:
+            read = self.wire.command.unpack(frame)
+        if read is None:
+            self.refused += 1
+            self._judged = Outcome.MALFORMED
+            return None
+        self._judged = self._judge(*read)
+        if self._judged is Outcome.ACTED:
+            self._fresh_ns = now_ns
+            self._machine.fire(PlantTrigger.COMMAND)
+        return frame
+
+    def watch(self, now_ns: int) -> bool:
+        """End the session when no fresh command came in time. In lockstep the node waits as long as it likes.
+
+        Returns:
+            Whether it ended the session, which is a tick without a measurement.
+        """
+        if self.session is None:
+            return False
+        if self._fresh_ns is None:
+            self._fresh_ns = now_ns
+        waited_ns = now_ns - self._fresh_ns
+        if self.state is PlantState.DRIVEN and waited_ns > self._watchdog_ns and not self.lockstep:
+            text = f"no fresh command for {waited_ns * 1e-6:.0f} ms"
+        elif self.state is PlantState.GRANTED and waited_ns > (limit_ns := self._first_limit_ns):
+            text = f"no first command within {limit_ns * 1e-9:.3g} s"
+        else:
+            return False
+        self._count(1)
+        self._trip(TripCause.COMMAND_TIMEOUT, text)
+        return True
+
+    @property
+    def _first_limit_ns(self) -> int:
+        return self._first_command_ns if self._begun else round(FIRST_COMMAND_S * 1e9)
+
+    def _count(self, ticks: int) -> None:
+        """A tick, so many periods after the last one of the session."""
+        self.ticked += 1
+        self._session_tick += ticks
+        self.outcome, self._judged = self._judged, Outcome.NONE
+
+    def _judge(self, echo: int, codes: tuple[float, ...]) -> Outcome:
+        """As the endpoint does."""
+        age = (self.counter - echo) % self._counters
+        answered = self._session_tick - age
+        if not self._begun or echo == self._echo or answered <= self._answered:
+            return Outcome.REPEATED
+        if age > self._watchdog:
+            self.stale += 1
+            return Outcome.STALE
+        self._said, self._echo, self._answered = codes, echo, answered
+        voltages = tuple(self._level(code) for code in codes)
+        self.voltages = voltages if isfinite(sum(voltages)) else self.off
+        return Outcome.ACTED
+
+    def _is_silence(self, frame: bytes, direction: Literal["measurement", "command"]) -> bool:
+        return frame == SILENCE and self.lockstep and getattr(self.wire.transmit, direction) == "on_change"
+
+    def _begin(self) -> None:
+        self.number = (self.number + 1) % SESSIONS
+        self._begun, self._session_tick, self._fresh_ns = False, -1, None
+        self._judged, self._said, self._echo, self._answered = Outcome.NONE, (), -1, -1
+
+    def _rest(self) -> None:
+        self.voltages, self._answered = self.off, -1
+
+
+class Bridge:
+    """The bridge as a process.
+
+    Args:
+        role: Its name on Zenoh.
+        loop: The grid.
+        wire: What the frames are.
+        settings: How the plant end looks after itself.
+        bus: The CAN bus, and which node of it the plant is.
+
+    Raises:
+        CanError: The bus cannot be opened, or a frame does not fit it.
+    """
+
+    def __init__(
+        self, role: Role, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, bus: CanSettings
+    ) -> None:
+        self._role = role
+        self._loop = loop
+        self._node = bus.node
+        self._relay = Relay(
+            wire,
+            loop.period_ns,
+            lockstep=loop.lockstep,
+            watchdog_s=settings.watchdog_s,
+            armed=settings.armed_at_start,
+        )
+        self._changed = Condition()
+        self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
+        self._presence = Presence(role, loop, self._relay, self._changed)
+        self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
+        self._beat_due = 0.0
+        self._reopen_due = 0.0
+        self._told = self._relay.state
+        self._arrival: Arrival | None = None  # the last command since the last tick
+        self._machine_notes: list[str] = []
+        self._granted_ns = 0
+
+    def run(self) -> None:
+        """Run until the role is told to stop; then the node is released, and a last status told."""
+        presence, relay = self._presence, self._relay
+        if not self._loop.lockstep:
+            presence.notes = self._machine_notes = prepare_process(self._loop)
+        presence.serve()
+        try:
+            while not self._role.stop.is_set():
+                with self._changed:
+                    self._changed.wait_for(self._frame_came, WAIT_S)
+                relay.unavailable = self._unavailable()
+                presence.take_inbox()
+                self._follow()
+                self._pass_frames()
+                if relay.watch(now_ns := time.monotonic_ns()):
+                    self._account(None, now_ns)
+                self._watch_node()
+                self._follow()
+                if self._bus.errors or self._bus.refused:
+                    count = f"the bus: {self._bus.errors} errors, {self._bus.refused} malformed frames"
+                    presence.notes = [*self._machine_notes, count]
+                presence.follow_session()
+                presence.tell_when_due()
+        finally:
+            if relay.session is not None:
+                relay.release(relay.session)
+            self._beat()
+            self._bus.close()
+            presence.leave()
+
+    def reconfigure(self, settings: PlantSettings) -> None:
+        """Take over what can change between two ticks: the watchdog."""
+        self._relay.operated("reconfigure", settings={"watchdog_s": settings.watchdog_s})
+        self._relay.protect(settings.watchdog_s)
+
+    def _frame_came(self) -> bool:
+        link = self._presence.link
+        return self._bus.pending or (link is not None and link.pending)
+
+    def _pass_frames(self) -> None:
+        arrival = self._bus.take()
+        if arrival is not None and self._relay.measurement(arrival.frame) is not None:
+            sent_ns = time.monotonic_ns()
+            self._presence.send(arrival.frame)
+            self._account(arrival.frame, sent_ns)
+        arrival = self._presence.link.take() if self._presence.link else None
+        if arrival is not None:
+            self._arrival = arrival
+            frame = self._relay.command(arrival.frame, time.monotonic_ns())
+            if frame is not None:
+                self._bus.send(frame)
+
+    def _account(self, measurement: bytes | None, sent_ns: int) -> None:
+        arrival, self._arrival = self._arrival, None
+        self._presence.after_tick(measurement, arrival, sent_ns)
+
+    def _watch_node(self) -> None:
+        """Trip when the bus or the node cannot be relied on any more."""
+        relay, bus = self._relay, self._bus
+        if bus.fault is not None:
+            relay.expire(TripCause.BUS, bus.fault)
+            self._mend(bus.fault)
+            return
+        heard = bus.heard
+        if relay.session is None or heard is None:
+            return
+        if bus.silent:
+            relay.expire(TripCause.NODE, f"node {self._node} has been silent for {bus.silent_s() * 1e3:.0f} ms")
+        elif heard.at_ns < self._granted_ns:
+            return  # it speaks of what was before this session
+        elif heard.fingerprint != self._fingerprint:
+            relay.expire(TripCause.NODE, f"node {self._node} has another wire spec now")
+        elif heard.state is PlantState.IDLE:
+            relay.expire(TripCause.NODE, f"node {self._node} was started again")
+        elif heard.state is PlantState.TRIPPED:
+            relay.expire(heard.cause or TripCause.NODE, f"node {self._node} tripped: {heard.cause or 'no cause told'}")
+
+    def _unavailable(self) -> str | None:
+        bus = self._bus
+        if bus.fault is not None:
+            return bus.fault
+        if bus.heard is None or bus.silent:
+            return f"node {self._node} is silent on the bus"
+        if bus.heard.fingerprint != self._fingerprint:
+            return f"node {self._node} has another wire spec, period or lockstep setting than the bridge"
+        return None
+
+    def _follow(self) -> None:
+        """Beat when it is due, and at once when the state has changed: the node follows it."""
+        relay = self._relay
+        if relay.state is not self._told:
+            if relay.state is PlantState.GRANTED:
+                self._bus.take()  # what came before the session is not of it
+                self._arrival = None
+                # The node's state is told ten times a second, and at once when it changes: what it says from here on
+                # may still be of before for as long as the first of our heartbeats takes.
+                self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
+            self._told = relay.state
+            self._beat()
+        elif time.monotonic() >= self._beat_due:
+            self._beat()
+
+    def _beat(self) -> None:
+        driven = self._relay.session is not None
+        state = PlantState.GRANTED if driven else PlantState.IDLE
+        self._beat_due = time.monotonic() + HEARTBEAT_S
+        self._bus.beat(Heartbeat(state, self._relay.number, self._fingerprint))
+
+    def _mend(self, fault: str) -> None:
+        self._role.warn("bus", "fault", f"{fault}; trying again twice a second")
+        if time.monotonic() >= self._reopen_due:
+            self._reopen_due = time.monotonic() + REOPEN_S
+            if self._bus.reopen():
+                self._role.event("changed", "the bus is open again")

@@ -1,0 +1,191 @@
+"""A plant behind an Endpoint, driven in time: the process at the plant end, whatever the plant and the network.
+
+The loop is wait → receive → tick → send → account. Who leads depends on the plant: on an emulated one the loop waits
+for the grid; hardware lets `advance` return when its next sample is there; in lockstep the loop waits for the answer to
+its last measurement, so that a run repeats bit for bit.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Final
+
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.plant import Plant
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.runtime.tick_grid import TickGrid
+from aeroloop.protocol.runtime.timing import LoopTiming
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+IDLE_WAIT_S: Final = 0.02
+ANSWER_SHARE: Final = 0.6
+"""Hardware's sample is answered within this share of the period, or in the next one."""
+
+
+class Driver:
+    """Drives a plant.
+
+    Args:
+        plant: The plant.
+        loop: The grid.
+        wire: How frames are read and written.
+        settings: How it looks after itself.
+        stop: Set when it is to end.
+
+    Raises:
+        ValueError: The wire commands another number of actuators than the plant has.
+
+    Attributes:
+        endpoint: Who grants, refuses and trips.
+    """
+
+    def __init__(
+        self, plant: Plant, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event
+    ) -> None:
+        self._plant = plant
+        self._loop = loop
+        self._settings = settings
+        self._stop = stop
+        self._counter = 0  # of the measurement sent last
+        self._command_bytes = wire.command.size
+        self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
+        self.endpoint = Endpoint(
+            plant,
+            wire,
+            loop.period_ns,
+            lockstep=loop.lockstep,
+            watchdog_s=settings.watchdog_s,
+            guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
+            armed=settings.armed_at_start,
+        )
+
+    def run(self, front: Front) -> None:
+        """Run until told to stop; then 0 V, and a last word."""
+        self._front = front
+        front.serve()
+        try:
+            if self._loop.lockstep:
+                self._run_lockstep()
+            else:
+                self._run_real_time()
+        finally:
+            self._plant.close()
+            front.leave()
+
+    def reconfigure(self, settings: PlantSettings) -> None:
+        """Take over what can change between two ticks: limits and watchdog."""
+        self._settings = settings
+        changed = {"watchdog_s": settings.watchdog_s, "limits": settings.limits.model_dump()}
+        self.endpoint.operated("reconfigure", settings=changed)
+        guard = settings.guard(self._loop.period_ns, self.endpoint.wire.voltage.quantizer().outermost)
+        self.endpoint.protect(settings.watchdog_s, guard)
+
+    def _run_real_time(self) -> None:
+        front = self._front
+        front.notes = prepare_process(self._loop)
+        timing = front.timing = LoopTiming()
+        grid = None if self._plant.paces else TickGrid(self._loop.period_ns)
+        while not self._stop.is_set():
+            skipped = grid.skipped if grid else 0
+            k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
+            timing.woke(grid.due_ns if grid else time.monotonic_ns())
+            before = self.endpoint.session
+            front.take_inbox()
+            if grid and self.endpoint.session not in (None, before):
+                # To grant took its time, and a session's first measurement tells the controller where the grid is.
+                k, skipped = grid.wait(), grid.skipped
+            self._tick(self._command(), k)
+            if self.endpoint.session:
+                front.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
+            timing.done()
+
+    def _command(self) -> Arrival | None:
+        """The command for this period. Hardware lets it act as soon as it is there, so it is worth a wait."""
+        link = self._front.link
+        if link is None:
+            return None
+        return link.wait(ANSWER_SHARE * self._loop.period) if self._plant.paces else link.take()
+
+    def _run_lockstep(self) -> None:
+        arrival = None
+        while not self._stop.is_set():
+            self._front.take_inbox()
+            if self._front.link is None or not self._may_step():
+                time.sleep(IDLE_WAIT_S if self._front.link is None else 0)
+                self._front.tell_when_due()
+                continue
+            echo = self._tick(arrival, self.endpoint.ticked + 1)
+            arrival = None if echo is None else self._await_answer(echo)
+
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """One tick of the plant end, without the network: as `Endpoint.tick`, with what stands in between.
+
+        Args:
+            frame: The newest command frame received since the last tick, or None.
+            k: Tick index, from 0, rising.
+        """
+        if frame and len(frame) != self._command_bytes:
+            frame = self._malformed
+        passed = self._incoming(frame)
+        measurement = self.endpoint.tick(passed, k)
+        if passed is None and frame is not None:
+            self.endpoint.outcome = Outcome.WITHHELD
+        return measurement
+
+    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
+        """One tick on the network. Returns the counter that an answer to its measurement will echo, if one will."""
+        front, measured = self._front, self.endpoint.wire.measurement
+        measurement = self.tick(arrival.frame if arrival is not None else None, k)
+        sent_ns = time.monotonic_ns()
+        echo = None
+        for sent in self._outgoing(measurement):
+            front.send(sent)
+            if self._loop.lockstep:
+                # The controller reads what has no counter as the tick after its last.
+                echo = measured.counter(sent)
+                self._counter = (self._counter + 1) % measured.counters if echo is None else echo
+                if sent == SILENCE:
+                    echo = self._counter
+        front.after_tick(measurement, arrival, sent_ns)
+        return echo
+
+    def _await_answer(self, echo: int) -> Arrival | None:
+        """The command that echoes a counter, or None when the session ends before it comes."""
+        deadline = time.monotonic() + self._settings.answer_timeout_s
+        while self._front.link and not self._stop.is_set():
+            arrival = self._front.link.wait(IDLE_WAIT_S)
+            if arrival is not None and _echo(self.endpoint.wire, arrival) in (echo, None):
+                return arrival
+            self._front.take_inbox()
+            if time.monotonic() > deadline:
+                self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
+            self._front.follow_session()
+            self._front.tell_when_due()
+        return None
+
+    # ── where somebody may stand in between ──
+
+    def _may_step(self) -> bool:
+        """Whether the next step in lockstep may be taken now."""
+        return True
+
+    def _incoming(self, frame: bytes | None) -> bytes | None:
+        """A command as it comes from the network; returned as the endpoint is to have it."""
+        return frame
+
+    def _outgoing(self, frame: bytes | None) -> list[bytes]:
+        """A measurement as the endpoint gives it; returned as what goes to the network."""
+        return [] if frame is None else [frame]
+
+
+def _echo(wire: WireSpec, arrival: Arrival) -> int | None:
+    read = wire.command.unpack(arrival.frame)
+    return None if read is None else read[0]

@@ -1,0 +1,213 @@
+"""What controllers and operators see of a plant: whoever stands at the plant end stands on the network through this.
+
+It answers claims and operators' verbs, opens and closes the session's link, publishes status, events and the trace, and
+counts the frames. Claims, verbs and lost peers come from Zenoh's threads and wait for the owner to take them between
+ticks: the endpoint is only ever touched by one thread.
+"""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+from threading import Condition
+from typing import Final
+
+from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, Status
+from aeroloop.protocol.messages.operator import Answer, Ask
+from aeroloop.protocol.messages.trace import Outcome, batches_per_s
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
+from aeroloop.protocol.transport.link import Arrival, Mailbox, ZenohLink
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.transmit import SILENCE
+
+STATUS_PERIOD_NS: Final = 1_000_000_000
+
+
+class Presence(Front):
+    """A plant end on the network.
+
+    Args:
+        role: Its name there.
+        loop: The grid.
+        endpoint: Who grants, refuses and trips.
+        changed: Notified when a command arrives, for an owner that waits for more than one thing.
+    """
+
+    def __init__(self, role: Role, loop: LoopSettings, endpoint: Tenancy, changed: Condition | None = None) -> None:
+        super().__init__()
+        self._role = role
+        self._loop = loop
+        self._endpoint = endpoint
+        self._link: ZenohLink | None = None
+        self._changed = changed
+        self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
+        self._latency = RollingHistogram()
+        self._counters = endpoint.wire.measurement.counters
+        self._sent_at: list[tuple[int, int]] = []  # session tick of each counter's last frame, and when it was sent
+        self._sent = self._received = 0
+        self._told_state = endpoint.state
+        self._since = _now() if endpoint.cause else None
+        self._status_tick = -1
+        self._status_due = 0
+        self._status_time = time.monotonic()
+
+    @property
+    def link(self) -> ZenohLink | None:
+        """The session's frames; None while there is no session."""
+        return self._link
+
+    def serve(self) -> None:
+        """Answer claims and operators from now on."""
+        role = self._role
+        role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
+        role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
+        role.serve("release", Release, lambda release: lambda: self._release(release))
+        role.serve("arm", Ask, lambda _: self._arm)
+        role.serve("stop", Ask, lambda _: self._stop)
+        role.watch_tokens(self._token)
+        role.announce()
+        role.event("started", f"{role.vehicle} waits for a claim")
+
+    def take_inbox(self) -> None:
+        """Between ticks: do what has come from controllers and operators."""
+        if self._role.take_inbox():
+            self.follow_session()
+
+    def send(self, frame: bytes) -> None:
+        """Send a measurement frame of the session; silence is sent only where it could not be heard, in lockstep."""
+        if self._link is not None and (frame or self._loop.lockstep):
+            self._link.send(frame)
+            self._sent += frame != SILENCE
+
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Account for a tick once its measurement is out: latency, the trace's row, events, a status that is due."""
+        endpoint = self._endpoint
+        self._trace.row(endpoint, measurement, arrival, sent_ns)
+        if endpoint.outcome is Outcome.ACTED:
+            answered = endpoint.answered
+            tick, at_ns = self._sent_at[answered % self._counters]
+            if tick == answered >= 0:
+                self._latency.add((sent_ns if arrival is None else arrival.at_ns) - at_ns)
+        elif endpoint.outcome is Outcome.STALE:
+            text = "commands answer measurements older than the watchdog's time: refused"
+            self._role.warn("stale", "fault", text, endpoint.session, endpoint.event_tick)
+        if measurement:
+            self._sent_at[endpoint.session_tick % self._counters] = endpoint.session_tick, sent_ns
+        if arrival is not None:
+            self._received += arrival.frame != SILENCE
+        self.follow_session()
+        self.tell_when_due()
+
+    def follow_session(self) -> None:
+        """Publish what happened, and close the link of a session that ended."""
+        self._trace.follow(self._endpoint)
+        endpoint = self._endpoint
+        if endpoint.state is not self._told_state:
+            self._told_state = endpoint.state
+            self._status_due = 0
+        if endpoint.session is None and self._link is not None:
+            self._link.close()
+            self._link = None
+        if not endpoint.notices:
+            return
+        if endpoint.cause is None:
+            self._since = None
+        elif any(notice.kind == "tripped" for notice in endpoint.notices):
+            self._told_state = endpoint.state
+        self._since = _now()
+        for notice in endpoint.notices:
+            self._role.event(*notice)
+        endpoint.notices.clear()
+        self._status_due = 0
+
+    def tell_when_due(self) -> None:
+        """Tell the status if a second is over, or something has happened."""
+        if time.monotonic_ns() >= self._status_due:
+            self.tell()
+
+    def leave(self) -> None:
+        """Tell that the plant is at 0 V and goes."""
+        self.follow_session()
+        self._trace.finish()
+        self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
+        self.tell()
+
+    # ── what came from Zenoh's threads, taken between ticks ──
+
+    def _token(self, name: str, came: bool) -> None:
+        if not came:
+            self._role.later(lambda: self._endpoint.lost(name))
+
+    def _claim(self, claim: Claim) -> Grant | Refusal:
+        answer = self._endpoint.claim(claim)
+        if isinstance(answer, Grant):
+            self._open_link(claim.session)
+        else:
+            text = f"{claim.controller} refused: {answer.reason}"
+            self._role.warn(text, "refused", text, claim.session)
+        return answer
+
+    def _release(self, release: Release) -> Answer:
+        done = self._endpoint.release(release.session)
+        return Answer(done=done, text="released" if done else f"no session {release.session} runs here")
+
+    def _arm(self) -> Answer:
+        vehicle = self._role.vehicle
+        if self._endpoint.arm():
+            return Answer(done=True, text=f"{vehicle} is armed: the next controller to claim it may drive it")
+        return Answer(done=False, text=f"{vehicle} is held by {self._endpoint.holder}, so there is nothing to arm")
+
+    def _stop(self) -> Answer:
+        self._endpoint.stop()
+        return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
+
+    def _open_link(self, session: str) -> None:
+        """Listen for commands before the grant goes out, so that the first one finds somebody."""
+        vehicle = self._role.vehicle
+        self._sent_at = [(-1, 0)] * self._counters
+        self._link = ZenohLink(
+            self._role.zenoh,
+            send_key=topics.key("measurement", vehicle, session=session),
+            receive_key=topics.key("command", vehicle, session=session),
+            lossless=self._loop.lockstep,
+            mailbox=Mailbox(self._changed),
+        )
+
+    def tell(self) -> None:
+        """Tell the status."""
+        now = time.monotonic()
+        endpoint = self._endpoint
+        self._latency.turn_when_due()
+        self._role.status(
+            Status(
+                role=self._role.role,
+                state=endpoint.state,
+                session=endpoint.session,
+                cause=endpoint.cause,
+                since=self._since,
+                uptime_s=self._role.uptime_s,
+                ticks=endpoint.ticked + 1,
+                rate_hz=max(0.0, (endpoint.ticked - self._status_tick) / (now - self._status_time)),
+                skipped=self.skipped,
+                received=self._received,
+                sent=self._sent,
+                refused=endpoint.refused,
+                stale=endpoint.stale,
+                saturated=endpoint.saturated,
+                latency_us=summary(self._latency.total),
+                recent_latency_us=summary(self._latency.recent()),
+                timing=report(self.timing) if self.timing else None,
+                notes=self.notes,
+            )
+        )
+        self._status_tick, self._status_time = endpoint.ticked, now
+        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,266 @@
+"""Replay of an emulated plant: the plant end computed again from its own rows, and compared byte for byte.
+
+The emulator is sans-I/O below its driver: its settings, seeds and faults, what was received at each tick, and what was
+done between ticks determine everything that it measures. A replay starts at the first row of the plant's process, where
+the plant's state is known, and goes on as long as no row is missing.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Refusal
+from aeroloop.protocol.messages.trace import NEVER, Batch, Operation, Sent
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+_FIELDS: Final = ("session", "session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
+"""What is compared of a row, in the order in which a difference is looked for."""
+
+
+class PlantDifference(BaseModel):
+    """The first row that was computed otherwise than it was logged."""
+
+    model_config = ConfigDict(frozen=True)
+
+    tick: int = Field(description="of the plant, since its process started")
+    session: str
+    session_tick: int
+    field: str = Field(description="column of the row")
+    logged: str
+    computed: str
+
+
+class PlantReplayed(BaseModel):
+    """What the replay of one process of the plant has shown."""
+
+    model_config = ConfigDict(frozen=True)
+
+    ticks: int = Field(description="rows compared")
+    differ: int = Field(description="of them, rows that were computed otherwise")
+    first_difference: PlantDifference | None
+    stopped: str | None = Field(description="why it ends before the log does; null if it does not")
+
+
+def why_not(plant: PlantSettings) -> str | None:
+    """Why a plant cannot be computed again; None if it can."""
+    return None if plant.via == "emulator" else f"plant.via is {plant.via!r}: only an emulated plant is computed again"
+
+
+class PlantReplay:
+    """Replays one process of an emulated plant.
+
+    Args:
+        loop: The grid, as the process began with it.
+        wire: How frames were read and written.
+        plant: The plant, as the process began with it: what was reconfigured later is in the trace.
+
+    Raises:
+        ValueError: `why_not` says why.
+    """
+
+    def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
+        if reason := why_not(plant):
+            raise ValueError(reason)
+        self._plant = plant
+        self._emulator = Emulator(loop, wire, plant, threading.Event())
+        self._wire = wire
+        self._none = bytes(wire.measurement.size)
+        self._malformed = bytes(wire.command.size + 1)
+        self._run: int | None = None
+        self._rows = self._ticks = self._differ = 0
+        self._first: PlantDifference | None = None
+        self._stopped: str | None = None
+        self._empty_at: set[int] = set()  # bases of batches without rows since the last row
+
+    def feed(self, batch: Batch) -> bool:
+        """Replay a batch of the run, in order; one that was fed before is passed over.
+
+        Returns:
+            Whether the replay goes on; after a gap it does not.
+        """
+        if self._run is None:
+            self._run = batch.header.run
+        if self._stopped is None and not self._known(batch):
+            self._stopped = self._cannot_follow(batch)
+            if self._stopped is None:
+                self._replay(batch)
+        return self._stopped is None
+
+    def result(self) -> PlantReplayed:
+        """What has been found so far."""
+        stopped = self._stopped
+        if self._run is None and stopped is None:
+            stopped = "the log has no trace of the plant"
+        return PlantReplayed(ticks=self._ticks, differ=self._differ, first_difference=self._first, stopped=stopped)
+
+    def _known(self, batch: Batch) -> bool:
+        """Whether a batch was fed before: a recorder that starts again gets the last minute again."""
+        header = batch.header
+        if header.run != self._run:
+            return False
+        if header.rows == 0:
+            known = header.first_row < self._rows or header.monotonic_ns in self._empty_at
+            self._empty_at.add(header.monotonic_ns)
+            return known
+        return header.first_row < self._rows
+
+    def _cannot_follow(self, batch: Batch) -> str | None:
+        header = batch.header
+        if header.run != self._run:
+            return "the plant was started again"
+        if (header.measurement_bytes, header.command_bytes, header.actuators) != (
+            self._wire.measurement.size,
+            self._wire.command.size,
+            self._wire.actuators,
+        ):
+            return "the rows are not of the wire that the contract describes"
+        if header.first_row > self._rows:
+            if not self._rows:
+                return "the log lacks the plant's first row, so the plant's state is not known"
+            return f"{header.first_row - self._rows} rows are missing after row {self._rows - 1} of the plant"
+        return None
+
+    # ── a batch ──
+
+    def _replay(self, batch: Batch) -> None:
+        operations = iter(batch.tail.operations)
+        operation = next(operations, None)
+        for tick, frame, logged in self._inputs(batch):
+            while operation is not None and operation.tick < tick:
+                if not self._operate(operation):
+                    return
+                operation = next(operations, None)
+            if self._emulator.endpoint.session is None:
+                self._stopped = f"tick {tick} is in a session whose claim is missing"
+                return
+            self._compare(tick, frame, logged)
+        while operation is not None and self._operate(operation):
+            operation = next(operations, None)
+        if batch.header.rows:
+            self._rows = batch.header.first_row + batch.header.rows
+            self._empty_at.clear()
+
+    def _inputs(self, batch: Batch) -> Iterator[tuple[int, bytes | None, tuple[object, ...]]]:
+        """Tick, command and what is to be compared of each row."""
+        rows = batch.columns
+        session = batch.header.session
+        answered = rows["answered"].astype(np.int64)
+        columns = [
+            rows["session_tick"].tolist(),
+            rows["sent_as"].tolist(),
+            rows["outcome"].tolist(),
+            rows["trip"].tolist(),
+            np.where(answered == NEVER, -1, answered).tolist(),
+            _frames(rows["measurement"]),
+            [row.tobytes() for row in rows["voltages"]],
+        ]
+        received = zip(
+            rows["tick"].tolist(), rows["received_as"].tolist(), _frames(rows["command"]), *columns, strict=True
+        )
+        for tick, received_as, command, *logged in received:
+            if received_as == Sent.FRAME:
+                frame: bytes | None = command
+            elif received_as == Sent.SILENT:
+                frame = SILENCE
+            else:
+                frame = None if received_as == Sent.NONE else self._malformed
+            yield tick, frame, (session, *logged)
+
+    def _compare(self, tick: int, frame: bytes | None, logged: tuple[object, ...]) -> None:
+        endpoint = self._emulator.endpoint
+        session = endpoint.session
+        measurement = self._emulator.tick(frame, tick)
+        ended = endpoint.session is None and endpoint.trip is not None
+        computed = (
+            session,
+            endpoint.session_tick,
+            Sent.FRAME if measurement else Sent.NONE if measurement is None else Sent.SILENT,
+            endpoint.outcome,
+            endpoint.trip.number if ended and endpoint.trip is not None else 0,
+            endpoint.answered,
+            measurement or self._none,
+            np.array(endpoint.voltages).tobytes(),
+        )
+        self._ticks += 1
+        if computed != logged:
+            self._differ += 1
+            if self._first is None:
+                self._first = self._difference(tick, logged, computed)
+
+    @staticmethod
+    def _difference(tick: int, logged: tuple[object, ...], computed: tuple[object, ...]) -> PlantDifference:
+        i = next(i for i, (a, b) in enumerate(zip(logged, computed, strict=True)) if a != b)
+        return PlantDifference(
+            tick=tick,
+            session=str(logged[0]),
+            session_tick=int(str(logged[1])),
+            field=_FIELDS[i],
+            logged=_text(_FIELDS[i], logged[i]),
+            computed=_text(_FIELDS[i], computed[i]),
+        )
+
+    # ── between ticks ──
+
+    def _operate(self, operation: Operation) -> bool:
+        """Let the plant come to an operation's tick, and do it. Whether it could be done."""
+        emulator, endpoint = self._emulator, self._emulator.endpoint
+        if operation.tick > endpoint.ticked:
+            if endpoint.session is not None:
+                self._stopped = f"rows are missing before tick {operation.tick}, where a session runs"
+                return False
+            emulator.tick(None, operation.tick)
+        match operation.kind:
+            case "claim":
+                assert operation.claim is not None
+                answer = endpoint.claim(operation.claim)
+                if isinstance(answer, Refusal):
+                    self._stopped = f"the claim after tick {operation.tick} is refused: {answer.reason}"
+            case "release":
+                endpoint.release(operation.name or "")
+            case "arm":
+                endpoint.arm()
+            case "stop":
+                endpoint.stop()
+            case "lost":
+                endpoint.lost(operation.name or "")
+            case "expire":
+                assert operation.cause is not None
+                endpoint.expire(operation.cause, operation.reason or "")
+            case "inject":
+                emulator.inject(None if operation.name is None else Fault.parse(operation.name))
+            case "reconfigure":
+                self._reconfigure(operation)
+        endpoint.operations.clear()
+        endpoint.notices.clear()
+        return self._stopped is None
+
+    def _reconfigure(self, operation: Operation) -> None:
+        changed = operation.settings or {}
+        self._plant = self._plant.model_copy(
+            update={"watchdog_s": changed["watchdog_s"], "limits": LimitSettings.model_validate(changed["limits"])}
+        )
+        self._emulator.reconfigure(self._plant)
+
+
+def _frames(column: npt.NDArray[np.void]) -> list[bytes]:
+    """A column of frames as bytes."""
+    whole, size = column.tobytes(), column.dtype.itemsize
+    return [whole[at : at + size] for at in range(0, len(whole), size)]
+
+
+def _text(field: str, value: object) -> str:
+    if field == "voltages" and isinstance(value, bytes):
+        return " ".join(f"{volts!r} V" for volts in np.frombuffer(value).tolist())
+    return value.hex() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,125 @@
+"""The emulated plant: a mechanism, with rotors, friction and wind acting on it and sensors looking at it.
+
+Each piece knows itself; this is where they meet. Motors clip the command to the supply, rotors lag behind it, friction
+and wind load the mechanism's axes, a Runge–Kutta step lets time pass, and the sensors say what they see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+from aeroloop.plant_emulator.model.friction import FrictionSettings, friction_torque
+from aeroloop.plant_emulator.model.integrate import rk4
+from aeroloop.plant_emulator.model.mechanism import Mechanism
+from aeroloop.plant_emulator.model.rotor import RotorSettings, rotor_derivative, thrust_voltage
+from aeroloop.plant_emulator.model.sensors import Sensors
+from aeroloop.plant_emulator.model.wind import Wind
+from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.symbolic import Compiled
+
+
+def step_function(
+    mechanism: Mechanism, rotor: RotorSettings, friction: FrictionSettings, period: float, substeps: int
+) -> ca.Function:
+    """One period of the plant under held voltages and wind.
+
+    Inputs: x (the mechanism's state, then the rotors' voltages if they lag), u [V], wind [N·m]. Outputs: the state
+    after, and its q, ω and joint angles.
+    """
+    n, m = len(mechanism.initial), mechanism.actuators
+    x = ca.SX.sym("x", n + (m if rotor.present else 0))
+    u, wind = ca.SX.sym("u", m), ca.SX.sym("wind", mechanism.axes)
+
+    def derivative(state: ca.SX) -> ca.SX:
+        body, rotors = state[0:n], state[n:]
+        voltages = thrust_voltage(rotor, rotors if rotor.present else u)
+        load = friction_torque(friction, mechanism.axis_rates(body)) + wind
+        body_dot = mechanism.derivative(body, voltages, load)
+        return ca.vertcat(body_dot, rotor_derivative(rotor, rotors, u)) if rotor.present else body_dot
+
+    stepped = rk4(derivative, x, period, substeps)
+    after = ca.vertcat(mechanism.settle(stepped[0:n]), stepped[n:])
+    body = after[0:n]
+    return ca.Function(
+        "step",
+        [x, u, wind],
+        [after, mechanism.attitude(body), mechanism.rate(body), mechanism.axis_angles(body)],
+        ["x", "u", "wind"],
+        ["after", "attitude", "rate", "angles"],
+    )
+
+
+class EmulatedPlant(Plant):
+    """A plant that is computed, so its state is known.
+
+    Args:
+        mechanism: The body.
+        rotor: How thrust follows voltage.
+        friction: What opposes its motion.
+        wind: What blows at it.
+        sensors: What looks at it.
+        period: Time that `advance` lets pass [s].
+        voltage_limit: Largest voltage of the supply [V].
+        substeps: Runge–Kutta steps a period.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        rotor: RotorSettings,
+        friction: FrictionSettings,
+        wind: Wind,
+        sensors: Sensors,
+        *,
+        period: float,
+        voltage_limit: float,
+        substeps: int,
+    ) -> None:
+        self.actuators = mechanism.actuators
+        self._wind, self._sensors, self._limit = wind, sensors, voltage_limit
+        self._step = Compiled(step_function(mechanism, rotor, friction, period, substeps))
+        self._x, self._u, self._load = (self._step.inputs[name] for name in ("x", "u", "wind"))
+        self._after, self._q, self._omega, self._angles = (
+            self._step.outputs[name] for name in ("after", "attitude", "rate", "angles")
+        )
+        for i, value in enumerate(mechanism.initial):
+            self._x[i] = value
+        start = ca.SX(mechanism.initial)
+        initial = ca.Function("start", [], [mechanism.attitude(start), mechanism.rate(start)])()
+        self._attitude: Quaternion = tuple(float(v) for v in initial["o0"].elements())  # type: ignore[assignment]  # 4
+        self._rate: Vector = tuple(float(v) for v in initial["o1"].elements())  # type: ignore[assignment]  # 3
+        angles = ca.Function("start", [], [mechanism.axis_angles(start)])()["o0"]
+        self._measurement = sensors.read(self._attitude, self._rate, [float(v) for v in angles.elements()])
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Hold voltages [V], clipped to the supply's limits. Shape (actuators,)."""
+        limit = self._limit
+        for i, voltage in enumerate(voltages):
+            self._u[i] = max(-limit, min(limit, voltage))
+
+    def advance(self) -> None:
+        """Integrate one period and let the sensors look."""
+        if not self._wind.calm:
+            for i, torque in enumerate(self._wind.sample()):
+                self._load[i] = torque
+        self._step()
+        self._x[:] = self._after
+        w, x, y, z = self._q
+        a, b, c = self._omega
+        self._attitude, self._rate = (w, x, y, z), (a, b, c)
+        self._measurement = self._sensors.read(self._attitude, self._rate, self._angles)
+
+    def measure(self) -> Measurement:
+        """What the sensors said at the end of the last period."""
+        return self._measurement
+
+    def truth(self) -> State:
+        """The unquantized state now."""
+        return State(self._attitude, self._rate, tuple(self._u))
+
+    def close(self) -> None:
+        """0 V."""
+        self.actuate((0.0,) * len(self._u))

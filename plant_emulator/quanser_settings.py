@@ -1,0 +1,60 @@
+"""Settings of Quanser's board: which one, its channels, signs and scales."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+Sign: TypeAlias = Literal[-1, 1]
+
+CardType: TypeAlias = Literal["quanser_aero2_usb", "quanser_aero_usb"]
+
+PITCH_COUNTS: Final[Mapping[str, int]] = {"quanser_aero2_usb": 2880, "quanser_aero_usb": 2048}
+
+
+class QuanserSettings(BaseModel):
+    """The board, and how its channels lie to the body. Signs and the gyro's axes are to be tried on the bench."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, as the interface names them")
+    card_identifier: str = Field(
+        default="0", min_length=1, description="which board; a virtual one is '0@tcpip://localhost:18950'"
+    )
+    rate: Literal["derivative", "gyro"] = Field(
+        default="derivative", description="derivative: of the encoders' angles, filtered"
+    )
+    pitch_counts: int | None = Field(
+        default=None, gt=0, description="pitch encoder's counts a turn; as the card type has if left out (2880, 2048)"
+    )
+    yaw_counts: int = Field(default=4096, gt=0, description="yaw encoder's counts a turn")
+    encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
+    bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
+    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter")
+    gyro_axes: tuple[int, int, int] = Field(
+        default=(0, 1, 2), description="which of the gyro's channels 0, 1, 2 measures the body's x, y, z"
+    )
+    gyro_signs: tuple[Sign, Sign, Sign] = Field(default=(1, 1, 1), description="of the body's x, y, z")
+    gyro_scale: float = Field(default=1.0, gt=0, description="rate that the gyro calls 1 [rad/s]")
+    motor_channels: tuple[int, int] = Field(default=(0, 1), description="analog outputs of u2 and u3")
+    motor_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of u2 and u3")
+    voltage_limit: float = Field(
+        default=18.0, gt=0, le=24, description="largest voltage of a motor [V]; 18 is recommended, 24 the most"
+    )
+    board_watchdog_s: float = Field(
+        default=0.1, gt=0, le=10, description="the board itself goes to 0 V after this long without a good sample [s]"
+    )
+
+    @field_validator("gyro_axes", "motor_channels")
+    @classmethod
+    def _each_channel_once(cls, channels: tuple[int, ...]) -> tuple[int, ...]:
+        if sorted(channels) != list(range(len(channels))):
+            raise ValueError(f"must name each of 0…{len(channels) - 1} once")
+        return channels
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Encoder counts a turn, pitch and yaw."""
+        return self.pitch_counts or PITCH_COUNTS[self.card_type], self.yaw_counts

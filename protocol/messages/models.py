@@ -1,0 +1,189 @@
+"""What crosses the network and is not a frame: JSON, by pydantic.
+
+Fields with a unit say it in their description, so that the JSON schema in a log explains the log.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import AfterValidator, Field, PlainSerializer, StringConstraints
+
+from aeroloop.protocol.messages import operator as verbs
+from aeroloop.protocol.messages.operator import Message
+from aeroloop.protocol.messages.topics import TOPICS, Topic
+from aeroloop.protocol.wire.spec import WireSpec
+
+PROTOCOL_VERSION: Final = 2
+
+EventKind = Literal[
+    "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
+]
+
+
+def _no_other_topics_key(session: str) -> str:
+    if any(session == topic.key.partition("/")[0] for topic in TOPICS.values()):
+        raise ValueError(f"{session!r} is the key of a topic and cannot name a session")
+    return session
+
+
+SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"), AfterValidator(_no_other_topics_key)]
+"""One chunk of a key, and no other topic's."""
+
+
+class Claim(Message):
+    """A controller's question to a plant: may I have this vehicle?"""
+
+    protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md the controller speaks")
+    controller: str = Field(description="who asks; the name of its liveliness token")
+    session: SessionName = Field(description="the key its frames would travel under; new for every claim")
+    period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
+    lockstep: bool = Field(description="the plant waits for each answer before it steps")
+    auto_arm: bool = Field(default=False, description="arm the plant by this claim, unless an operator stopped it")
+    wire: Annotated[WireSpec, PlainSerializer(WireSpec.agreed)]
+
+
+class Grant(Message):
+    """The plant's answer to a claim: yes. The first measurement follows at once."""
+
+    granted: Literal[True] = True
+    session: str
+
+
+class Refusal(Message):
+    """The plant's answer to a claim: no, and why."""
+
+    granted: Literal[False] = False
+    reason: str = Field(description="for a person")
+    holder: str | None = Field(default=None, description="who has the vehicle, if somebody has")
+    differences: list[str] = Field(default_factory=list, description="fields of the claim that do not fit the plant")
+
+
+class Release(Message):
+    """A controller gives its session back; the plant goes to 0 V."""
+
+    session: str
+
+
+class Contract(Message):
+    """Who a role is and how it was configured: all that a reader of the log needs to read it."""
+
+    protocol: int = Field(description="version of SPEC.md that the role speaks; 1 did not say")
+    role: str
+    vehicle: str
+    host: str
+    versions: dict[str, str]
+    facts: dict[str, str] = Field(default_factory=dict, description="the machine, and what of it bears on time")
+    config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
+    freshness_s: float | None = Field(
+        default=None,
+        description="2^counter_bits periods: a frame that is later than this may be taken for a newer one [s]",
+    )
+    certificate: dict[str, Any] | None = Field(
+        default=None,
+        description="controller: what the theorem promises of it, as `aeroloop lab certify --json` says it",
+    )
+
+
+class Percentiles(Message):
+    """Percentiles of a duration in µs, from a histogram with bins 4.4 % wide."""
+
+    count: int
+    p50: float
+    p99: float
+    p999: float = Field(description="99.9th percentile")
+    max: float
+
+
+class Timing(Message):
+    """How well a loop keeps time, since its start-up and over the last ten seconds."""
+
+    wake: Percentiles | None = Field(description="from when a tick was due to when it began [µs]")
+    busy: Percentiles | None = Field(description="from when it began to when it was over [µs]")
+    period: Percentiles | None = Field(description="from one beginning to the next [µs]")
+    recent_wake: Percentiles | None = Field(description="`wake`, last 10 s")
+    recent_busy: Percentiles | None = Field(description="`busy`, last 10 s")
+    recent_period: Percentiles | None = Field(description="`period`, last 10 s")
+
+
+class Status(Message):
+    """How a role is doing; the last one before it ends is final."""
+
+    role: str
+    state: str
+    session: str | None = None
+    cause: str | None = Field(
+        default=None, description="plant: why it may not be driven; controller: why it claims none; where that is so"
+    )
+    since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
+    uptime_s: float
+    ticks: int = Field(description="ticks since start")
+    rate_hz: float = Field(description="ticks a second since the last status")
+    skipped: int = Field(description="grid ticks of the session that were missed, never made up for")
+    received: int = Field(default=0, description="frames (recorder: messages) taken in since start")
+    sent: int = Field(default=0, description="frames sent since start")
+    refused: int = Field(default=0, description="malformed frames since start")
+    stale: int = Field(default=0, description="frames since start that came too late to be acted upon")
+    saturated: int = Field(default=0, description="values beyond a quantizer's range since start")
+    latency_us: Percentiles | None = Field(
+        default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
+    )
+    recent_latency_us: Percentiles | None = Field(default=None, description="`latency_us`, last 10 s")
+    age_us: Percentiles | None = Field(
+        default=None,
+        description="controller: from a measurement received to the command that answers it sent, last 10 s [µs]",
+    )
+    timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
+    notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
+
+
+class Telemetry(Message):
+    """What the controller computed at one tick."""
+
+    session: str
+    tick: int = Field(description="tick k of the law; its time is k·period")
+    counter: int = Field(description="counter of the measurement it used")
+    attitude_error: tuple[float, float, float] = Field(description="ε̃ of the quantized attitude [1]")
+    rate_error: tuple[float, float, float] = Field(description="ω_e of the quantized rates, body frame [rad/s]")
+    desired: tuple[float, float, float, float] = Field(description="q_d [1]")
+    damping_estimate: tuple[float, float, float] = Field(description="θ̂ [N·m·s/rad]")
+    voltages: tuple[float, ...] = Field(description="u before quantization [V]")
+    sign: int = Field(description="the equilibrium approached, z₁₊ or z₁₋")
+
+
+class Truth(Message):
+    """The emulator's unquantized state. Never fed to the controller."""
+
+    tick: int = Field(description="plant tick since start; its time is tick·period")
+    attitude: tuple[float, float, float, float] = Field(description="q, body relative to inertial [1]")
+    rate: tuple[float, float, float] = Field(description="ω, body frame [rad/s]")
+    voltages: tuple[float, ...] = Field(description="voltages at the motors [V]")
+    session: str | None = Field(default=None, description="whose measurement was taken of this very state, if one was")
+    session_tick: int | None = Field(default=None, description="that measurement's tick since the session's first")
+
+
+class Event(Message):
+    """Something that happened once."""
+
+    role: str
+    kind: EventKind
+    text: str = Field(description="one line for a person: what, why, and since when if that is known")
+    session: str | None = None
+    tick: int | None = Field(default=None, description="the session's tick at which it happened, if it was at one")
+
+
+class Loss(Message):
+    """Messages of one key that the recorder knows are not in the log."""
+
+    key: str
+    count: int = Field(ge=1, description="how many are missing")
+    reason: Literal["network", "queue", "disk"] = Field(
+        description="network: published, and neither received nor recovered; queue: received faster than they could be "
+        "written; disk: the log could not be written"
+    )
+
+
+def model_of(topic: Topic) -> type[Message]:
+    """The model of what a topic of messages carries. Raises KeyError for a topic of frames."""
+    model: type[Message] = globals().get(topic.model) or vars(verbs)[topic.model]
+    return model

@@ -1,0 +1,158 @@
+"""What an operator can ask of a running system, and what has changed: messages with the bounds that hold for them.
+
+A reference says roll, pitch and yaw over time. Whatever it is, it is joined to what was followed before by a quintic
+over `within_s`, so that angle, rate and acceleration never jump.
+"""
+
+from __future__ import annotations
+
+from math import isfinite, pi
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from aeroloop.protocol.wire.attitude import Vector
+
+MAX_POINTS: Final = 10_000
+
+
+class Message(BaseModel):
+    """A message; unknown fields are refused, so that two versions that differ do not half understand each other."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def encode(self) -> bytes:
+        """The message as JSON."""
+        return self.model_dump_json().encode()
+
+
+def _finite(triple: Vector) -> Vector:
+    if not all(isfinite(value) for value in triple):
+        raise ValueError("every element must be a number")
+    return triple
+
+
+def _gain(gains: Vector) -> Vector:
+    if min(gains) <= 0 or max(gains) > MAX_GAIN:
+        raise ValueError(f"every element must be positive and at most {MAX_GAIN:g}")
+    return gains
+
+
+MAX_GAIN: Final = 20.0
+Gain = Annotated[Vector, AfterValidator(_finite), AfterValidator(_gain)]
+"""The diagonal of a positive definite gain matrix, bounded: no typing error makes it a hundred times too large."""
+
+Angles = Annotated[Vector, AfterValidator(_finite)]
+"""Roll, pitch, yaw [deg]."""
+
+Frequency = Annotated[float, Field(ge=0, le=100)]
+
+
+class Sinusoid(Message):
+    """amplitude · sin(frequency · t) on each of roll, pitch and yaw. The default is the paper's experiment, C.5."""
+
+    kind: Literal["sinusoid"] = "sinusoid"
+    amplitude: Angles = Field(default=(0.0, 40.0, 100.0), description="of roll, pitch, yaw [deg]")
+    frequency: tuple[Frequency, Frequency, Frequency] = Field(
+        default=(0.0, 0.1 * pi, 0.05 * pi), description="of roll, pitch, yaw [rad/s]"
+    )
+
+
+class Hold(Message):
+    """One attitude, for ever."""
+
+    kind: Literal["hold"] = "hold"
+    attitude: Angles | None = Field(
+        default=None, description="roll, pitch, yaw [deg]; null: where the body is brought to rest, or 0 at the start"
+    )
+
+
+class Points(Message):
+    """Attitudes at given times, joined smoothly, from rest to rest; the last one is held."""
+
+    kind: Literal["points"] = "points"
+    times: list[float] = Field(min_length=2, max_length=MAX_POINTS, description="rising, from 0 [s]")
+    attitudes: list[Angles] = Field(min_length=2, max_length=MAX_POINTS, description="roll, pitch, yaw each [deg]")
+
+    @model_validator(mode="after")
+    def _a_time_for_each(self) -> Points:
+        if len(self.times) != len(self.attitudes):
+            raise ValueError(f"{len(self.times)} times for {len(self.attitudes)} attitudes")
+        if self.times[0] != 0 or not all(isfinite(t) for t in self.times):
+            raise ValueError("the first time must be 0, and every time a number")
+        if any(after - before < 1e-3 - 1e-9 for before, after in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("times must rise by at least a millisecond")
+        return self
+
+
+class Stream(Message):
+    """Whatever comes on the `reference` topic; when nothing comes, the last set-point is held."""
+
+    kind: Literal["stream"] = "stream"
+    timeout_s: float = Field(default=0.5, gt=0, le=60, description="a stream silent for longer is told and held [s]")
+    within_s: float = Field(default=0.2, ge=0.02, le=60, description="time to reach each set-point [s]")
+
+
+Reference = Annotated[Sinusoid | Hold | Points | Stream, Field(discriminator="kind")]
+
+
+class Setpoint(Message):
+    """One message of a live stream of set-points."""
+
+    attitude: Angles = Field(description="roll, pitch, yaw [deg]")
+
+
+class Gains(Message):
+    """The law's gains, each the diagonal of its matrix. What is null stays as it is."""
+
+    C1: Gain | None = Field(default=None, description="of the attitude error [1/s]")
+    C2: Gain | None = Field(default=None, description="of the rate error [N·m·s/rad]")
+    Gamma: Gain | None = Field(default=None, description="of the adaptation [N·m·s²/rad² per s]")
+
+
+class Ask(Message):
+    """A question that needs no words: arm, stop, stand down, recall."""
+
+
+class Track(Message):
+    """Follow another reference from the next tick on."""
+
+    reference: Reference
+    within_s: float = Field(default=2.0, ge=0.02, le=600, description="time to reach it from the present one [s]")
+
+
+class Change(Message):
+    """What a controller follows from a tick on: told at the start of every session, and whenever it changes.
+
+    With the frames, the changes and the contract, the session can be computed again to the last bit.
+    """
+
+    session: str
+    tick: int = Field(description="the first tick k of the law to which it applies")
+    gains: Gains | None = Field(default=None, description="null: as before")
+    reference: Reference | None = Field(default=None, description="null: as before")
+    within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: at once [s]")
+    start: Angles | None = Field(
+        default=None,
+        description="where the way to the reference starts, at rest; null: where one was [deg]",
+    )
+    ease_s: float = Field(default=0.0, description="time to let the acceleration of before go, before that [s]")
+
+
+class Inject(Message):
+    """Put a fault on an emulated plant, now; null clears all faults."""
+
+    fault: str | None = Field(description="signal:kind[=value][@start[..end]], seconds from now")
+
+
+class Advance(Message):
+    """Let a plant in lockstep that steps on request go on for so long."""
+
+    seconds: float = Field(gt=0, le=86_400, description="of the plant's time [s]")
+
+
+class Answer(Message):
+    """A role's answer to an operator."""
+
+    done: bool
+    text: str = Field(description="one line for a person: what was done, or why not")

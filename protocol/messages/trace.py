@@ -1,0 +1,481 @@
+"""Trace: what each end did, tick by tick, published in columnar batches that numpy reads.
+
+An end adds a row at every tick of a session. Rows gather in a preallocated buffer, as records; a batch turns them into
+columns, which compress to two thirds of the records' size:
+
+    header (112 bytes) · columns, one after another · tail (JSON)
+
+`SPEC.md`, section 10, defines every byte, with golden vectors. Both writers are sans-I/O: the owner passes times and
+publishes what `take` returns. Times in rows are whole microseconds after the header's `monotonic_ns`, on the end's own
+monotonic clock; nothing here compares the clocks of two hosts.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, ValidationError
+
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
+from aeroloop.protocol.messages.operator import Change, Message
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+
+End = Literal["controller", "plant"]
+ENDS: Final[tuple[End, ...]] = ("controller", "plant")
+
+MAX_ROWS: Final = 256
+"""Rows of a batch at the most."""
+
+STEPS: Final = ("tick", "session_tick", "answered", "received", "sent")
+"""Columns that hold steps from row to row, modulo their type's range: ticks and times rise evenly, so they compress
+to a fifth. The first row's step is from 0."""
+
+NEVER: Final = 0xFFFF_FFFF
+"""In a column of times or of session ticks: there is none."""
+
+_BATCHES_BEYOND: Final = 1.25
+"""Batches beyond those of a steady loop: sessions that begin and end, operations between them."""
+
+_FASTEST_HZ: Final = 10_000.0
+"""In lockstep ticks come as fast as they are computed, whatever the grid's rate."""
+
+_HEADER: Final = struct.Struct("<BBBBHHIIQQqq64s")
+HEADER_BYTES: Final = _HEADER.size
+_FINAL: Final = 1
+_MARGIN_NS: Final = 1_000_000_000
+"""The base of a batch's times is so long before its first row: a command may be received before the row begins."""
+
+_MASK: Final = 0xFFFF_FFFF
+"""Times wrap after 71 minutes, which no batch lasts: `due` is looked at after every row."""
+
+
+class Sent(IntEnum):
+    """What an end did with the frame of a tick: a measurement at the plant, a command at the controller.
+
+    The plant's `received_as` says with it what was received since the last tick.
+    """
+
+    NONE = 0
+    FRAME = 1
+    SILENT = 2
+    MALFORMED = 3
+    """Received, of another length than the wire's frames: nothing of it is in the row."""
+
+
+class Received(IntEnum):
+    """What the controller computed a tick with."""
+
+    FRAME = 0
+    SILENT = 1
+    LATE = 2
+    """The frame came when its tick was over, or stale: its levels hold from the next tick on, and nothing is sent."""
+    MALFORMED = 3
+
+
+class Outcome(IntEnum):
+    """What the plant did with the command that it received since the last tick."""
+
+    NONE = 0
+    """No command was received; the one in force, if any, is held."""
+    ACTED = 1
+    MALFORMED = 2
+    REPEATED = 3
+    """Its echo is that of the last fresh command, or it answers an older measurement than that did."""
+    STALE = 4
+    """It answers a measurement that is older than the watchdog's time."""
+    INVALID = 5
+    """It has no valid value and answers a measurement that has one: the plant trips."""
+    WITHHELD = 6
+    """An injected fault keeps it back."""
+
+
+OperationKind = Literal["claim", "release", "arm", "stop", "lost", "expire", "inject", "reconfigure"]
+
+
+class Operation(Message):
+    """Something that changed the plant end between two ticks. With the rows, the end's run can be computed again."""
+
+    tick: int = Field(ge=-1, description="the last tick of the plant before it; −1: before the first")
+    kind: OperationKind
+    claim: Claim | None = Field(default=None, description="claim: as it was granted")
+    name: str | None = Field(default=None, description="release: session; lost: controller; inject: fault, null: none")
+    cause: TripCause | None = Field(default=None, description="expire: the cause")
+    reason: str | None = Field(default=None, description="expire: the reason")
+    settings: dict[str, Any] | None = Field(default=None, description="reconfigure: `watchdog_s` and `limits`")
+
+
+class Tail(Message):
+    """What belongs to the rows of a batch and has no fixed size."""
+
+    state: dict[str, Any] | None = Field(
+        default=None, description="controller: its state before the batch's first row; a replay can begin there"
+    )
+    changes: list[Change] = Field(default_factory=list, description="controller: applied before their ticks' rows")
+    operations: list[Operation] = Field(default_factory=list, description="plant: between its ticks")
+
+
+def row_dtype(end: End, measurement: int, command: int, actuators: int) -> np.dtype[np.void]:
+    """Fields of a row, in the order of the columns. Sizes of the frames in bytes."""
+    if end == "controller":
+        return np.dtype(
+            [
+                ("tick", "<u4"),
+                ("received_as", "u1"),
+                ("sent_as", "u1"),
+                ("received", "<u4"),
+                ("sent", "<u4"),
+                ("measurement", f"V{measurement}"),
+                ("command", f"V{command}"),
+            ]
+        )
+    return np.dtype(
+        [
+            ("tick", "<u8"),
+            ("session_tick", "<u4"),
+            ("sent_as", "u1"),
+            ("received_as", "u1"),
+            ("outcome", "u1"),
+            ("trip", "u1"),
+            ("answered", "<u4"),
+            ("sent", "<u4"),
+            ("received", "<u4"),
+            ("measurement", f"V{measurement}"),
+            ("command", f"V{command}"),
+            ("voltages", "<f8", (actuators,)),
+        ]
+    )
+
+
+class Header(NamedTuple):
+    """What a batch says of all its rows.
+
+    Attributes:
+        end: Which end.
+        final: Whether the session's rows end with it.
+        actuators: Number of motors.
+        measurement_bytes: Size of a measurement frame.
+        command_bytes: Size of a command frame.
+        rows: Rows in it.
+        tail_bytes: Size of its tail.
+        run: A random number of the end's process.
+        first_row: Rows that this process has published before it, in all its sessions.
+        monotonic_ns: Base of the rows' times, on the end's monotonic clock [ns].
+        wall_ns: The same instant on the end's wall clock [ns since 1970].
+        session: Name of the session; empty where the plant has none.
+    """
+
+    end: End
+    final: bool
+    actuators: int
+    measurement_bytes: int
+    command_bytes: int
+    rows: int
+    tail_bytes: int
+    run: int
+    first_row: int
+    monotonic_ns: int
+    wall_ns: int
+    session: str
+
+
+class Batch(NamedTuple):
+    """A batch as it was read.
+
+    Attributes:
+        header: What holds for all rows.
+        columns: A structured scalar with one field a column, each of shape (rows,) or (rows, actuators).
+        tail: What has no fixed size.
+    """
+
+    header: Header
+    columns: np.void
+    tail: Tail
+
+    def times_ns(self, column: Literal["received", "sent"]) -> npt.NDArray[np.int64]:
+        """A column of times on the end's monotonic clock [ns]; −1 where there is none. Shape (rows,)."""
+        values: npt.NDArray[np.uint32] = self.columns[column]
+        ns = values.astype(np.int64) * 1000 + self.header.monotonic_ns
+        return np.where(values == NEVER, -1, ns)
+
+
+def read_header(payload: bytes) -> Header | None:
+    """The header of a batch; None if the bytes are none of this version."""
+    if len(payload) < HEADER_BYTES:
+        return None
+    version, end, flags, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, name = (
+        _HEADER.unpack_from(payload)
+    )
+    session = _name(name)
+    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3) or session is None:
+        return None
+    final = bool(flags & _FINAL)
+    return Header(
+        ENDS[end], final, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, session
+    )
+
+
+@lru_cache(maxsize=16)
+def _name(padded: bytes) -> str | None:
+    """The name of a session; None if it is none."""
+    try:
+        return padded.rstrip(b"\0").decode("ascii")
+    except UnicodeDecodeError:
+        return None
+
+
+def read_batch(payload: bytes) -> Batch | None:
+    """A batch; None if it is malformed: another version, a wrong length, a tail that is no Tail."""
+    header = read_header(payload)
+    if header is None or header.rows > MAX_ROWS:
+        return None
+    columns = read_columns(payload, header)
+    if columns is None:
+        return None
+    try:
+        tail = Tail.model_validate_json(payload[-header.tail_bytes :]) if header.tail_bytes else Tail()
+    except ValidationError:
+        return None
+    return Batch(header, columns, tail)
+
+
+def read_columns(payload: bytes, header: Header) -> np.void | None:
+    """The columns of a batch, as in `Batch`; None if its length is not what its header says."""
+    if len(payload) != batch_bytes(header):
+        return None
+    dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
+    columns: np.void = np.frombuffer(bytearray(payload), dtype, 1, HEADER_BYTES)[0]
+    assert dtype.names is not None
+    for name in dtype.names:
+        if name in STEPS:
+            column = columns[name]
+            np.add.accumulate(column, out=column)
+    return columns
+
+
+def batch_bytes(header: Header) -> int:
+    """How long a batch is by its header."""
+    dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
+    return HEADER_BYTES + dtype.itemsize + header.tail_bytes
+
+
+def join_columns(batches: Sequence[tuple[Header, bytes]]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of batches of one end and wire, one after another; of their times see `Batch.times_ns`. Shapes (rows,).
+
+    Args:
+        batches: At least one; headers, and bytes of the length that they say.
+    """
+    first = batches[0][0]
+    dtype = row_dtype(first.end, first.measurement_bytes, first.command_bytes, first.actuators)
+    ends = np.cumsum([header.rows for header, _ in batches])
+    columns: dict[str, npt.NDArray[Any]] = {}
+    assert dtype.fields is not None
+    for name, (kind, at, *_) in dtype.fields.items():
+        size = at + kind.itemsize
+        parts = [
+            payload[HEADER_BYTES + header.rows * at : HEADER_BYTES + header.rows * size] for header, payload in batches
+        ]
+        column = np.frombuffer(b"".join(parts), kind.base).reshape(-1, *kind.shape)
+        if name in STEPS:  # each batch begins with a step from 0
+            column = np.add.accumulate(column, dtype=kind)
+            before = np.concatenate([[0], column[ends[:-1] - 1]]).astype(kind)
+            column -= np.repeat(before, np.diff(ends, prepend=0))
+        columns[name] = column
+    return columns
+
+
+@lru_cache(maxsize=1024)
+def _columns_dtype(end: End, measurement: int, command: int, actuators: int, rows: int) -> np.dtype[np.void]:
+    """The columns of so many rows, one after another; a reader of hours has few different numbers of rows."""
+    row = row_dtype(end, measurement, command, actuators)
+    assert row.names is not None
+    return np.dtype([(name, row[name].base, (rows, *row[name].shape)) for name in row.names])
+
+
+class TraceWriter:
+    """Gathers one end's rows.
+
+    Args:
+        end: Which end.
+        wire: Sizes of the frames.
+        run: A random number of this process, 64 bits.
+        every_ns: A batch is due this long after its first row [ns].
+
+    Attributes:
+        rows: Rows that wait.
+        session: Name of the session that they are of; set between batches only.
+        state: The controller's state before the first row that waits, as JSON; null at the plant.
+        changes: Changes that belong to the rows that wait.
+        operations: Operations likewise.
+    """
+
+    def __init__(self, end: End, wire: WireSpec, run: int, every_ns: int) -> None:
+        self.end: End = end
+        self.rows = 0
+        self.session = ""
+        self.state: dict[str, Any] | None = None
+        self.changes: list[Change] = []
+        self.operations: list[Operation] = []
+        self._sizes = wire.measurement.size, wire.command.size
+        self._actuators = wire.actuators
+        self._dtype = row_dtype(end, *self._sizes, wire.actuators)
+        record = struct.Struct(_record_format(end, *self._sizes, wire.actuators))
+        assert record.size == self._dtype.itemsize
+        self._pack, self._size = record.pack_into, record.size
+        self._buffer = bytearray(MAX_ROWS * self._size)
+        self._run = run
+        self._published = 0
+        self._every_ns = every_ns
+        self._base_ns = 0
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        return not (self.rows or self.changes or self.operations)
+
+    def due(self, now_ns: int) -> bool:
+        """Whether a batch is to be published: it is full, or its first row has waited long enough."""
+        if self.rows:
+            return self.rows >= MAX_ROWS or now_ns - self._base_ns >= self._every_ns + _MARGIN_NS
+        return not self.empty
+
+    def controller_row(
+        self,
+        tick: int,
+        received_as: int,
+        sent_as: int,
+        received_ns: int,
+        sent_ns: int,
+        measurement: bytes,
+        command: bytes,
+    ) -> None:
+        """Add a row of the controller; at most MAX_ROWS until `take`. Times on its monotonic clock, 0 for none [ns]."""
+        rows = self.rows
+        if not rows:
+            self._base_ns = received_ns - _MARGIN_NS
+        base_ns = self._base_ns
+        self._pack(
+            self._buffer,
+            rows * self._size,
+            tick,
+            received_as,
+            sent_as,
+            (received_ns - base_ns) // 1000 & _MASK,
+            (sent_ns - base_ns) // 1000 & _MASK if sent_ns else NEVER,
+            measurement,
+            command,
+        )
+        self.rows = rows + 1
+
+    def plant_row(
+        self,
+        tick: int,
+        session_tick: int,
+        sent_as: int,
+        received_as: int,
+        outcome: int,
+        trip: int,
+        answered: int,
+        sent_ns: int,
+        received_ns: int,
+        measurement: bytes,
+        command: bytes,
+        voltages: Sequence[float],
+    ) -> None:
+        """Add a row of the plant end; at most MAX_ROWS until `take`. Times on its monotonic clock, 0 for none [ns].
+
+        Args:
+            tick: Tick of the plant since its process started.
+            session_tick: The same since the session's first measurement.
+            sent_as: What was done with the measurement; see Sent.
+            received_as: What was received since the last tick; see Sent.
+            outcome: What was done with it; see Outcome.
+            trip: Place of the TripCause that ended the session at this tick, from 1; 0 for none.
+            answered: Session tick that the command in force answers; −1 for none.
+            sent_ns: When the measurement was sent.
+            received_ns: When the command was received.
+            measurement: The frame as the endpoint made it.
+            command: The frame as it was received.
+            voltages: In force from this tick's beginning to the next command [V]. Shape (actuators,).
+        """
+        rows = self.rows
+        if not rows:
+            self._base_ns = (sent_ns or received_ns) - _MARGIN_NS
+        base_ns = self._base_ns
+        self._pack(
+            self._buffer,
+            rows * self._size,
+            tick,
+            session_tick,
+            sent_as,
+            received_as,
+            outcome,
+            trip,
+            answered & NEVER,
+            (sent_ns - base_ns) // 1000 & _MASK if sent_ns else NEVER,
+            (received_ns - base_ns) // 1000 & _MASK if received_ns else NEVER,
+            measurement,
+            command,
+            *voltages,
+        )
+        self.rows = rows + 1
+
+    def take(self, now_ns: int, wall_ns: int, *, final: bool = False) -> bytes:
+        """The batch of all that waits; then nothing does.
+
+        Args:
+            now_ns: The end's monotonic clock now [ns].
+            wall_ns: Its wall clock now [ns since 1970].
+            final: Whether the session's rows end here.
+        """
+        rows = self.rows
+        base_ns = self._base_ns if rows else now_ns
+        tail = Tail(state=self.state, changes=self.changes, operations=self.operations)
+        nothing = {name for name, value in tail if not value}
+        text = b"" if len(nothing) == len(Tail.model_fields) else tail.model_dump_json(exclude=nothing).encode()
+        header = _HEADER.pack(
+            PROTOCOL_VERSION,
+            ENDS.index(self.end),
+            _FINAL if final else 0,
+            self._actuators,
+            *self._sizes,
+            rows,
+            len(text),
+            self._run,
+            self._published,
+            base_ns,
+            wall_ns - (now_ns - base_ns),
+            self.session.encode("ascii"),
+        )
+        records = np.frombuffer(self._buffer, self._dtype, rows)
+        names = self._dtype.names
+        assert names is not None
+        columns = [_steps(records[name]).tobytes() if name in STEPS else records[name].tobytes() for name in names]
+        self._published += rows
+        self.rows = 0
+        self.state, self.changes, self.operations = None, [], []
+        return b"".join([header, *columns, text])
+
+
+def batches_per_s(loop: LoopSettings) -> float:
+    """Batches that an end publishes a second at the most, in the long run."""
+    rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
+    return _BATCHES_BEYOND * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
+
+
+def _steps(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """What a column of STEPS holds instead of its values. Shapes (n,)."""
+    return np.diff(column, prepend=column.dtype.type(0))
+
+
+def _record_format(end: End, measurement: int, command: int, actuators: int) -> str:
+    """What `row_dtype` says, for struct."""
+    frames = f"{measurement}s{command}s"
+    return f"<IBBII{frames}" if end == "controller" else f"<QIBBBBIII{frames}{actuators}d"

@@ -1,0 +1,59 @@
+"""Real-time set-up of a process: scheduling class, locked memory, CPU affinity, no garbage collection."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+from typing import Final
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wire.loop import LoopSettings
+
+_PR_SET_TIMERSLACK: Final = 29
+_MCL_CURRENT: Final = 1
+_MCL_FUTURE: Final = 2
+
+
+class RealtimeError(AeroloopError):
+    """`loop.realtime = "strict"`, and this machine refused something; one line that names it."""
+
+
+def prepare_process(settings: LoopSettings) -> list[str]:
+    """Make this process fit for a timed loop, and say what was refused.
+
+    The garbage collector is switched off (the loop makes no cycles), the timer slack set to its least, memory locked,
+    the process bound to `cpus`, SCHED_FIFO asked for.
+
+    Returns:
+        One line for each thing that this machine refused; nothing is asked for with `realtime = "off"`.
+
+    Raises:
+        RealtimeError: Something was refused, and `realtime` is strict.
+    """
+    if settings.realtime == "off":
+        return []
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    refused = []
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0):
+        refused.append("timer slack stays at the system's default")
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+        refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
+    try:
+        # Every thread: what carries the frames must not wait for other work any more than the loop itself.
+        for thread in os.listdir("/proc/self/task"):
+            if settings.cpus:
+                os.sched_setaffinity(int(thread), settings.cpus)
+    except OSError as error:
+        refused.append(f"affinity to CPUs {settings.cpus}: {error.strerror}")
+    try:
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(settings.priority))
+    except OSError as error:
+        refused.append(f"SCHED_FIFO {settings.priority}: {error.strerror} (raise LimitRTPRIO)")
+    if refused and settings.realtime == "strict":
+        raise RealtimeError(f"loop.realtime is strict, but this machine refuses: {'; '.join(refused)}")
+    return refused

@@ -1,0 +1,255 @@
+"""What every process is on the network: alive, configured, doing well or not, and stoppable.
+
+A Role joins the network, answers questions about its configuration and, once its owner is ready, shows a liveliness
+token; the owner publishes status, events and whatever else through it. It is a context: leaving it closes the Zenoh
+session, without which a Python process would not end.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from types import FrameType, TracebackType
+from typing import Any, Final, Self, TypeVar
+
+import zenoh
+from pydantic import ValidationError
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Event, EventKind, Status
+from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.runtime.host_facts import host_facts, versions
+from aeroloop.protocol.runtime.throttle import Throttle
+from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+
+log: Final = logging.getLogger("aeroloop")
+
+
+M = TypeVar("M", bound=Message)
+_SELDOM_PER_S: Final = 8.0
+"""Messages a second of a topic that is not declared beforehand: statuses, events."""
+
+Action = Callable[[], object]
+"""Something to do between two ticks."""
+
+
+def notify_systemd(state: str) -> None:
+    """Tell the service manager, if one asked to be told (sd_notify(3)); nobody listening is no error."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if not address:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager, suppress(OSError):
+        manager.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+
+
+class Role:
+    """A process's presence on the network.
+
+    Args:
+        role: `plant`, `controller` or `recorder`.
+        vehicle: Whose topics it speaks on.
+        network: Where to meet the others.
+        config: Its effective configuration, for the contract.
+        name: Name of its liveliness token; the role's name if None.
+
+    Raises:
+        NetworkError: The network cannot be joined.
+    """
+
+    def __init__(
+        self, role: str, vehicle: str, network: NetworkSettings, config: dict[str, Any], name: str | None = None
+    ) -> None:
+        self.role = role
+        self.vehicle = vehicle
+        self.name = name or role
+        self.stop = threading.Event()
+        self.zenoh = join(network)
+        self._status = b""
+        self._publishers: dict[str, CachedPublisher] = {}
+        self._inbox: deque[Action] = deque()
+        self._throttle = Throttle()
+        self._started = time.monotonic()
+        self.configured(config)
+        key = topics.key("contract", vehicle, role=role)
+        self.answer(key, lambda query: query.reply(key, self._contract))
+        status = topics.key("status", vehicle, role=role)
+        self.answer(status, lambda query: query.reply(status, self._status) if self._status else None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        notify_systemd("STOPPING=1")
+        self.zenoh.close()
+
+    def announce(self) -> None:
+        """Show the liveliness token. Declarations keep their order on a link: who sees it knows ours before it too."""
+        notify_systemd("READY=1")
+        self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
+
+    def stop_on_signals(self) -> None:
+        """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""
+
+        def ask_to_stop(_signum: int, _frame: FrameType | None) -> None:
+            self.stop.set()
+
+        signal.signal(signal.SIGTERM, ask_to_stop)
+        signal.signal(signal.SIGINT, ask_to_stop)
+
+    def on_hangup(self, reload: Callable[[], Action]) -> None:
+        """On SIGHUP, call `reload` in a thread of its own, and what it returns between two ticks.
+
+        What `reload` raises as an AeroloopError is told, and nothing changes.
+        """
+
+        def prepare() -> None:
+            try:
+                self._inbox.append(reload())
+            except AeroloopError as error:
+                self.event("fault", f"not reloaded: {error}")
+
+        signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
+
+    def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
+        """Publish the role's contract with this configuration, and what is promised of it, and answer queries with it.
+
+        Args:
+            config: The effective configuration.
+            certificate: What the theorem promises of it; of a controller.
+        """
+        freshness_s = None
+        if "wire" in config and "loop" in config:
+            period_ns = LoopSettings.model_validate(config["loop"]).period_ns
+            freshness_s = WireSpec.model_validate(config["wire"]).freshness_ns(period_ns) * 1e-9
+        self._contract = Contract(
+            protocol=PROTOCOL_VERSION,
+            role=self.role,
+            vehicle=self.vehicle,
+            host=socket.gethostname(),
+            versions=versions(),
+            facts=host_facts(),
+            config=config,
+            freshness_s=freshness_s,
+            certificate=certificate,
+        ).encode()
+        self.publish_bytes("contract", self._contract)
+
+    @property
+    def uptime_s(self) -> float:
+        """Seconds since the role joined."""
+        return time.monotonic() - self._started
+
+    def answer(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
+        """Answer queries on a key for as long as the role lives. The callback runs in a thread of Zenoh's."""
+        self.zenoh.declare_queryable(key, callback, complete=True)
+
+    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
+        """Answer a topic's queries between ticks, when the owner calls `take_inbox`.
+
+        Args:
+            topic: Name of a query in the table.
+            model: What is asked; anything else is answered by an Answer that says so.
+            prepare: Called in a thread of Zenoh's with what was asked, to do what takes time; what it returns is
+                called between ticks and gives the reply. An AeroloopError from either is the reply.
+        """
+
+        def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
+            try:
+                reply = act()
+            except AeroloopError as error:
+                reply = Answer(done=False, text=str(error))
+            query.reply(query.key_expr, reply.encode())
+            query.drop()
+
+        def asked(query: zenoh.Query) -> None:
+            try:
+                action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
+            except ValidationError as error:
+                text = f"not a {model.__name__}: {error.errors()[0]['msg']}"
+                guarded(query, lambda: Answer(done=False, text=text))
+            except AeroloopError as error:
+                refusal = Answer(done=False, text=str(error))
+                guarded(query, lambda: refusal)
+            else:
+                self._inbox.append(lambda: guarded(query, action))
+
+        self.answer(topics.key(topic, self.vehicle), asked)
+
+    def later(self, action: Action) -> None:
+        """Let the owner do something between two ticks; may be called from any thread."""
+        self._inbox.append(action)
+
+    def take_inbox(self) -> bool:
+        """Do what has come for the time between two ticks. Whether anything had."""
+        inbox = self._inbox
+        if not inbox:
+            return False
+        while inbox:
+            inbox.popleft()()
+        return True
+
+    def watch_tokens(self, callback: Callable[[str, bool], None]) -> None:
+        """Call back with the name of every liveliness token of any role, and whether it came (True) or went (False).
+
+        The callback runs in a thread of Zenoh's.
+        """
+        alive = topics.TOPICS["alive"]
+
+        def seen(sample: zenoh.Sample) -> None:
+            address = topics.read_key(str(sample.key_expr))
+            if address is not None and address.topic is alive and address.role is not None:
+                callback(address.role, sample.kind == zenoh.SampleKind.PUT)
+
+        self.zenoh.liveliness().declare_subscriber(topics.key("alive", self.vehicle), seen, history=True)
+
+    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
+        """Declare a topic's publisher before it is needed: a cache for so many messages a second takes a while."""
+        carries = topics.TOPICS[topic].carries
+        self._publishers[topic] = CachedPublisher(
+            self.zenoh,
+            topics.key(topic, self.vehicle, role=self.role),
+            per_s,
+            lossless=lossless,
+            encoding=zenoh.Encoding.APPLICATION_JSON if carries == "json" else zenoh.Encoding.ZENOH_BYTES,
+        )
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Publish a message on one of the table's JSON topics."""
+        self.publish_bytes(topic, message.encode())
+
+    def publish_bytes(self, topic: str, payload: bytes) -> None:
+        """Publish on one of the table's topics of JSON or traces."""
+        if topic not in self._publishers:
+            self.declare(topic, _SELDOM_PER_S)
+        self._publishers[topic].put(payload)
+
+    def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Publish and log something that happened, at a session's tick if it was at one."""
+        log.log(logging.WARNING if kind in ("tripped", "lost", "fault") else logging.INFO, "%s: %s", self.role, text)
+        self.publish("event", Event(role=self.role, kind=kind, text=text, session=session, tick=tick))
+
+    def warn(self, about: str, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Publish something that may go on for long: at most once in ten seconds for each thing it is about."""
+        held_back = self._throttle.let_pass(about)
+        if held_back is not None:
+            more = f" ({held_back} more like it in the last {self._throttle.period_s:g} s)" if held_back else ""
+            self.event(kind, text + more, session, tick)
+
+    def status(self, status: Status) -> None:
+        """Tell how the role is doing, now and to whoever asks before the next time."""
+        notify_systemd("WATCHDOG=1")
+        self._status = status.encode()
+        self.publish("status", status)

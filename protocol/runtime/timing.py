@@ -1,0 +1,150 @@
+"""Timing statistics of a loop: wake-up latency, tick duration and period, in histograms of fixed size."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from math import exp2, log2
+from typing import Final
+
+from aeroloop.protocol.messages.models import Percentiles, Timing
+
+_BINS_PER_OCTAVE: Final = 16
+_BINS: Final = 32 * _BINS_PER_OCTAVE  # 1 µs … 2^32 µs, over an hour
+_SHORTEST_WINDOW_NS: Final = 900_000_000
+
+
+class Histogram:
+    """Durations in bins 4.4 % wide (16 an octave, from 1 µs): of fixed size, however long it runs."""
+
+    def __init__(self) -> None:
+        self._bins: dict[int, int] = {}
+        self.count = 0
+        self.max_us = 0.0
+
+    def add(self, nanoseconds: int) -> None:
+        """Count one duration [ns]; under 1 µs counts as 1 µs, over an hour as an hour."""
+        us = nanoseconds * 1e-3
+        i = min(int(log2(us) * _BINS_PER_OCTAVE), _BINS - 1) if us > 1.0 else 0
+        self._bins[i] = self._bins.get(i, 0) + 1
+        self.count += 1
+        if us > self.max_us:
+            self.max_us = us
+
+    def merge(self, other: Histogram) -> None:
+        """Count all that another has counted."""
+        for i, n in other._bins.items():
+            self._bins[i] = self._bins.get(i, 0) + n
+        self.count += other.count
+        self.max_us = max(self.max_us, other.max_us)
+
+    def percentile(self, percent: float) -> float:
+        """The middle of the bin that holds this percentile [µs]; NaN if nothing was counted."""
+        wanted = self.count * percent / 100
+        seen = 0
+        for i in sorted(self._bins):
+            seen += self._bins[i]
+            if seen >= wanted:
+                return min(exp2((i + 0.5) / _BINS_PER_OCTAVE), self.max_us)
+        return float("nan")
+
+
+class RollingHistogram:
+    """A histogram of all durations, and one of those of the last ten seconds."""
+
+    WINDOWS: Final = 10
+
+    def __init__(self) -> None:
+        self.total = Histogram()
+        self._windows: deque[Histogram] = deque([Histogram()], maxlen=self.WINDOWS)
+        self._current = self._windows[0]
+        self._turned_at = 0
+
+    def add(self, nanoseconds: int) -> None:
+        """Count one duration [ns]."""
+        self._current.add(nanoseconds)
+
+    def turn(self) -> None:
+        """End a window."""
+        self._turned_at = time.monotonic_ns()
+        self.total.merge(self._current)
+        self._current = Histogram()
+        self._windows.append(self._current)
+
+    def turn_when_due(self) -> None:
+        """End a one-second window; called by whoever reports. A report that comes sooner ends none."""
+        if time.monotonic_ns() - self._turned_at >= _SHORTEST_WINDOW_NS:
+            self.turn()
+
+    def recent(self) -> Histogram:
+        """The last ten windows."""
+        merged = Histogram()
+        for window in self._windows:
+            merged.merge(window)
+        return merged
+
+
+class LoopTiming:
+    """How well a loop keeps time: wake-up latency, time a tick takes, period between ticks.
+
+    The first second is left out: caches are cold, and code runs for the first time.
+
+    Args:
+        warm_up_ns: What counts as start-up [ns].
+    """
+
+    def __init__(self, warm_up_ns: int = 1_000_000_000) -> None:
+        self.wake = RollingHistogram()
+        self.busy = RollingHistogram()
+        self.period = RollingHistogram()
+        self._warm_at = time.monotonic_ns() + warm_up_ns
+        self._woke_at = 0
+
+    def woke(self, due_ns: int) -> None:
+        """A tick begins that was due at `due_ns` on `time.monotonic_ns()`."""
+        now = time.monotonic_ns()
+        if now >= self._warm_at:
+            self.wake.add(now - due_ns)
+            if self._woke_at:
+                self.period.add(now - self._woke_at)
+            self._woke_at = now
+
+    def done(self) -> None:
+        """The tick is over."""
+        if self._woke_at:
+            self.busy.add(time.monotonic_ns() - self._woke_at)
+
+    def pause(self) -> None:
+        """No ticks for a while: the time until the next is no period."""
+        self._woke_at = 0
+
+    def turn(self) -> None:
+        """End a one-second window."""
+        for histogram in (self.wake, self.busy, self.period):
+            histogram.turn_when_due()
+
+
+def summary(durations: Histogram) -> Percentiles | None:
+    """Percentiles of what a histogram has counted; None if nothing."""
+    if not durations.count:
+        return None
+    return Percentiles(
+        count=durations.count,
+        p50=round(durations.percentile(50), 1),
+        p99=round(durations.percentile(99), 1),
+        p999=round(durations.percentile(99.9), 1),
+        max=round(durations.max_us, 1),
+    )
+
+
+def report(timing: LoopTiming) -> Timing:
+    """End a one-second window of a loop's timing and say how it stands."""
+    timing.turn()
+    return Timing(
+        wake=summary(timing.wake.total),
+        busy=summary(timing.busy.total),
+        period=summary(timing.period.total),
+        recent_wake=summary(timing.wake.recent()),
+        recent_busy=summary(timing.busy.recent()),
+        recent_period=summary(timing.period.recent()),
+    )

@@ -1,0 +1,246 @@
+"""The DBC of one node: what every bit on the CAN bus means, for tools that know nothing of this project.
+
+A CAN payload is the wire frame byte for byte, so the whole file follows from the `WireSpec`: widths place the signals,
+and the quantizer gives factor, bounds and the code that says "no valid value". Uniform with half-step dead zone, with
+or without hysteresis, the level of code i is i·l, which is what a DBC can say. Otherwise it is not; the signal is then
+the bare code, and its comment has the formula. Many tools read DBC files as cp1252, so the text keeps to ASCII.
+
+Identifiers and lengths are those of `can_link`. cantools takes about half a second to import: import this module where
+it is used, not at a program's head.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from math import isclose
+from typing import Final, NamedTuple
+
+from cantools.database.can import Database, Message, Node, Signal
+from cantools.database.can.formats.dbc import DbcAttribute, DbcAttributeDefinition, DbcSpecifics
+from cantools.database.conversion import BaseConversion
+from cantools.typechecking import Choices
+
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_link import (
+    CLASSIC_BYTES,
+    COMMAND_ID,
+    CONTROLLER_HEARTBEAT_ID,
+    FD_LENGTHS,
+    HEARTBEAT_S,
+    MAX_NODE,
+    MEASUREMENT_ID,
+    PLANT_HEARTBEAT_ID,
+    number_of,
+)
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+
+NO_VALID_VALUE: Final = "no_valid_value"
+"""Name of the code −2^(R−1)."""
+
+_HEARTBEAT_MS: Final = round(1000 * HEARTBEAT_S)
+_FINGERPRINT_BITS: Final = 56
+_PLANT: Final = "Plant"
+_CONTROLLER: Final = "Controller"
+_MAX_CYCLE_MS: Final = 2**16 - 1  # what cantools declares for GenMsgCycleTime
+_SAME_STEP: Final = 1e-12  # a dead zone this near to l/2, relatively, shifts no level by more than 1e-12 l
+
+
+class _Quantity(NamedTuple):
+    """A quantized signal, as a person knows it."""
+
+    name: str
+    unit: str
+    comment: str
+    spec: SignalSpec
+
+
+def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
+    """The DBC file of a plant's node and the controller that drives it.
+
+    Args:
+        wire: What the frames carry.
+        node: Number of the plant's node, 1…127.
+        period_ns: Period of the plant's grid [ns].
+
+    Raises:
+        ValueError: A node or a period out of bounds.
+    """
+    if not 1 <= node <= MAX_NODE:
+        raise ValueError(f"a node's number is 1 to {MAX_NODE}, not {node}")
+    cycle_ms = -(-period_ns // 1_000_000)
+    if not 1 <= cycle_ms <= _MAX_CYCLE_MS:
+        raise ValueError(f"a period of {period_ns} ns is not between 1 ns and {_MAX_CYCLE_MS} ms")
+    rate = f"one every {period_ns} ns ({1e9 / period_ns:.6g} Hz; the cycle time is in whole ms, rounded up)"
+    idle = "Every bit that belongs to no signal must be 0."
+    bits = wire.counter_bits
+    counted = f"Tick of the plant modulo {1 << bits}; 0 in a session's first measurement."
+    measurement = _message(
+        "Measurement",
+        MEASUREMENT_ID + node,
+        _PLANT,
+        wire.measurement.size,
+        [_unsigned("counter", 0, bits, counted), *_codes(wire.measurement, _measured(wire))],
+        cycle_ms,
+        f"What the plant measures: {rate}. {idle}",
+    )
+    echo = _unsigned("echo", 0, bits, "Counter of the measurement that this command answers.")
+    command = _message(
+        "Command",
+        COMMAND_ID + node,
+        _CONTROLLER,
+        wire.command.size,
+        [echo, *_codes(wire.command, _commanded(wire))],
+        cycle_ms,
+        f"What the controller commands in answer to a measurement: {rate}. {idle}",
+    )
+    causes: Choices = OrderedDict([(0, "none"), *((number_of(cause), str(cause)) for cause in TripCause)])
+    cause = _unsigned("cause", 0, 4, "What tripped the plant last.", causes)
+    session = _unsigned("session", 0, 4, "Number of the session, modulo 16.")
+    messages = [
+        measurement,
+        command,
+        _heartbeat("PlantHeartbeat", PLANT_HEARTBEAT_ID + node, _PLANT, cause),
+        _heartbeat("ControllerHeartbeat", CONTROLLER_HEARTBEAT_ID + node, _CONTROLLER, session),
+    ]
+    database = Database(
+        messages,
+        [
+            Node(_PLANT, f"What measures and has the motors: node {node}."),
+            Node(_CONTROLLER, f"What computes the commands of node {node}."),
+        ],
+        version=f"aeroloop protocol {PROTOCOL_VERSION}",
+        dbc_specifics=_bus_type("CAN FD" if any(message.is_fd for message in messages) else "CAN"),
+    )
+    return database.as_dbc_string(sort_signals=None, sort_attribute_signals=None)
+
+
+def _measured(wire: WireSpec) -> list[_Quantity]:
+    part = "of the attitude quaternion's vector part, where the scalar part is >= 0."
+    axes = {1: "x, roll", 2: "y, pitch", 3: "z, yaw"}
+    return [
+        *(_Quantity(f"eps{i}", "", f"Component {i} {part}", wire.attitude) for i in axes),
+        *(_Quantity(f"omega{i}", "rad/s", f"Angular velocity about the body's {axes[i]}.", wire.rate) for i in axes),
+    ]
+
+
+def _commanded(wire: WireSpec) -> list[_Quantity]:
+    numbers = (2, 3) if wire.actuators == 2 else (1, 2, 3)  # the Aero's two are the paper's u₂ and u₃
+    return [_Quantity(f"u{i}", "V", f"Command u{i}.", wire.voltage) for i in numbers]
+
+
+def _message(
+    name: str, identifier: int, sender: str, size: int, signals: list[Signal], cycle_ms: int, comment: str
+) -> Message:
+    """A message that carries `size` bytes from `sender` to the other end."""
+    for signal in signals:
+        signal.receivers = [_CONTROLLER if sender == _PLANT else _PLANT]
+    length = next(length for length in FD_LENGTHS if length >= size)
+    return Message(
+        identifier,
+        name,
+        length,
+        signals,
+        comment=comment,
+        senders=[sender],
+        cycle_time=cycle_ms,
+        is_fd=length > CLASSIC_BYTES,
+    )
+
+
+def _heartbeat(name: str, identifier: int, sender: str, number: Signal) -> Message:
+    """A heartbeat, whose first four bits are `number`."""
+    states: Choices = OrderedDict((code, str(state)) for code, state in enumerate(PlantState))
+    state = _unsigned("state", 4, 4, "What the plant is doing, or what the controller wants it to do.", states)
+    agreed = "What both ends must agree on, wire, period and lockstep, as seven bytes of a hash."
+    fingerprint = _unsigned("fingerprint", 8, _FINGERPRINT_BITS, agreed)
+    comment = f"The {sender.lower()} lives: one every {_HEARTBEAT_MS} ms, and at once on a change."
+    return _message(name, identifier, sender, CLASSIC_BYTES, [number, state, fingerprint], _HEARTBEAT_MS, comment)
+
+
+def _codes(layout: FrameFormat, quantities: Iterable[_Quantity]) -> Iterator[Signal]:
+    """The signals that follow a frame's counter."""
+    at = layout.first_bit
+    for quantity, width in zip(quantities, layout.widths, strict=True):
+        yield _signal(quantity, at)
+        at += 64 if width is None else width
+
+
+def _unsigned(name: str, at: int, width: int, comment: str, choices: Choices | None = None) -> Signal:
+    return Signal(
+        name,
+        _start(at),
+        width,
+        "big_endian",
+        conversion=BaseConversion.factory(choices=choices),
+        minimum=0,
+        maximum=max(choices) if choices else 2**width - 1,
+        comment=comment,
+    )
+
+
+def _signal(quantity: _Quantity, at: int) -> Signal:
+    """One quantized signal whose first bit is `at`, counted from the frame's first."""
+    quantizer = quantity.spec.quantizer()
+    comment, unit = quantity.comment, quantity.unit
+    scale: float = 1
+    choices: Choices | None = None
+    if not isinstance(quantizer, UniformQuantizer | LogarithmicQuantizer):
+        width, top = 64, quantizer.limit
+        comment += " IEEE 754 double; NaN says: no valid value."
+    else:
+        width, top = quantizer.bits, quantizer.top
+        choices = OrderedDict([(quantizer.invalid, NO_VALID_VALUE)])
+        comment += f" Quantized; code {quantizer.invalid} says: no valid value."
+        formula = _formula(quantizer)
+        if formula is None:
+            scale = quantizer.step
+        else:
+            level, constants = formula
+            comment += (
+                f" This is the bare code i; the level is 0 for i = 0, else {level} [{unit or 1}] with {constants}."
+            )
+            unit = ""
+    return Signal(
+        quantity.name,
+        _start(at),
+        width,
+        "big_endian",
+        is_signed=True,
+        conversion=BaseConversion.factory(scale=scale, choices=choices, is_float=quantity.spec.bits is None),
+        minimum=-top * scale,
+        maximum=top * scale,
+        unit=unit,
+        comment=comment,
+    )
+
+
+def _formula(quantizer: UniformQuantizer | LogarithmicQuantizer) -> tuple[str, str] | None:
+    """The level of code i, and the constants in it; None if that is i times the step."""
+    if isinstance(quantizer, LogarithmicQuantizer):
+        return "sgn(i) * (e(|i| - 1) + e(|i|)) / 2", (
+            "e(k) = y0 * (yt / y0) ** (k / m) for k < m, else yt + (k - m) * l;"
+            f" y0 = {quantizer.deadzone!r}, yt = {quantizer.threshold!r},"
+            f" m = {quantizer.growing} and l = {quantizer.step!r}"
+        )
+    if isclose(quantizer.deadzone, quantizer.step / 2, rel_tol=_SAME_STEP):
+        return None
+    return "sgn(i) * (y0 + l/2 + (|i| - 1) * l)", f"y0 = {quantizer.deadzone!r} and l = {quantizer.step!r}"
+
+
+def _start(at: int) -> int:
+    """A DBC counts bits from each byte's least significant, and a big-endian signal starts at its most significant."""
+    return at // 8 * 8 + 7 - at % 8
+
+
+def _bus_type(bus: str) -> DbcSpecifics:
+    """What the database says of itself. Only with BusType "CAN FD" does cantools write which messages are FD."""
+    definition = DbcAttributeDefinition("BusType", default_value="CAN", type_name="STRING")
+    return DbcSpecifics(
+        attributes=OrderedDict([("BusType", DbcAttribute(bus, definition))]),
+        attribute_definitions=OrderedDict([("BusType", definition)]),
+    )

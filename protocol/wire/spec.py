@@ -1,0 +1,175 @@
+"""The wire spec: what both ends must agree on, and from which every scale and width derives.
+
+A signal has a kind of quantizer, bits and a range; a wire has three signals, a number of motors, and a policy of when
+frames are sent. Claims, fingerprints, frames, the DBC and whoever reads a log take all they need from here.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any, Final, Literal, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS, MAX_COUNTER_BITS, MIN_COUNTER_BITS, FrameFormat
+from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
+from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.transmit import Transmit
+
+
+def bits_or_continuous(value: object) -> object:
+    """The word "cont" stands for no quantization wherever a person writes bits (TOML has no null)."""
+    return None if value == "cont" else value
+
+
+Bits: TypeAlias = Annotated[
+    Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)] | None,
+    BeforeValidator(bits_or_continuous),
+]
+
+
+Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
+
+_OWNER: Final[dict[str, Kind]] = {"hysteresis": "hysteresis-uniform", "threshold": "logarithmic-uniform"}
+"""Parameters that only one kind of quantizer has."""
+
+
+class SignalSpec(BaseModel):
+    """How one signal is quantized. The range runs from −limit to +limit, in the signal's unit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
+    limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
+    deadzone: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="y0 of (C.14) [signal's unit]; half a step if left out, a quarter of that if logarithmic-uniform",
+    )
+    kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
+    hysteresis: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="h: how much farther a level is held [signal's unit]; half a step if left out; hysteresis-uniform",
+    )
+    threshold: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="where steps stop growing [signal's unit]; limit/4 if left out; logarithmic-uniform",
+    )
+
+    @model_validator(mode="after")
+    def _makes_a_quantizer(self) -> SignalSpec:
+        if self.deadzone is not None and self.deadzone >= self.limit:
+            raise ValueError(f"the dead zone {self.deadzone} must be smaller than the limit {self.limit}")
+        for name, owner in _OWNER.items():
+            if getattr(self, name) is not None and self.kind != owner:
+                raise ValueError(f'{name} belongs to kind = "{owner}", and kind is "{self.kind}"')
+        if self.kind != "uniform":
+            self.quantizer()  # has bounds of its own, which depend on the bits
+        return self
+
+    def quantizer(self) -> Quantizer:
+        """A quantizer of one element of this signal, with its own count of saturations and its own memory."""
+        if self.bits is None:
+            return Continuous(self.limit)
+        if self.kind == "hysteresis-uniform":
+            return HysteresisQuantizer(self.bits, self.limit, self.deadzone, self.hysteresis)
+        if self.kind == "logarithmic-uniform":
+            return LogarithmicQuantizer(self.bits, self.limit, self.deadzone, self.threshold)
+        return UniformQuantizer(self.bits, self.limit, self.deadzone)
+
+    def with_bits(self, bits: int | None) -> SignalSpec:
+        """The same with other bits. Raises ValueError where the kind takes no such number, or not with the rest."""
+        changed = self.model_copy(update={"bits": bits})
+        if self.kind != "uniform":
+            changed.quantizer()
+        return changed
+
+
+class WireSpec(BaseModel):
+    """Everything the two ends must agree on to read each other's frames. The default is the paper's 8/6-bit Aero."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    attitude: SignalSpec = Field(
+        default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]"
+    )
+    rate: SignalSpec = Field(
+        default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]"
+    )
+    voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
+    actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
+    transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
+    counter_bits: int = Field(
+        default=DEFAULT_COUNTER_BITS,
+        ge=MIN_COUNTER_BITS,
+        le=MAX_COUNTER_BITS,
+        description="bits of the counter in each frame; one that is 2^bits periods late may be taken for a newer one",
+    )
+
+    @cached_property
+    def measurement(self) -> FrameFormat:
+        """Format of a measurement frame: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃."""
+        return FrameFormat([self.attitude.bits] * 3 + [self.rate.bits] * 3, self.counter_bits)
+
+    @cached_property
+    def command(self) -> FrameFormat:
+        """Format of a command frame: u₂ u₃, or u₁ u₂ u₃."""
+        return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
+
+    def freshness_ns(self, period_ns: int) -> int:
+        """How late a frame may be before it may be taken for a newer one: 2^counter_bits periods [ns].
+
+        Args:
+            period_ns: Period of a tick [ns].
+        """
+        return period_ns << self.counter_bits
+
+    def with_bits(self, out: int | None, inp: int | None) -> WireSpec:
+        """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont.".
+
+        Raises:
+            ValueError: A signal's kind takes no such number of bits.
+        """
+        return WireSpec(
+            attitude=self.attitude.with_bits(out),
+            rate=self.rate.with_bits(out),
+            voltage=self.voltage.with_bits(inp),
+            actuators=self.actuators,
+            transmit=self.transmit,
+            counter_bits=self.counter_bits,
+        )
+
+    def agreed(self) -> dict[str, Any]:
+        """What two ends must agree on, as JSON: what they use, so that an end that knows no more understands it.
+
+        A uniform signal has nothing of other kinds; `transmit` is left out unless some of it is not by default.
+        """
+        told = self.model_dump(mode="json")
+        for name in ("attitude", "rate", "voltage"):
+            if told[name]["kind"] == "uniform":
+                for unused in ("kind", *_OWNER):
+                    del told[name][unused]
+        if self.transmit == Transmit():
+            del told["transmit"]
+        return told
+
+    def differences(self, other: WireSpec) -> list[str]:
+        """Where two specs differ, one line a field: `rate.bits: 8, not 10`. Empty if they are the same wire."""
+        mine, theirs = _flat(self.model_dump()), _flat(other.model_dump())
+        return [f"{name}: {mine[name]}, not {theirs[name]}" for name in mine if mine[name] != theirs[name]]
+
+
+def _flat(tree: dict[str, object], prefix: str = "") -> dict[str, object]:
+    leaves: dict[str, object] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            leaves |= _flat(value, f"{prefix}{name}.")
+        else:
+            leaves[prefix + name] = value
+    return leaves

@@ -1,0 +1,1 @@
+"""Adaptive attitude control over Eclipse Zenoh, in frames whose every bit is a quantizer's bit."""

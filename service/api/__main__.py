@@ -1,0 +1,7 @@
+"""The command `aeroloop`, as `python -m aeroloop`."""
+
+from __future__ import annotations
+
+from aeroloop.service.cli.main import main
+
+main()

@@ -1,0 +1,72 @@
+"""`aeroloop log compare`: several runs side by side; and what a log's page is written with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aeroloop.service.cli.common import Json, checked, fail, guarded
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from aeroloop.service.review.report import Report
+
+Html = Annotated[
+    Path | None,
+    typer.Option("--html", help="Write an interactive page that needs no network.", show_default=False),
+]
+
+
+def compare(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, or a folder for each run.", show_default=False)],
+    html: Html = None,
+    require: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--require",
+            metavar="FIGURE=LIMIT",
+            help="Exit with 1 unless this figure of every run is at most that.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Lay several runs over each other: their figures side by side, and what differs in their configurations."""
+    from aeroloop.service.review.requirements import Limit
+
+    if len(logs) < 2:
+        fail("log compare takes two logs or more", 2)
+    limits = checked(lambda: [Limit.parse(text) for text in require or []])
+
+    def run() -> list[Report]:
+        from aeroloop.service.review.compare import read_runs
+        from aeroloop.service.terminal.display import share_bar
+
+        with share_bar("reading", hidden=json) as update:
+            reports = read_runs(logs, limits, update)
+        if html is not None:
+            write_html(reports, html)
+        return reports
+
+    reports = guarded(run)
+    from aeroloop.service.review.compare import Comparison, broken_limits
+
+    if json:
+        typer.echo(Comparison.of(reports).model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.side_by_side import comparison_tables
+
+        comparison_tables(reports)
+    if broken := broken_limits(reports):
+        fail("; ".join(broken), 1)
+
+
+def write_html(reports: Sequence[Report], out: Path) -> None:
+    """Write the page of some runs and say so. Raises AeroloopError if it cannot be written."""
+    from aeroloop.service.report.page.page import write_page
+
+    write_page(reports, out)
+    typer.echo(f"aeroloop: wrote {out}", err=True)

@@ -1,0 +1,96 @@
+"""`aeroloop host`: this machine."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aeroloop.service.cli.common import Config, Json, Overrides, fail, guarded, settings_of
+
+if TYPE_CHECKING:
+    from aeroloop.service.host.doctor import Diagnosis
+    from aeroloop.service.host.soak import Soak
+
+group = typer.Typer(no_args_is_help=True, help="This machine.")
+
+
+@group.command()
+def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Say whether this machine will hold the configured rate, and what to change if not."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Diagnosis:
+        from aeroloop.service.host.doctor import TRIAL_S, diagnose
+        from aeroloop.service.terminal.display import progress_bar
+
+        with progress_bar("trial", TRIAL_S, hidden=json) as update:
+            return diagnose(settings.loop, update)
+
+    diagnosis = guarded(run)
+    if json:
+        typer.echo(diagnosis.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.display import diagnosis_table
+
+        diagnosis_table(diagnosis)
+    if not diagnosis.holds:
+        raise typer.Exit(1)
+
+
+@group.command()
+def soak(
+    minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="How long.")] = 20.0,
+    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the three processes for long, and say whether anything grows, drifts or is lost."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Soak:
+        from datetime import datetime
+
+        from aeroloop.service.host.soak import run_soak
+        from aeroloop.service.terminal.display import progress_bar
+
+        path = log or settings.recorder.directory / datetime.now().strftime("soak-%Y%m%d-%H%M%S.mcap")
+        with progress_bar("soak", minutes * 60, hidden=json) as update:
+            return run_soak(settings, minutes, path, lambda reached, _: update(reached))
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.display import soak_table
+
+        soak_table(result)
+    if result.findings:
+        raise typer.Exit(1)
+
+
+@group.command()
+def units(
+    install: Annotated[
+        Path | None, typer.Option("--install", help="Write them into this folder instead.", show_default=False)
+    ] = None,
+) -> None:
+    """Print systemd units for the daemons, or install them."""
+    from shutil import which
+
+    from aeroloop.service.host.units import UNITS, unit
+    from aeroloop.service.host.units import install as install_units
+
+    executable = which("aeroloop") or str(Path(sys.argv[0]).absolute())
+    if install is None:
+        for name in UNITS:
+            typer.echo(f"# aeroloop-{name}.service\n{unit(name, executable)}")
+        return
+    try:
+        for path in install_units(install, executable):
+            typer.echo(path)
+    except OSError as error:
+        fail(f"cannot write into {install}: {error.strerror}", 1)

@@ -1,0 +1,222 @@
+"""`aeroloop lab`: the theory and the bench, in lockstep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aeroloop.service.cli.common import (
+    PAPER_DURATION_S,
+    BitsIn,
+    BitsOut,
+    Config,
+    Duration,
+    Json,
+    Overrides,
+    checked,
+    guarded,
+    print_figures,
+    settings_of,
+    with_bits_of,
+)
+
+if TYPE_CHECKING:
+    from aeroloop.service.figures import Figures
+    from aeroloop.service.lab.burden import Burden
+    from aeroloop.service.lab.calibrate import Calibration
+    from aeroloop.service.lab.tables import Tables
+    from aeroloop.service.theorem.certificate import Certificate
+
+group = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
+
+
+@group.command()
+def experiment(
+    duration: Duration = PAPER_DURATION_S,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the closed loop in this process, in lockstep and through real frames, without a network."""
+    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+
+    def run() -> Figures:
+        from aeroloop.service.lab.experiment import run_experiment
+
+        if json:
+            return run_experiment(settings, duration)
+        from aeroloop.service.terminal.display import progress_bar
+
+        with progress_bar("experiment", duration) as update:
+            return run_experiment(settings, duration, update)
+
+    print_figures(guarded(run), json)
+
+
+@group.command()
+def tables(
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Predict every cell of the paper's Tables C.2 to C.4, beside what was published."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Tables:
+        from aeroloop.service.lab.tables import predict
+        from aeroloop.service.terminal.display import count_bar
+
+        with count_bar("cells", hidden=json) as update:
+            return predict(settings, seeds, update)
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    elif markdown:
+        from aeroloop.service.lab.tables import markdown as as_markdown
+
+        typer.echo(as_markdown(result))
+    else:
+        from aeroloop.service.terminal.display import paper_tables
+
+        paper_tables(result)
+
+
+@group.command()
+def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Fit the bench to two of the paper's cells, calm and windy, and print the fitted values."""
+    settings = settings_of(config, overrides)
+
+    def run() -> Calibration:
+        from aeroloop.service.lab.calibrate import calibrate
+        from aeroloop.service.terminal.display import count_bar
+
+        with count_bar("experiments", hidden=json) as update:
+            return calibrate(settings, lambda runs: update(runs, None))
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.display import calibration_table
+
+        calibration_table(result)
+
+
+@group.command()
+def certify(
+    disturbance: Annotated[float, typer.Option(min=0, help="Largest disturbance to be reckoned with, in N·m.")] = 0.0,
+    attitude_error: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=180,
+            help="Assume that the attitude error stays below this, in degrees; controller.start_within_deg if left "
+            "out, and 180 assumes nothing.",
+            show_default=False,
+        ),
+    ] = None,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Say whether the paper's theorem holds for the configuration, and what error it then guarantees."""
+    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+
+    def run() -> Certificate:
+        from aeroloop.service.theorem.certificate import certify
+
+        return certify(
+            settings.wire,
+            settings.law,
+            settings.reference,
+            settings.controller,
+            disturbance=disturbance,
+            attitude_error_deg=attitude_error,
+        )
+
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.certificate_table import certificate_table
+
+        certificate_table(result)
+    raise typer.Exit(0 if result.holds else 1)
+
+
+@group.command()
+def burden(
+    bits: Annotated[
+        list[str] | None,
+        typer.Option(metavar="OUT/IN", help="Bits of ε and ω, and of u, such as 8/6; repeated.", show_default=False),
+    ] = None,
+    quantizer: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
+            "the rest); repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    duration: Duration = PAPER_DURATION_S,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Weigh error against bits: every number of bits, quantizer, transmit policy and sensor noise, beside float64.
+
+    What is left out is all of it: six pairs of bits, every quantizer, four kinds of sensors.
+    """
+    settings = settings_of(config, overrides)
+
+    def run() -> Burden:
+        from aeroloop.service.lab.burden import measure_burden
+        from aeroloop.service.terminal.display import count_bar
+
+        with count_bar("experiments", hidden=json) as update:
+            return measure_burden(settings, cells, duration, update)
+
+    from aeroloop.service.lab.burden_grid import grid
+
+    if figure is not None:
+        from aeroloop.service.lab.burden_figure import check_path
+
+        checked(lambda: check_path(figure))
+    cells = checked(lambda: grid(settings, bits or (), quantizer or (), sensors or ()))
+    result = guarded(run)
+    if json:
+        typer.echo(result.model_dump_json(indent=2))
+    elif markdown:
+        from aeroloop.service.lab.burden_table import markdown as as_markdown
+
+        typer.echo(as_markdown(result))
+    else:
+        from aeroloop.service.lab.burden_table import burden_table
+
+        burden_table(result)
+    if figure is not None:  # last, so that a disk that is full costs no table
+        from aeroloop.service.lab.burden_figure import draw_burden
+
+        guarded(lambda: draw_burden(result, figure))

@@ -1,0 +1,195 @@
+"""`aeroloop log`: what happened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, run_alone, settings_of
+from aeroloop.service.cli.compare import Html, compare, write_html
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from aeroloop.service.logs.export import Exported
+    from aeroloop.service.logs.recover import Recovery
+    from aeroloop.service.logs.replay import Replay
+    from aeroloop.service.review.report import Report
+
+group = typer.Typer(no_args_is_help=True, help="What happened, from logs; and what happens.")
+
+
+@group.command()
+def review(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    figures: Annotated[
+        Path | None, typer.Option("--figures", help="Draw the paper's figures into this folder.", show_default=False)
+    ] = None,
+    require: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--require",
+            metavar="FIGURE=LIMIT",
+            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4, skipped=0 or latency.p99=2000.",
+            show_default=False,
+        ),
+    ] = None,
+    html: Html = None,
+    json: Json = False,
+) -> None:
+    """Say everything that logs tell of a run, hold its figures to limits, draw the paper's figures."""
+    from aeroloop.service.review.requirements import Limit
+
+    limits = checked(lambda: [Limit.parse(text) for text in require or []])
+
+    def run() -> Report:
+        from aeroloop.service.logs.ticks import Ticks
+        from aeroloop.service.review.review import read
+        from aeroloop.service.terminal.display import share_bar
+
+        kept: list[Ticks] = []
+        with share_bar("reading", hidden=json) as update:
+            judged = read(*logs, watch=None if figures is None else kept.append, progress=update)
+        report = judged.report(limits)
+        if figures is not None:
+            from aeroloop.service.report.plots import draw_figures, draw_theorem
+
+            drawn = draw_figures(judged.session.settings, kept, figures)
+            for path in [*drawn, *draw_theorem(report, figures)]:
+                typer.echo(f"aeroloop: drew {path}", err=True)
+        if html is not None:
+            write_html([report], html)
+        return report
+
+    findings = guarded(run).findings
+    if json:
+        typer.echo(findings.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.log_tables import review_account
+
+        review_account(findings)
+    broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
+    if broken:
+        fail("; ".join(broken), 1)
+
+
+group.command()(compare)
+
+
+@group.command()
+def replay(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Compute with this instead of what the log says."),
+    ] = None,
+    end: Annotated[
+        Literal["controller", "plant"] | None,
+        typer.Option("--end", help="Only this end; both if left out.", show_default=False),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compute what both ends did again from their traces, and compare byte for byte."""
+
+    def run() -> Replay:
+        from aeroloop.protocol.messages.trace import ENDS
+        from aeroloop.service.logs.replay import replay
+        from aeroloop.service.terminal.display import share_bar
+
+        with share_bar("replaying", hidden=json) as update:
+            return replay(logs, overrides or [], update, ends=[end] if end else ENDS)
+
+    replayed = guarded(run)
+    if json:
+        typer.echo(replayed.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.log_tables import replay_table
+
+        replay_table(replayed)
+    if not overrides and replayed.differs:
+        raise typer.Exit(1)
+
+
+@group.command()
+def recover(
+    broken: Annotated[Path, typer.Argument(help="A log that was cut or damaged; it is not changed.")],
+    out: Annotated[Path, typer.Argument(help="The new file.")],
+    json: Json = False,
+) -> None:
+    """Write everything that is whole in a broken log into a new one, and say what was lost."""
+
+    def run() -> Recovery:
+        from aeroloop.service.logs.recover import recover
+        from aeroloop.service.terminal.display import share_bar
+
+        with share_bar("recovering", hidden=json) as update:
+            return recover(broken, out, update)
+
+    recovery = guarded(run)
+    if json:
+        typer.echo(recovery.model_dump_json(indent=2))
+    else:
+        typer.echo(f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels")
+        for line in recovery.lost:
+            typer.echo(f"not recovered, {line}")
+
+
+@group.command()
+def live(
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free one.")] = 8765,
+    address: Annotated[str, typer.Option("--address", help="Where to listen; 0.0.0.0 is everywhere.")] = "127.0.0.1",
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000, help="Messages a second of each topic.")] = 30.0,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Show what happens now in Foxglove or Lichtblick: a WebSocket server, until ^C."""
+    settings = settings_of(config, overrides)
+    vehicle = settings.vehicle
+
+    def ready(url: str) -> None:
+        layout = f"aeroloop show layout --vehicle {vehicle}"
+        typer.echo(f"{vehicle} at {url} for Foxglove and Lichtblick, until ^C; `{layout}` prints a layout to import")
+
+    def run(stop: Event) -> None:
+        from aeroloop.service.viewers.foxglove_server import serve
+
+        serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
+
+    run_alone(run, quiet=False, log_format="text", with_parent=0)
+
+
+@group.command()
+def export(
+    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="What kind of file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The new file; the log's name with another ending if left out.", show_default=False),
+    ] = None,
+    session: Annotated[
+        str | None,
+        typer.Option("--session", metavar="NAME|all", help="The longest one if left out.", show_default=False),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write a log as a table, a row a tick, for other programs; or, --to mcap, with everything decoded beside it."""
+
+    def run() -> Exported:
+        from aeroloop.service.logs.export import export
+        from aeroloop.service.terminal.display import share_bar
+
+        with share_bar("exporting", hidden=json) as update:
+            return export(logs, to, out, session=session, progress=update)
+
+    exported = guarded(run)
+    if json:
+        typer.echo(exported.model_dump_json(indent=2))
+    else:
+        if exported.sessions is None:
+            typer.echo(f"{exported.out}: {exported.rows} messages on {len(exported.columns)} channels")
+        else:
+            typer.echo(f"{exported.out}: {exported.rows} ticks of {', '.join(exported.sessions)}")
+        for line in exported.damages:
+            typer.echo(f"not read, {line}")

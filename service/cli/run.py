@@ -1,0 +1,232 @@
+"""The processes: the demo, and each of its parts by itself."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from aeroloop.service.cli.common import (
+    PAPER_DURATION_S,
+    BitsIn,
+    BitsOut,
+    Config,
+    Duration,
+    Json,
+    LogFormat,
+    Overrides,
+    Quiet,
+    WithParent,
+    guarded,
+    print_figures,
+    reloadable,
+    run_alone,
+    run_role,
+    settings_of,
+    with_bits_of,
+)
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from aeroloop.protocol.runtime.role import Role
+    from aeroloop.service.config import Settings
+    from aeroloop.service.figures import Figures
+
+Faults = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fault",
+        metavar="SIGNAL:KIND@T",
+        help="What shall go wrong, such as rate:off@5 or command:drop=0.05; may be repeated.",
+        show_default=False,
+    ),
+]
+
+group = typer.Typer()
+
+
+@group.command()
+def demo(
+    duration: Duration = PAPER_DURATION_S,
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
+    via: Annotated[
+        str | None,
+        typer.Option(
+            "--via", metavar="emulator|can|quanser-fake", help="What the plant is behind.", show_default=False
+        ),
+    ] = None,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the paper's experiment over Zenoh in three processes, and judge its log."""
+    options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
+    settings = settings_of(config, [*(overrides or []), *options])
+    settings = with_bits_of(settings, bits_out, bits_in)
+
+    def run() -> tuple[Figures, bool]:
+        from aeroloop.service.lab.demo import run_demo
+        from aeroloop.service.terminal.display import live_demo
+
+        if json or not sys.stderr.isatty():
+            how = "in lockstep" if settings.loop.lockstep else "in real time"
+            typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
+            return run_demo(settings, duration, log)
+        with live_demo(duration) as update:
+            return run_demo(settings, duration, log, update)
+
+    figures, complete = guarded(run)
+    print_figures(figures, json)
+    if not complete:
+        raise typer.Exit(130)
+
+
+@group.command()
+def controller(
+    duration: Annotated[
+        float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.", show_default=False)
+    ] = None,
+    auto_arm: Annotated[
+        bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
+    ] = False,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = 0,
+) -> None:
+    """Run the controller daemon until SIGTERM."""
+    options = [f"controller.duration_s={duration}"] if duration is not None else []
+    options += ["controller.auto_arm=true"] if auto_arm else []
+    settings, load = reloadable(config, [*(overrides or []), *options])
+
+    def run(role: Role) -> None:
+        from aeroloop.service.config import from_contract
+        from aeroloop.service.daemon.daemon import Daemon
+        from aeroloop.service.daemon.reload import reload_on_hangup
+
+        daemon = Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller)
+
+        def promise(now: Settings) -> dict[str, Any] | None:
+            return daemon.promise(now.law, now.reference, now.controller)
+
+        role.configured(settings.contract(), promise(settings))
+        reload_on_hangup(
+            role,
+            settings,
+            load,
+            lambda new: daemon.reconfigure(new.law, new.reference, new.controller),
+            lambda effective: promise(from_contract(effective)),
+        )
+        daemon.run()
+
+    run_role("controller", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command()
+def emulator(
+    faults: Faults = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = 0,
+) -> None:
+    """Run the emulated plant until SIGTERM."""
+    settings, load = reloadable(config, [*(overrides or []), "plant.via=emulator", *_fault_options(faults)])
+    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command()
+def plant(
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = 0,
+) -> None:
+    """Run the plant end that `plant.via` names, until SIGTERM: emulator, CAN bridge or Quanser's board."""
+    settings, load = reloadable(config, overrides or [])
+    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command()
+def bridge(
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = 0,
+) -> None:
+    """Run the bridge to a plant on the configured CAN bus, until SIGTERM."""
+    settings, load = reloadable(config, [*(overrides or []), "plant.via=can"])
+    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command("can-node")
+def can_node(
+    faults: Faults = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = 0,
+) -> None:
+    """Run the emulated plant as a node on the configured CAN bus, until SIGTERM."""
+    settings = settings_of(config, [*(overrides or []), *_fault_options(faults)])
+
+    def run(stop: Event) -> None:
+        from aeroloop.plant_emulator.hosts.can_node import CanFront
+        from aeroloop.plant_emulator.hosts.emulator import Emulator
+
+        emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
+        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint))
+
+    run_alone(run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+def _fault_options(faults: list[str] | None) -> list[str]:
+    return [f"plant.faults={dumps(faults)}"] if faults else []
+
+
+def _run_plant(
+    settings: Settings, load: Callable[[], Settings], *, quiet: bool, log_format: str, with_parent: int
+) -> None:
+    def run(role: Role) -> None:
+        from aeroloop.service.daemon.plants import run_plant
+
+        run_plant(role, settings, load)
+
+    run_role("plant", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+
+
+@group.command()
+def recorder(
+    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+    log_format: LogFormat = "text",
+    with_parent: WithParent = 0,
+) -> None:
+    """Record traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
+    options = [f"recorder.path={dumps(str(log))}"] if log is not None else []
+    settings, load = reloadable(config, [*(overrides or []), *options])
+
+    def run(role: Role) -> None:
+        from aeroloop.service.daemon.reload import reload_on_hangup
+        from aeroloop.service.recording.recorder import Recorder
+
+        recorder = Recorder(role, settings.recorder)
+        reload_on_hangup(role, settings, load, lambda new: recorder.reconfigure(new.recorder))
+        recorder.run()
+
+    run_role("recorder", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)

@@ -1,0 +1,72 @@
+"""`aeroloop show`: what would be used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aeroloop.service.cli.common import Config, Overrides, fail, settings_of
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+group = typer.Typer(no_args_is_help=True, help="What would be used.")
+
+
+@group.command("config")
+def show_config(config: Config = None, overrides: Overrides = None) -> None:
+    """Print the effective configuration as TOML."""
+    typer.echo(settings_of(config, overrides).toml(), nl=False)
+
+
+@group.command()
+def spec(config: Config = None, overrides: Overrides = None) -> None:
+    """Print the wire as configured: frames, widths, steps."""
+    from aeroloop.service.terminal.wire_table import wire_table
+
+    wire_table(settings_of(config, overrides).wire)
+
+
+@group.command()
+def dbc(config: Config = None, overrides: Overrides = None) -> None:
+    """Print the DBC file of the configured wire on the configured CAN node."""
+    settings = settings_of(config, overrides)
+
+    from aeroloop.protocol.transport.dbc import dbc as describe
+
+    typer.echo(describe(settings.wire, settings.can.node, settings.loop.period_ns), nl=False)
+
+
+@group.command()
+def layout(
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", metavar="NAME", help="Whose topics; the configured one's if left out.")
+    ] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print a layout for Foxglove or Lichtblick that shows a log, or `log live`: save it, and import the file there."""
+    settings = settings_of(config, [*(overrides or []), *([f'vehicle="{vehicle}"'] if vehicle is not None else [])])
+
+    from aeroloop.service.viewers.layout import layout as describe
+
+    typer.echo(describe(settings.vehicle, settings.wire.actuators))
+
+
+@group.command()
+def examples(
+    name: Annotated[
+        str | None, typer.Argument(help="Which one; all are listed if left out.", show_default=False)
+    ] = None,
+) -> None:
+    """List the example configurations, or print one of them."""
+    known = {path.stem: path.read_text(encoding="utf-8") for path in sorted(EXAMPLES.glob("*.toml"))}
+    if name is None:
+        for stem, text in known.items():
+            about = " ".join(line[2:] for line in text.split("\n\n")[0].splitlines() if line.startswith("# "))
+            typer.echo(f"{stem:12}  {about}")
+    elif name in known:
+        typer.echo(known[name], nl=False)
+    else:
+        fail(f"no example is called {name!r}; there are {', '.join(known)}", 2)

@@ -1,1 +1,0 @@
-"""The verbs of the command `aeroloop`, a module a group. Each parses, calls one function and prints."""

@@ -1,0 +1,274 @@
+"""The adaptive control law, (C.16)–(C.49), written beside the paper.
+
+    symbol   name in code   meaning                                        unit        shape
+    q^Q      q              attitude as received, body relative to i       1           4
+    ω^Q      omega          angular velocity as received, body frame       rad/s       3
+    q_d      q_d            desired attitude                               1           4
+    ω_d      omega_d        desired angular velocity, *inertial* frame     rad/s       3
+    ω̇_d      omega_d_dot    its derivative                                 rad/s²      3
+    θ̂        theta          estimate of the damping θ                      N·m·s/rad   3
+    ±        s              sign of η̃(t0): +1 for z₁₊, −1 for z₁₋          1           1
+    C₁ C₂ Γ  C1, C2, Gamma  gains, diagonal; symbols, so that they may     see below   3
+                            change while the loop runs
+    e^Q      eta_e, eps_e   tracking error, scalar and vector part         1           1, 3
+    ω_e^Q    omega_e        angular velocity error                         rad/s       3
+    u        u              command before quantization                    V           3
+
+The equations without quantization, (C.16)–(C.23), are the same expressions with unquantized arguments; where the paper
+repeats an equation for its quantized form, the line carries both numbers. That (C.25) follows from them is proved in
+tests/service/test_law.py. What arrives here is within the bounds (C.28) and (C.29) of the truth: its errors are (C.31),
+(C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the bound (C.30).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot
+from typing import Annotated, Final, NamedTuple
+
+import casadi as ca
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from aeroloop.protocol.messages.operator import Gain
+from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.protocol.wire.symbolic import along_rows, in_columns
+
+
+def _positive(gains: tuple[float, float, float]) -> tuple[float, float, float]:
+    if min(gains) <= 0:
+        raise ValueError("every element must be positive")
+    return gains
+
+
+Diagonal = Annotated[tuple[float, float, float], AfterValidator(_positive)]
+"""The diagonal of a positive definite matrix."""
+
+
+class LawSettings(BaseModel):
+    """What the controller believes of the plant, and its gains. The default is the paper's experiment, Table C.1."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    inertia: Diagonal = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
+    mass: float = Field(default=1.075, gt=0, description="m [kg]")
+    gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
+    centre_of_mass: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, -0.0038), description="r_g, origin to centre of mass, body frame [m]"
+    )
+    allocation: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] = Field(
+        default=((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, -0.0014, 0.00176)),
+        description="B, control allocation, invertible [N·m/V]; the Aero's first row is fictitious",
+    )
+    C1: Gain = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
+    C2: Gain = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
+    Gamma: Gain = Field(default=(0.02, 0.02, 0.02), description="adaptation gain [N·m·s²/rad² per s]")
+    damping_estimate: tuple[float, float, float] = Field(
+        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
+    )
+    damping_bound: float = Field(default=0.05, gt=0, description="k_θ: ‖θ‖ is known to be below this [N·m·s/rad]")
+
+    @model_validator(mode="after")
+    def _estimate_within_bound(self) -> LawSettings:
+        if hypot(*self.damping_estimate) > self.damping_bound:
+            raise ValueError(f"the first damping estimate lies beyond damping_bound, {self.damping_bound}")
+        return self
+
+
+@dataclass(frozen=True)
+class Law:
+    """The law's expressions, each as named in the module's table, and the symbols they are made of."""
+
+    q: ca.SX
+    omega: ca.SX
+    q_d: ca.SX
+    omega_d: ca.SX
+    omega_d_dot: ca.SX
+    theta: ca.SX
+    s: ca.SX
+    C1: ca.SX
+    C2: ca.SX
+    Gamma: ca.SX
+    eta_e: ca.SX
+    eps_e: ca.SX
+    omega_e: ca.SX
+    z1: ca.SX
+    z2: ca.SX
+    u: ca.SX
+    tau: ca.SX
+    theta_dot: ca.SX
+
+
+def build_law(p: LawSettings) -> Law:
+    """The law for these parameters, as CasADi expressions; the gains are symbols among them.
+
+    Raises:
+        ValueError: B cannot be inverted.
+    """
+    if np.linalg.cond(np.array(p.allocation)) > 1e12:
+        raise ValueError("law.allocation (B) has no inverse: every axis needs a motor that acts on it")
+    J, B = ca.diag(ca.SX(p.inertia)), ca.SX(np.array(p.allocation))
+    gains = ca.SX.sym("C1", 3), ca.SX.sym("C2", 3), ca.SX.sym("Gamma", 3)
+    C1, C2, Gamma = (ca.diag(gain) for gain in gains)
+    r_g = ca.SX(p.centre_of_mass)
+    f_g = ca.vertcat(0, 0, -p.mass * p.gravity)
+    I = ca.SX.eye(3)  # noqa: E741  # the paper's identity matrix
+
+    q, omega = ca.SX.sym("q", 4), ca.SX.sym("omega", 3)
+    q_d, omega_d, omega_d_dot = ca.SX.sym("q_d", 4), ca.SX.sym("omega_d", 3), ca.SX.sym("omega_d_dot", 3)
+    theta, s = ca.SX.sym("theta", 3), ca.SX.sym("s")
+    eta, eps, eta_d, eps_d = q[0], q[1:4], q_d[0], q_d[1:4]
+
+    eta_e = eta_d * eta + ca.dot(eps_d, eps)  # (C.16), (C.32)
+    eps_e = eta_d * eps - eta * eps_d - S(eps_d) @ eps  # (C.16), (C.32)
+    R_ib = R(q).T  # (C.48): inertial to body, of the attitude as received
+    omega_e = omega - R_ib @ omega_d  # (C.18), (C.47); it moves e as (C.17) says
+
+    z1 = ca.vertcat(1 - s * eta_e, eps_e)  # (C.19), (C.39)
+    G = ca.vertcat(s * eps_e.T, eta_e * I + S(eps_e)).T  # (C.21), (C.41)
+    alpha = -C1 @ G @ z1  # (C.20), (C.42); G z1 = ±ε̃ by (C.49)
+    z2 = omega_e - alpha  # (C.19), (C.40)
+    alpha_bar = -s / 2 * C1 @ (eta_e * I + S(eps_e)) @ omega_e  # (C.46), for α̇ (Remark 6)
+
+    g = -S(r_g) @ R_ib @ f_g  # (C.45)
+    Psi = -S(omega) @ (J @ omega) - g  # (C.43)
+    Phi = ca.diag(-omega)  # (C.44)
+    u = ca.solve(
+        B,
+        -G @ z1 - C2 @ z2 - Phi @ theta - Psi - J @ (S(omega) @ R_ib @ omega_d - R_ib @ omega_d_dot - alpha_bar),
+    )  # (C.22), (C.37)
+    tau = Gamma @ Phi @ z2  # (C.23)
+    theta_dot = projection(tau, theta, Gamma, p.damping_bound)  # (C.38)
+
+    return Law(q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains, eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot)
+
+
+def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
+    """Proj{τ} of (C.38): the smooth projection of Krstić, Kanellakopoulos and Kokotović onto ‖θ̂‖ ≤ k_θ (Remark 5).
+
+    Inside ‖θ̂‖ ≤ 0.95 k_θ it is τ itself; from there to k_θ it takes away, more and more, what points outwards.
+
+    Args:
+        tau: Γ Φ z₂, the update without projection. Shape (3,).
+        theta: θ̂. Shape (3,).
+        Gamma: Adaptation gain. Shape (3, 3).
+        bound: k_θ [N·m·s/rad].
+    """
+    inner = 0.95 * bound
+    outside = (ca.dot(theta, theta) - inner**2) / (bound**2 - inner**2)
+    outward = ca.dot(theta, tau)
+    weight = ca.fmin(1, outside) / ca.fmax(ca.dot(theta, Gamma @ theta), 1e-300)
+    return tau - ca.if_else(ca.logic_and(outside > 0, outward > 0), weight * outward, 0) * Gamma @ theta
+
+
+def received(eps: ca.SX, last: ca.SX) -> ca.SX:
+    """q^Q of ε as received: `aeroloop.protocol.wire.attitude.received_quaternion`, as an expression. Shape (4,).
+
+    Args:
+        eps: ε. Shape (3,).
+        last: The q^Q before. Shape (4,).
+    """
+    square = ca.dot(eps, eps)
+    eta = ca.sqrt(ca.fmax(0, 1 - square))  # (C.11)
+    q = ca.vertcat(eta, eps / ca.sqrt(ca.fmax(1, square)))  # Remark 2
+    return q * (1 - 2 * (ca.dot(q, last) < 0))
+
+
+class Steps(NamedTuple):
+    """A tick of the law in four parts, so that only two of them go from tick to tick.
+
+    Attributes:
+        attitude: last, eps ↦ q. From tick to tick: `last` is the q before.
+        adaptation: q, omega, q_d, omega_d, s, C1, C2, Gamma ↦ tau.
+        estimate: theta, tau, Gamma ↦ theta_next. From tick to tick.
+        command: q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2 ↦ u, eta_e, eps_e, omega_e.
+    """
+
+    attitude: ca.Function
+    adaptation: ca.Function
+    estimate: ca.Function
+    command: ca.Function
+
+
+def law_steps(p: LawSettings, period: float) -> Steps:
+    """The law's parts, with θ̂ carried over a period by Euler's rule.
+
+    Args:
+        p: Parameters; the gains are inputs.
+        period: Time between ticks [s].
+
+    Raises:
+        ValueError: B cannot be inverted.
+    """
+    law = build_law(p)
+    last, eps, tau = ca.SX.sym("last", 4), ca.SX.sym("eps", 3), ca.SX.sym("tau", 3)
+    theta_next = law.theta + period * projection(tau, law.theta, ca.diag(law.Gamma), p.damping_bound)  # (C.38)
+    # Euler's step leaves the ball along its tangent; the projection of Remark 5 holds in continuous time only.
+    theta_next *= ca.fmin(1, p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
+    errors = law.q, law.omega, law.q_d, law.omega_d
+    return Steps(
+        ca.Function("attitude", [last, eps], [received(eps, last)], ["last", "eps"], ["q"]),
+        ca.Function("adaptation", [*errors, law.s, law.C1, law.C2, law.Gamma], [law.tau]),
+        ca.Function("estimate", [law.theta, tau, law.Gamma], [theta_next]),
+        ca.Function(
+            "command",
+            [*errors, law.omega_d_dot, law.theta, law.s, law.C1, law.C2],
+            [law.u, law.eta_e, law.eps_e, law.omega_e],
+        ),
+    )
+
+
+_SIZES: Final = {"eps": 3, "omega": 3, "q_d": 4, "omega_d": 3, "omega_d_dot": 3, "s": 1, "C1": 3, "C2": 3, "Gamma": 3}
+
+
+def law_function(p: LawSettings, period: float) -> ca.Function:
+    """The law as the loop evaluates it: one tick. Raises as `law_steps` does.
+
+    Inputs: last, theta, and eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma. `last` is the q before, which the
+    next q is nearest to. Outputs: q, u, theta_next, eta_e, eps_e, omega_e.
+    """
+    steps = law_steps(p, period)
+    last, theta = ca.SX.sym("last", 4), ca.SX.sym("theta", 3)
+    given = {name: ca.SX.sym(name, size) for name, size in _SIZES.items()}
+    eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma = given.values()
+    q = steps.attitude(last, eps)
+    theta_next = steps.estimate(theta, steps.adaptation(q, omega, q_d, omega_d, s, C1, C2, Gamma), Gamma)
+    u, *errors = steps.command(q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2)
+    return ca.Function(
+        "law",
+        [last, theta, *given.values()],
+        [q, u, theta_next, *errors],
+        ["last", "theta", *given],
+        ["q", "u", "theta_next", "eta_e", "eps_e", "omega_e"],
+        {"cse": True},  # two parts need the errors
+    )
+
+
+def law_of_many(p: LawSettings, period: float, rows: int) -> ca.Function:
+    """The law as a reader of logs evaluates it: many ticks in a row. Raises as `law_steps` does.
+
+    Args:
+        p: Parameters; the gains are inputs.
+        period: Time between ticks [s].
+        rows: How many ticks; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
+
+    Returns:
+        A function with the inputs and outputs of `law_function`. `last` and `theta` are those before the first tick;
+        everything else has a row a tick, shape (rows, …). One output more: theta_before, the θ̂ that each u is made of.
+    """
+    steps = law_steps(p, period)
+    last, first = ca.MX.sym("last", 4), ca.MX.sym("theta", 3)
+    given = {name: ca.MX.sym(name, rows, size) for name, size in _SIZES.items()}
+    eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma = given.values()
+    q = along_rows(steps.attitude, last, eps)
+    tau = in_columns(steps.adaptation, rows)(q, omega, q_d, omega_d, s, C1, C2, Gamma)
+    theta_next = along_rows(steps.estimate, first, tau, Gamma)
+    theta = ca.vertcat(first.T, theta_next[:-1, :])
+    u, *errors = in_columns(steps.command, rows)(q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2)
+    return ca.Function(
+        "law_of_many",
+        [last, first, *given.values()],
+        [q, u, theta_next, *errors, theta],
+        ["last", "theta", *given],
+        ["q", "u", "theta_next", "eta_e", "eps_e", "omega_e", "theta_before"],
+    )

@@ -1,0 +1,44 @@
+"""What can stand at the plant end of a Zenoh network, by the name that `plant.via` has for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.service.config import Settings
+from aeroloop.service.daemon.reload import reload_on_hangup
+
+
+def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> None:
+    """Run the plant end that the configuration names until the role is told to stop.
+
+    Args:
+        role: Its name on the network.
+        settings: The configuration.
+        load: Reads it again, on SIGHUP.
+
+    Raises:
+        AeroloopError: It cannot be run, in one line.
+        ValueError: The same, of the configuration.
+    """
+    loop, wire, plant = settings.loop, settings.wire, settings.plant
+    if plant.via == "can":
+        from aeroloop.plant_emulator.hosts.can_bridge import Bridge
+
+        bridge = Bridge(role, loop, wire, plant, settings.can)
+        reload_on_hangup(role, settings, load, lambda new: bridge.reconfigure(new.plant))
+        bridge.run()
+        return
+    if plant.via == "emulator":
+        from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
+
+        emulator = EmulatorOnZenoh(role, loop, wire, plant)
+        reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
+        emulator.run()
+        return
+    from aeroloop.plant_emulator.hosts.presence import Presence
+    from aeroloop.plant_emulator.hosts.quanser.board import BoardDriver
+
+    driver = BoardDriver(loop, wire, plant, role.stop)
+    reload_on_hangup(role, settings, load, lambda new: driver.reconfigure(new.plant))
+    driver.run(Presence(role, loop, driver.endpoint))

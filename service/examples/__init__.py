@@ -1,0 +1,1 @@
+"""Examples: configurations, and programs on the public API."""

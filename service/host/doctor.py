@@ -1,0 +1,142 @@
+"""Will this machine hold the configured rate? Looks at what the kernel allows, then tries it for a few seconds.
+
+A finding is good or names what to change. The trial is a bare loop on the grid, with everything asked for that the
+daemons ask for; what it shows is the machine's part of the jitter, to which Zenoh adds its own.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.protocol.messages.models import Percentiles
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.runtime.tick_grid import TickGrid
+from aeroloop.protocol.runtime.timing import LoopTiming, summary
+from aeroloop.protocol.wire.loop import LoopSettings
+
+TRIAL_S: Final = 5.0
+GOOD_CLOCKS: Final = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page")
+SHARE_OF_PERIOD: Final = 0.25
+"""A wake-up later than this part of the period leaves too little of it for two crossings of the network."""
+
+
+class Finding(BaseModel):
+    """One thing that was looked at."""
+
+    model_config = ConfigDict(frozen=True)
+
+    what: str
+    good: bool
+    found: str
+    advice: str = Field(default="", description="what to change, where it is not good")
+
+
+class Diagnosis(BaseModel):
+    """All findings and the trial."""
+
+    model_config = ConfigDict(frozen=True)
+
+    holds: bool = Field(description="whether the trial kept the configured rate")
+    rate_hz: float
+    skipped: int
+    wake_us: Percentiles | None
+    findings: list[Finding]
+
+
+def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None) -> Diagnosis:
+    """Look, then try.
+
+    Args:
+        loop: The grid, and what is asked of the machine.
+        progress: Called now and then with the seconds of the trial that are over.
+    """
+    findings = [_clock(), _priority_limit(), _memory_limit(), _throttling(), _governor()]
+    refused = prepare_process(loop.model_copy(update={"realtime": "try"}))
+    findings += [Finding(what="asked for", good=False, found=line, advice="run it as a service") for line in refused]
+    timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
+    ticks, report_every = loop.ticks(TRIAL_S), max(1, loop.ticks(0.2))
+    while grid.tick < ticks:
+        k = grid.wait()
+        timing.woke(grid.due_ns)
+        if progress is not None and k % report_every == 0:
+            progress(k * loop.period)
+        timing.done()
+    timing.turn()
+    wake = summary(timing.wake.total)
+    limit_us = SHARE_OF_PERIOD * loop.period_ns / 1000
+    late = wake is None or wake.p999 > limit_us
+    trial = Finding(
+        what=f"{TRIAL_S:g} s at {loop.rate_hz:g} Hz",
+        good=not late and grid.skipped == 0,
+        found=f"{grid.skipped} ticks skipped, 99.9 % of wake-ups within {wake.p999 if wake else float('nan'):.0f} µs",
+        advice=f"want none skipped and {limit_us:.0f} µs: lower loop.rate_hz, free or isolate a CPU (loop.cpus), or "
+        "use a kernel with PREEMPT_RT",
+    )
+    return Diagnosis(
+        holds=trial.good, rate_hz=loop.rate_hz, skipped=grid.skipped, wake_us=wake, findings=[*findings, trial]
+    )
+
+
+def _read(path: str) -> str | None:
+    try:
+        return Path(path).read_text().strip()
+    except OSError:
+        return None
+
+
+def _clock() -> Finding:
+    source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    return Finding(
+        what="clock source",
+        good=source in GOOD_CLOCKS,
+        found=source or "not told by this kernel",
+        advice="reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
+    )
+
+
+def _priority_limit() -> Finding:
+    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    root = os.geteuid() == 0
+    return Finding(
+        what="real-time priority",
+        good=root or soft != 0,
+        found="root may" if root else f"limit {soft}",
+        advice="give the user LimitRTPRIO=10 (systemd), or 'rtprio 10' in /etc/security/limits.d",
+    )
+
+
+def _memory_limit() -> Finding:
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    root = os.geteuid() == 0
+    return Finding(
+        what="locked memory",
+        good=root or soft == resource.RLIM_INFINITY,
+        found="root may" if root else "no limit" if soft == resource.RLIM_INFINITY else f"limit {soft // 1024} KiB",
+        advice="give the user LimitMEMLOCK=infinity (systemd), or 'memlock unlimited' in /etc/security/limits.d",
+    )
+
+
+def _throttling() -> Finding:
+    runtime = _read("/proc/sys/kernel/sched_rt_runtime_us")
+    return Finding(
+        what="real-time throttling",
+        good=runtime is not None,
+        found="off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not told",
+        advice="the kernel does not say how much time real-time tasks may take",
+    )
+
+
+def _governor() -> Finding:
+    governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    return Finding(
+        what="CPU frequency",
+        good=governor in (None, "performance"),
+        found=governor or "not scaled by this kernel",
+        advice="set the governor to performance: cpupower frequency-set -g performance",
+    )

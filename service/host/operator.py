@@ -1,0 +1,181 @@
+"""An operator's verbs: look at every role on the network, arm a plant, stop it, change what a controller follows.
+
+Each is a question over Zenoh, answered by the role it is put to. Status is answered by the role's network thread from
+what it last said, so asking never stalls a loop; the other verbs are taken between two ticks.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from math import isfinite
+from pathlib import Path
+from typing import Final
+
+import zenoh
+from pydantic import ValidationError
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.messages.operator import Answer, Ask, Gains, Message, Points, Track
+from aeroloop.protocol.transport.network import NetworkSettings, join
+
+GATHER_S: Final = 1.0
+"""How long to look for roles. Gossip links a newcomer to all of them in some 50 ms."""
+ANSWER_S: Final = 1.0
+
+Statuses = dict[str, dict[str, Status]]
+
+
+class OperatorError(AeroloopError):
+    """Nobody answered, or the answer was no; one line."""
+
+
+def gather(network: NetworkSettings) -> Statuses:
+    """Status of every role of every vehicle on the network, by vehicle and role.
+
+    Of several controllers of one vehicle it is the one that has it, if any does.
+
+    Raises:
+        NetworkError: The network cannot be joined.
+        OperatorError: Nobody is there.
+    """
+    with join(network) as session:
+        found: Statuses = {}
+        deadline = time.monotonic() + GATHER_S
+        while time.monotonic() < deadline:
+            now: Statuses = {}
+            for reply in session.get(topics.key("status", "*"), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL):
+                if reply.ok is None or (address := topics.read_key(str(reply.ok.key_expr))) is None:
+                    continue
+                if address.role is not None:
+                    status = Status.model_validate_json(reply.ok.payload.to_bytes())
+                    roles = now.setdefault(address.vehicle, {})
+                    if address.role not in roles or status.session:
+                        roles[address.role] = status
+            for vehicle, roles in now.items():
+                found.setdefault(vehicle, {}).update(roles)
+            time.sleep(0.1)
+    if not found:
+        raise OperatorError(f"nobody answers at {network.rendezvous}; is an emulator or a controller running?")
+    return found
+
+
+def arm(network: NetworkSettings, vehicle: str) -> str:
+    """Arm a plant, so that the next claim is granted, and recall controllers that hold or are faulted.
+
+    Returns:
+        What was done, in a line.
+
+    Raises:
+        NetworkError: The network cannot be joined.
+        OperatorError: No plant answers, or a controller holds it.
+    """
+    with join(network) as session:
+        text = _ask(session, network, vehicle, "arm", Ask())
+        recalled = [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
+        return "; ".join([text, *recalled])
+
+
+def stop(network: NetworkSettings, vehicle: str) -> str:
+    """Stop a plant: 0 V at its next tick, and no claim until it is armed. Raises as `arm` does."""
+    return _tell(network, vehicle, "stop", Ask())
+
+
+def release(network: NetworkSettings, vehicle: str) -> str:
+    """Let the controller that has a vehicle give it back and hold until `arm`. Raises as `arm` does."""
+    return _tell(network, vehicle, "stand_down", Ask())
+
+
+def set_gains(network: NetworkSettings, vehicle: str, gains: Gains) -> str:
+    """Let the controller that has a vehicle use other gains from its next tick on. Raises as `arm` does."""
+    return _tell(network, vehicle, "set_gains", gains)
+
+
+def track(network: NetworkSettings, vehicle: str, track: Track) -> str:
+    """Let the controller that has a vehicle follow another reference. Raises as `arm` does."""
+    return _tell(network, vehicle, "track", track)
+
+
+def read_points(path: Path) -> Points:
+    """Attitudes over time out of a CSV file: columns time [s], roll, pitch, yaw [deg], with or without a heading.
+
+    Raises:
+        OperatorError: It cannot be read, or is no such table; names the line.
+    """
+    times: list[float] = []
+    attitudes: list[tuple[float, float, float]] = []
+    number = 1
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file)
+            first = True
+            while True:
+                number = rows.line_num + 1  # of the row that is tried next, if it cannot even be read
+                if (row := next(rows, None)) is None:
+                    break
+                number, heading = rows.line_num, first and bool(row) and not _is_number(row[0])
+                first = False
+                if not row or heading:
+                    continue
+                if (problem := _problem(row, times)) is not None:
+                    raise OperatorError(f"{path}, line {number}: {problem}")
+                time_s, roll, pitch, yaw = (float(cell) for cell in row)
+                times.append(time_s)
+                attitudes.append((roll, pitch, yaw))
+        return Points(times=times, attitudes=attitudes)
+    except csv.Error as error:
+        raise OperatorError(f"{path}, line {number}: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise OperatorError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    except ValidationError as error:
+        raise OperatorError(f"{path}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+
+
+def _problem(row: list[str], times: list[float]) -> str | None:
+    """What is wrong with a row of a table of points, if anything is."""
+    if len(row) != 4 or not all(_is_number(cell) for cell in row):
+        return f"expected four numbers (time [s], roll, pitch, yaw [deg]), not {','.join(row)!r}"
+    values = [float(cell) for cell in row]
+    if not all(isfinite(value) for value in values):
+        return f"every number must be finite, not {','.join(row)!r}"
+    if not times and values[0] != 0:
+        return f"the first time must be 0, not {row[0]}"
+    if times and values[0] <= times[-1]:
+        return f"times must rise, and {row[0]} does not after {times[-1]:g}"
+    return None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _tell(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+    with join(network) as session:
+        return _ask(session, network, vehicle, topic, message)
+
+
+def _ask(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+    """Put a question until somebody answers, since a newcomer's links take a moment; one yes is enough."""
+    deadline = time.monotonic() + ANSWER_S
+    while time.monotonic() < deadline:
+        if answers := _answers(session, topic, vehicle, message):
+            for answer in answers:
+                if answer.done:
+                    return answer.text
+            raise OperatorError("; ".join(answer.text for answer in answers))
+        time.sleep(0.02)
+    who = "plant" if topic in ("arm", "stop") else "controller"
+    raise OperatorError(f"no {who} of {vehicle} answers at {network.rendezvous}")
+
+
+def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:
+    replies = session.get(
+        topics.key(topic, vehicle), payload=message.encode(), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL
+    )
+    return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]

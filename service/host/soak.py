@@ -1,0 +1,163 @@
+"""The soak: the three processes for as long as one likes, and whether anything grows, drifts or is lost meanwhile.
+
+What a process uses is read from /proc, what the loop does from the roles' own status.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import zenoh
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Percentiles, Status
+from aeroloop.service.config import Settings
+from aeroloop.service.recording.rolling import parts
+from aeroloop.service.testing.process_group import Bench, BenchError, RoleName, free_rendezvous, private_bus
+
+ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
+WARM_UP: Final = 0.1
+"""Share of the time that is left to the processes to settle before growth is judged."""
+MAX_GROWTH: Final = 0.05
+"""Memory may grow by this share after warm-up and still count as steady."""
+PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
+
+
+class Usage(BaseModel):
+    """What a process uses."""
+
+    model_config = ConfigDict(frozen=True)
+
+    memory_mb: float = Field(description="resident memory [MB]")
+    threads: int
+    files: int = Field(description="open file handles")
+    cpu_s: float = Field(description="processor time since it started [s]")
+
+
+class Minute(BaseModel):
+    """How the loop did up to some time."""
+
+    model_config = ConfigDict(frozen=True)
+
+    at_s: float
+    skipped: int = Field(description="ticks the plant's grid has missed so far")
+    unanswered: int = Field(description="measurements so far that no command has answered")
+    latency_us: Percentiles | None = Field(description="from measurement to command, last 10 s [µs]")
+    wake_us: Percentiles | None = Field(description="the plant's wake-up latency, last 10 s [µs]")
+    usage: dict[str, Usage]
+
+
+class Soak(BaseModel):
+    """What a soak has shown."""
+
+    model_config = ConfigDict(frozen=True)
+
+    rate_hz: float
+    minutes: list[Minute]
+    findings: list[str] = Field(description="what was not as it should be, a line each; empty if all was")
+    log: str
+    log_mb: float
+
+
+def run_soak(
+    settings: Settings, minutes: float, log: Path, progress: Callable[[float, Minute], None] | None = None
+) -> Soak:
+    """Run controller, emulator and recorder for a while and watch them.
+
+    Args:
+        settings: The configuration; the rendezvous is replaced by a free one.
+        minutes: How long [min].
+        log: Where the recorder writes.
+        progress: Called once a sample with the seconds reached and the sample.
+
+    Raises:
+        BenchError: A process did not start, or failed, or the log exists.
+    """
+    if parts(log):
+        raise BenchError(f"{log} exists, and a log is never written over; name another with --log PATH")
+    settings = settings.model_copy(
+        update={
+            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
+            "controller": settings.controller.model_copy(update={"require_recorder": True, "auto_arm": True}),
+            "can": private_bus(settings.can),
+            "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
+        }
+    )
+    statuses: dict[str, Status] = {}
+    sessions: list[str] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        status = Status.model_validate_json(sample.payload.to_bytes())
+        statuses[status.role] = status
+        if status.role == "plant" and status.session and status.session not in sessions:
+            sessions.append(status.session)
+
+    samples: list[Minute] = []
+    total_s, every_s = minutes * 60, min(60.0, max(2.0, minutes * 60 / 10))
+    with Bench(settings) as bench:
+        bench.zenoh.declare_subscriber(topics.key("status", settings.vehicle), hear)
+        bench.start("recorder")
+        bench.start_plant()
+        bench.start("controller")
+        bench.await_role("plant")
+        bench.await_role("recorder")
+        start = time.monotonic()
+        while (reached := time.monotonic() - start) < total_s:
+            time.sleep(min(every_s, total_s - reached))
+            bench.check()
+            sample = _sample(bench, statuses, time.monotonic() - start)
+            samples.append(sample)
+            if progress is not None:
+                progress(sample.at_s, sample)
+    return Soak(
+        rate_hz=settings.loop.rate_hz,
+        minutes=samples,
+        findings=_findings(samples, sessions),
+        log=str(log),
+        log_mb=round(sum(path.stat().st_size for path in parts(log)) / 1e6, 2),
+    )
+
+
+def _sample(bench: Bench, statuses: dict[str, Status], at_s: float) -> Minute:
+    plant = statuses.get("plant")
+    return Minute(
+        at_s=round(at_s, 1),
+        skipped=plant.skipped if plant else 0,
+        unanswered=plant.sent - plant.received if plant else 0,
+        latency_us=plant.recent_latency_us if plant else None,
+        wake_us=plant.timing.recent_wake if plant and plant.timing else None,
+        usage={role: _usage(bench.pid(role)) for role in ROLES},
+    )
+
+
+def _usage(pid: int) -> Usage:
+    proc = Path(f"/proc/{pid}")
+    pages = int((proc / "statm").read_text().split()[1])
+    fields = (proc / "stat").read_text().rpartition(")")[2].split()
+    return Usage(
+        memory_mb=round(pages * PAGE_BYTES / 1e6, 2),
+        threads=int(fields[17]),
+        files=len(list((proc / "fd").iterdir())),
+        cpu_s=(int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"),
+    )
+
+
+def _findings(samples: list[Minute], sessions: list[str]) -> list[str]:
+    found = []
+    if len(sessions) != 1:
+        found.append(f"{len(sessions)} sessions instead of one: the log's events say why")
+    settled = samples[int(len(samples) * WARM_UP) :]
+    for role in ROLES:
+        first, last = settled[0].usage[role], settled[-1].usage[role]
+        if last.memory_mb > first.memory_mb * (1 + MAX_GROWTH):
+            found.append(f"the {role}'s memory grew from {first.memory_mb:.1f} to {last.memory_mb:.1f} MB")
+        if last.threads > first.threads:
+            found.append(f"the {role}'s threads grew from {first.threads} to {last.threads}")
+        if last.files > first.files:
+            found.append(f"the {role}'s open files grew from {first.files} to {last.files}")
+    return found

@@ -1,0 +1,128 @@
+"""The demo: controller, emulator and recorder as three processes on loopback, and the figures out of their log."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+import zenoh
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status, Telemetry
+from aeroloop.protocol.wire.attitude import angle
+from aeroloop.service.config import Settings
+from aeroloop.service.figures import Figures
+from aeroloop.service.host.bandwidth import PayloadRate
+from aeroloop.service.recording.rolling import parts
+from aeroloop.service.review.review import review
+from aeroloop.service.testing.process_group import Bench, BenchError, free_rendezvous, private_bus
+
+REFRESH_S = 0.1
+
+
+@dataclass
+class Progress:
+    """What the demo shows while it runs, gathered from the network."""
+
+    settings: Settings
+    time_s: float = 0.0
+    error_rad: float = 0.0
+    voltages: tuple[float, ...] = ()
+    statuses: dict[str, Status] = field(default_factory=dict)
+    payload: PayloadRate = field(default_factory=PayloadRate)
+
+    def hear(self, sample: zenoh.Sample) -> None:
+        """Take in a telemetry or status message."""
+        address = topics.read_key(str(sample.key_expr))
+        if address is None:
+            return
+        payload = sample.payload.to_bytes()
+        if address.topic.name == "telemetry":
+            telemetry = Telemetry.model_validate_json(payload)
+            self.time_s = telemetry.tick * self.settings.loop.period
+            self.error_rad = angle(*telemetry.attitude_error)
+            self.voltages = telemetry.voltages
+        elif address.topic.name == "status" and address.role is not None:
+            self.statuses[address.role] = status = Status.model_validate_json(payload)
+            if address.role == "controller":
+                self.payload.hear(status)
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks a second of the controller, as it last said."""
+        return self.statuses["controller"].rate_hz if "controller" in self.statuses else 0.0
+
+    @property
+    def skipped(self) -> int:
+        """Ticks skipped by both ends so far."""
+        return sum(status.skipped for status in self.statuses.values())
+
+    @property
+    def bits_per_s(self) -> tuple[float, float]:
+        """Payload bits a second of measurements and commands, now."""
+        return self.payload.bits_per_s(self.settings.wire)
+
+
+def run_demo(
+    settings: Settings, duration_s: float, log: Path | None, show: Callable[[Progress], None] | None = None
+) -> tuple[Figures, bool]:
+    """Run the experiment over Zenoh in three processes and review its log.
+
+    Args:
+        settings: The configuration; the rendezvous is replaced by a free one.
+        duration_s: How long, on the law's clock [s].
+        log: Where the log goes; None for a new file in the recorder's directory.
+        show: Called ten times a second with what is known.
+
+    Returns:
+        The figures, and whether it ran to the end (False after ^C).
+
+    Raises:
+        BenchError: A process did not start, or failed, or the log exists.
+        ReviewError: The log cannot be judged.
+    """
+    path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
+    if parts(path):
+        raise BenchError(f"{path} exists, and a log is never written over; name another with --log PATH")
+    settings = settings.model_copy(
+        update={
+            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
+            "controller": settings.controller.model_copy(
+                update={"duration_s": duration_s, "require_recorder": True, "auto_arm": True}
+            ),
+            "can": private_bus(settings.can),
+            "recorder": settings.recorder.model_copy(update={"path": path.absolute()}),
+        }
+    )
+    progress = Progress(settings)
+    interrupted = threading.Event()
+    with Bench(settings) as bench, _on_interrupt(interrupted):
+        for topic in ("telemetry", "status"):
+            bench.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.hear)
+        bench.start("recorder")
+        bench.start_plant()
+        bench.await_role("recorder")
+        bench.await_role("plant")
+        bench.start("controller")
+        while bench.running("controller") and not interrupted.wait(REFRESH_S):
+            bench.check()
+            if show is not None:
+                show(progress)
+        bench.check()
+    return review(*parts(path)), not interrupted.is_set()
+
+
+@contextmanager
+def _on_interrupt(event: threading.Event) -> Iterator[None]:
+    """Let ^C and SIGTERM set an event. KeyboardInterrupt could strike, and be lost, in any line of any library."""
+    previous = {which: signal.signal(which, lambda *_: event.set()) for which in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for which, handler in previous.items():
+            signal.signal(which, handler)

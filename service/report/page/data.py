@@ -1,0 +1,177 @@
+"""What the browser draws, as JSON: lines as base64 of little-endian floats, so that an hour of them opens at once.
+
+Times are float64, because a float32 of a day's run is 4 ms coarse; values are float32, which is finer than any
+quantizer here. The panels of several runs are laid over each other by group and label.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Iterator, Sequence
+from json import dumps
+from math import floor, isfinite, log10
+from typing import Any, Final
+
+import numpy as np
+
+from aeroloop.service.logs.traces import Array
+from aeroloop.service.review.report import Line, Mark, Panel, Report
+
+SPREADS: Final = {
+    "latency": "Latency: from a measurement to the command that answers it",
+    "measurement_delay": "From the plant to the controller",
+    "command_delay": "From the controller to the plant",
+    "period": "Period between measurements",
+}
+"""Which distributions are drawn, in this order, and what they are called."""
+
+GRAVE: Final = frozenset({"tripped", "fault", "lost", "refused"})
+"""Kinds of events that one looks for first."""
+
+Spoken = dict[str, Any]
+
+
+def page_data(reports: Sequence[Report]) -> str:
+    """Everything that is drawn, as JSON that may stand in a script element."""
+    data = {
+        "span": _span(reports),
+        "runs": [_run(report) for report in reports],
+        "groups": list(_groups(reports)),
+        "spreads": [
+            {"id": name, "runs": [_spread(report, name) for report in reports]}
+            for name in spread_names(reports)
+        ],
+    }  # fmt: skip
+    # JSON has no other place for these than inside strings, and no end of a script or start of a comment without them.
+    return dumps(data, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def group_titles(reports: Sequence[Report]) -> dict[str, str]:
+    """Groups of panels in order, and what each is called; runs that call it differently are both heard."""
+    titles: dict[str, dict[str, None]] = {}
+    for report in reports:
+        for panel in report.panels:
+            titles.setdefault(panel.group, {})[panel.title] = None
+    return {group: " / ".join(names) for group, names in titles.items()}
+
+
+def spread_names(reports: Sequence[Report]) -> list[str]:
+    """Distributions that at least one run has."""
+    had = [name for report in reports for name in report.findings.timing]
+    return sorted(set(had), key=lambda name: (list(SPREADS).index(name) if name in SPREADS else len(SPREADS), name))
+
+
+def grave(mark: Mark) -> bool:
+    """Whether it is something that one looks for first."""
+    return mark.kind in GRAVE
+
+
+def period_s(report: Report) -> float | None:
+    """The loop's period [s], as configured; None if the log does not say."""
+    rate = report.settings.get("loop", {}).get("rate_hz")
+    return 1 / rate if isinstance(rate, int | float) and rate > 0 else None
+
+
+def _span(reports: Sequence[Report]) -> tuple[float, float]:
+    """The time that the whole page is about, with a little room, so that nothing hides in its edges."""
+    times = [float(time) for report in reports for time in (*report.time[:1], *report.time[-1:])]
+    times += [mark.time_s for report in reports for mark in report.findings.marks if mark.time_s is not None]
+    start, end = (min(times), max(times)) if times else (0.0, 1.0)
+    room = 0.01 * (end - start) or 0.5
+    return start - room, end + room
+
+
+def _run(report: Report) -> Spoken:
+    period = period_s(report) or 0.0
+    return {
+        "name": report.name,
+        "time": _packed(report.time, "<f8"),
+        "marks": sorted([m.time_s, grave(m)] for m in report.findings.marks if m.time_s is not None),
+        "gaps": [[gap.time_s, gap.time_s + gap.ticks * period] for gap in report.findings.gaps],
+    }
+
+
+def _groups(reports: Sequence[Report]) -> Iterator[Spoken]:
+    for group in group_titles(reports):
+        panels: dict[str, list[tuple[int, Panel]]] = {}
+        for run, report in enumerate(reports):
+            for panel in report.panels:
+                if panel.group == group:
+                    panels.setdefault(panel.label, []).append((run, panel))
+        shared = all(_desired_agree(alike, reports) for alike in panels.values())
+        yield {"id": group, "panels": [_panel(label, alike, reports, shared) for label, alike in panels.items()]}
+
+
+def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool) -> Spoken:
+    least, most = _extent([line.values for _, panel in alike for line in panel.lines])
+    unit = alike[0][1].unit
+    return {
+        "label": label,
+        "unit": "" if unit == "1" else unit,
+        "decimals": _decimals(max(abs(least), abs(most))),
+        "log": unit in {"µs", "ms", "s"} and least > 0 and most > 30 * least,
+        "lines": [
+            {"run": run, "label": line.label, "desired": line.desired, "shared": shared and line.desired, "nth": nth,
+             "sparse": _sparse(line.values), "values": _packed(line.values, "<f4")}
+            for run, nth, line in _lines(alike, reports, shared)
+        ],
+    }  # fmt: skip
+
+
+def _lines(
+    alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool
+) -> Iterator[tuple[int, int, Line]]:
+    """Run, how manieth of its kind, line; of desired ones that are shared, the longest."""
+    longest = max((run for run, _ in alike), key=lambda run: reports[run].findings.duration_s)
+    for run, panel in alike:
+        count = {True: 0, False: 0}
+        for line in panel.lines:
+            if not (line.desired and shared) or run == longest:
+                yield run, count[line.desired], line
+            count[line.desired] += 1
+
+
+def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> bool:
+    """Whether every run desires the same here, so that one line can stand for all."""
+    desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
+    one_each = len(desired) in (0, len(alike)) and len(alike) == len(reports)
+    return one_each and all(_agree(*desired[0], *other) for other in desired[1:])
+
+
+def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
+    """Whether two lines are the same, as far as can be seen, for as long as both last.
+
+    They need not be the same to the last bit: each was sampled, and perhaps thinned out, in its own way.
+    """
+    if not (len(time) and len(other_time)):
+        return False
+    both = (time >= other_time[0]) & (time <= other_time[-1]) & np.isfinite(values)
+    apart = np.abs(np.interp(time[both], other_time, other_values) - values[both])
+    apart = apart[np.isfinite(apart)]
+    return bool(len(apart) and apart.max() <= 0.02 * np.abs(values[both]).max())
+
+
+def _sparse(values: Array) -> bool:
+    """Whether most times have no value: a line that is told less often than every tick, and has no gaps there."""
+    return bool(2 * np.isfinite(values).sum() < len(values))
+
+
+def _extent(values: Sequence[Array]) -> tuple[float, float]:
+    finite = [v[np.isfinite(v)] for v in values]
+    finite = [v for v in finite if len(v)]
+    return (min(float(v.min()) for v in finite), max(float(v.max()) for v in finite)) if finite else (0.0, 0.0)
+
+
+def _decimals(largest: float) -> int:
+    """Digits behind the point that show a ten-thousandth of the largest value."""
+    return min(9, max(0, 3 - floor(log10(largest)))) if largest > 0 and isfinite(largest) else 3
+
+
+def _spread(report: Report, name: str) -> Spoken | None:
+    spread = report.findings.timing.get(name)
+    return None if spread is None else spread.model_dump(include={"p50", "p99", "p999", "max", "bins"})
+
+
+def _packed(values: Array, dtype: str) -> str:
+    with np.errstate(over="ignore"):
+        return b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode()

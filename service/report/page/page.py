@@ -1,0 +1,160 @@
+"""Puts the page together: template, sections, data, scripts and plotly.js in one text that needs no network.
+
+Every script is named by its hash in the page's content security policy, so that the browser runs these and no other,
+whatever a log contains.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Sequence
+from hashlib import sha256
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Final
+
+from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.report.page import happenings, setup, theorem, verdict
+from aeroloop.service.report.page.data import group_titles, page_data, spread_names
+from aeroloop.service.report.page.markup import Html, joined, tag
+from aeroloop.service.review.report import Report
+
+SCRIPTS: Final = ("data.js", "window.js", "panels.js", "spreads.js", "controls.js")
+"""In the order in which each uses those before it."""
+
+PROVED: Final[tuple[str, ...]] = ("z_norm", "lyapunov")
+"""Groups of panels that are the theorem's."""
+
+TIME_UNITS: Final = frozenset({"s", "ms", "µs"})
+
+
+def page(reports: Sequence[Report]) -> str:
+    """The page of one run, or of several laid over each other.
+
+    Args:
+        reports: At least one.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if not reports:
+        raise ValueError("a page needs a run")
+    from plotly.offline import get_plotlyjs
+
+    library = _script(get_plotlyjs())
+    ours = _script('"use strict";\n' + "\n".join(_read(name) for name in SCRIPTS))
+    title = reports[0].name if len(reports) == 1 else " – ".join(report.name for report in reports)
+    return Template(_read("page.html")).substitute(
+        policy=_policy([library, ours]),
+        title=tag("title", f"{title} · aeroloop"),
+        style=tag("style", Html("\n" + _read("page.css"))),
+        masthead=verdict.masthead(reports),
+        navigation=_navigation(sections := _sections(reports)),
+        runs="several" if len(reports) > 1 else "one",
+        verdict=tag("div", verdict.verdict(reports), class_="verdicts"),
+        sections=joined(_section(*section) for section in sections),
+        data=tag("script", Html(page_data(reports)), type="application/json", id="data"),
+        library=library,
+        scripts=ours,
+    )
+
+
+def write_page(reports: Sequence[Report], out: Path) -> None:
+    """Write the page into a file, in one step. Raises ReviewError if that cannot be."""
+    text = page(reports)
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(out)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ReviewError(f"cannot write {out}: {error.strerror}") from None
+
+
+def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
+    """What the page has: id, title, contents."""
+    broken, promised = verdict.broken(reports), theorem.theorem(reports)
+    in_time = {panel.group for report in reports for panel in report.panels if panel.unit in TIME_UNITS}
+    titles = group_titles(reports)
+    proved = {group: titles.pop(group) for group in PROVED if promised and group in titles}
+    several = len(reports) > 1
+    drawn = _groups(reports, {group: title for group, title in titles.items() if group not in in_time})
+    timing = joined([
+        tag("div", [_drawing("spread", name, happenings.spread_title(name)) for name in spread_names(reports)],
+            class_="drawings"),
+        happenings.timing(reports),
+        _groups(reports, {group: title for group, title in titles.items() if group in in_time}),
+    ])  # fmt: skip
+    return [
+        ("figures", "Figures of merit", verdict.figures(reports)),
+        *([("differences", "What differs in the configurations", setup.differing(reports))] if several else []),
+        *([("broken", "What is missing from the log", broken)] if broken else []),
+        ("tracking", "Tracking", joined([_thinned(reports), drawn])),
+        *([("theorem", "What the theorem promises", joined([promised, _groups(reports, proved)]))] if promised else []),
+        ("events", "Events", happenings.events(reports)),
+        ("timing", "Timing", timing),
+        ("gaps", "Gaps", happenings.gaps(reports)),
+        ("wire", "On the wire", happenings.wire(reports)),
+        ("configuration", "Configuration", joined([_search(), setup.configuration(reports)])),
+        ("facts", "Software and host", setup.facts(reports)),
+    ]
+
+
+def _section(name: str, title: str, contents: Html) -> Html:
+    return tag("section", tag("h2", title, id=f"{name}-title"), contents, id=name, aria_labelledby=f"{name}-title")
+
+
+def _navigation(sections: Sequence[tuple[str, str, Html]]) -> Html:
+    return joined(tag("a", title, href=f"#{name}") for name, title, _ in sections)
+
+
+def _groups(reports: Sequence[Report], titles: dict[str, str]) -> Html:
+    heights = {
+        group: max(sum(panel.group == group for panel in report.panels) for report in reports) for group in titles
+    }
+    return tag(
+        "div",
+        [_drawing("group", group, title, panels=heights[group]) for group, title in titles.items()],
+        class_="drawings",
+    )
+
+
+def _drawing(kind: str, name: str, title: str, panels: int = 1) -> Html:
+    """Where a drawing goes; it has its height from the start, so that nothing moves when it is drawn."""
+    key = tag("span", class_="key")
+    plot = tag("div", class_="plot", style=f"--panels: {panels}", tabindex=0, role="group", aria_label=title)
+    return tag("figure", tag("figcaption", tag("span", title, class_="name"), key), plot, class_=f"drawing {kind}",
+               data_name=name)  # fmt: skip
+
+
+def _thinned(reports: Sequence[Report]) -> Html:
+    most = max(report.thinned for report in reports)
+    if most <= 2:
+        return Html("")
+    said = f"Lines are thinned out: two points, the least and the largest value, stand for up to {most:,} ticks."
+    return tag("p", said, class_="quiet", id="thinned")
+
+
+def _search() -> Html:
+    return tag("input", type="search", id="search", placeholder="Search keys and values", autocomplete="off",
+               aria_label="Search the configuration and the facts")  # fmt: skip
+
+
+def _script(code: str) -> Html:
+    return tag("script", Html(f"\n{code}\n"))
+
+
+def _policy(scripts: Sequence[Html]) -> Html:
+    """Nothing from anywhere but this file, and of this file only these scripts."""
+    hashes = [_hash(script.removeprefix("<script>").removesuffix("</script>")) for script in scripts]
+    rules = f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:"
+    return tag("meta", http_equiv="Content-Security-Policy", content=rules)
+
+
+def _hash(code: str) -> str:
+    return f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'"
+
+
+def _read(name: str) -> str:
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,81 @@
+"""What the theorem promises, what the run did, and whether each inequality of Lemma 1 held where the truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from aeroloop.service.report.page.happenings import Column, jump, run_cell, run_column, table
+from aeroloop.service.report.page.markup import Html, joined, tag
+from aeroloop.service.report.page.verdict import figures_table, run_name
+from aeroloop.service.report.rows import THEOREM, figure_rows, percent
+from aeroloop.service.review.report import Report, TheoremFindings
+
+COLUMNS: Sequence[Column] = (
+    ("Equation", False),
+    ("Left-hand side", False),
+    ("Samples", True),
+    ("Broken", True),
+    ("First at [s]", True),
+    ("Closest to its bound [%]", True),
+    ("At [s]", True),
+)
+
+UNMET: Final = {
+    "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
+    "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
+    "Assumption 3": "the attitude error is larger than the certificate assumes",
+}
+"""Premises that a true state may not satisfy, and what that means."""
+
+
+def theorem(reports: Sequence[Report]) -> Html:
+    """Verdict, figures, inequalities; empty if no run was held against it."""
+    if all(report.findings.theorem is None for report in reports):
+        return Html("")
+    rows = [row for row in figure_rows([report.findings for report in reports]) if row.key.startswith(THEOREM)]
+    said = [_said(reports, index) for index, report in enumerate(reports) if report.findings.theorem is not None]
+    return joined([*said, figures_table(reports, rows), _lemma(reports)])
+
+
+def judged(found: TheoremFindings) -> str:
+    """Which true states the inequalities are judged by, in a sentence or two."""
+    if not found.samples:
+        return ""
+    left_out = [f"At {count:,} {UNMET.get(name, name)}." for name, count in found.outside.items() if count]
+    by = f"the other {found.judged:,}" if left_out else "all of them"
+    return " ".join([f"{found.samples:,} true states belong to a tick.", *left_out, f"Lemma 1 is judged by {by}."])
+
+
+def _said(reports: Sequence[Report], index: int) -> Html:
+    report = reports[index]
+    found = report.findings.theorem
+    assert found is not None
+    until = f" Judged until {found.until_s:g} s, where gains or reference changed." if found.until_s is not None else ""
+    since = f" Judged from {found.since_s:g} s, when the reference had been reached." if found.since_s else ""
+    mood = "good" if found.holds else "bad"
+    return tag(
+        "div",
+        tag("p", run_name(report, index, len(reports))) if len(reports) > 1 else None,
+        tag("p", tag("span", "✓" if found.holds else "✗", class_="sign", aria_hidden="true"), " ", found.verdict,
+            class_=mood),
+        tag("p", f"The transient is taken to last {found.transient_s:.3g} s, three times the law's slower "
+            f"time constant.{since}{until} {judged(found)}", class_="quiet"),
+    )  # fmt: skip
+
+
+def _lemma(reports: Sequence[Report]) -> Html:
+    rows = []
+    for index, report in enumerate(reports):
+        found = report.findings.theorem
+        for check in found.lemma if found else ():
+            if not check.samples:
+                continue
+            what = f"({check.equation}) {check.what}"
+            first = "–" if check.broken_s is None else jump(check.broken_s, index, f"{what} first broken")
+            most = "–" if check.closest is None else percent(check.closest)
+            at = "–" if check.closest_s is None else jump(check.closest_s, index, f"{what} closest to its bound")
+            broken = tag("b", f"{check.broken:,}", class_="kind grave") if check.broken else "0"
+            cells = [f"({check.equation})", check.what, f"{check.samples:,}", broken, first, most, at]
+            rows.append([*run_cell(reports, index), *cells])
+    return table([*run_column(reports), *COLUMNS], rows) if rows else Html("")

@@ -1,0 +1,225 @@
+"""What happened, as roles published it: events, changes, losses, and how old measurements were when they were used.
+
+What carries a session tick stands there; the rest stands at the tick that the plant's trace had reached in the file
+when it was recorded. Of each kind the first few hundred become marks and the rest are counted, so that a log with a
+storm of them can be read and held in memory.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Loss, Status
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Points, Reference, Sinusoid
+from aeroloop.protocol.messages.topics import Address
+from aeroloop.protocol.runtime.timing import Histogram
+from aeroloop.service.logs.runs import Taker
+from aeroloop.service.logs.traces import Which
+from aeroloop.service.review.report import Mark
+
+MAX_MARKS: Final = 300
+"""Of one kind of one role."""
+
+_RECENT: Final = 100_000
+"""Messages that are remembered, so that a recorder that was restarted and got them again does not double them."""
+
+
+Place = tuple[int, float]
+"""Where a mark stands among others: −1 before the session, 0 and a time [s] within it, 1 after it."""
+
+
+class Kind:
+    """All of one kind: the first few hundred, and how many more."""
+
+    def __init__(self) -> None:
+        self.first: list[tuple[Place, Mark]] = []
+        self.more = 0
+        self.last: tuple[Place, Mark] | None = None
+
+    def add(self, place: Place, mark: Mark) -> None:
+        """One more."""
+        if len(self.first) < MAX_MARKS:
+            self.first.append((place, mark))
+        else:
+            self.more += 1
+            self.last = place, mark
+
+    def all(self) -> list[tuple[Place, Mark]]:
+        """As many as were kept, and one that stands for the others."""
+        if self.last is None:
+            return self.first
+        place, mark = self.last
+        return [*self.first, (place, mark.model_copy(update={"text": f"{self.more} more, the last: {mark.text}"}))]
+
+
+class Ages:
+    """Age of measurements by a controller's statuses, each over ten seconds."""
+
+    def __init__(self) -> None:
+        self._p50 = Histogram()
+        self._p99 = self._max = 0.0
+
+    def add(self, status: Status) -> None:
+        """One more status."""
+        if status.age_us is not None:
+            self._p50.add(round(status.age_us.p50 * 1e3))
+            self._p99, self._max = max(self._p99, status.age_us.p99), max(self._max, status.age_us.max)
+
+    def figures(self) -> dict[str, float] | None:
+        """The median of all tens of seconds, and the worst p99 and maximum of any [µs]; None without any."""
+        if not self._p50.count:
+            return None
+        return {"p50": round(self._p50.percentile(50), 1), "p99": self._p99, "max": self._max}
+
+
+class Story:
+    """What a log has beside its traces, of one session and its vehicle.
+
+    Args:
+        which: The session that is judged.
+        period: Time between its ticks [s].
+        reached: The last tick of each session that the traces have reached in the files so far.
+        open_sessions: The session of each vehicle that has begun there and not ended.
+
+    Attributes:
+        statuses: The last of every vehicle and role.
+        trips: Why a plant went to 0 V by itself, each time one did.
+        losses: Messages of the vehicle that the recorder lost, by topic.
+    """
+
+    def __init__(
+        self, which: Which, period: float, reached: Mapping[Which, int], open_sessions: Mapping[str, str]
+    ) -> None:
+        self.statuses: dict[tuple[str, str], Status] = {}
+        self.trips: list[str] = []
+        self.losses: dict[str, int] = {}
+        self._which = which
+        self._period = period
+        self._reached = reached
+        self._open = open_sessions
+        self._kinds: defaultdict[tuple[str, str], Kind] = defaultdict(Kind)
+        self._ages = Ages()
+        self._known: dict[int, None] = {}
+        self._status_ns: dict[tuple[str, str], int] = {}
+
+    def route(self, address: Address) -> Taker | None:
+        """Who takes the messages of a key; None if they are not part of it."""
+        vehicle, role = address.vehicle, address.role
+        match address.topic.name:
+            case "event":
+                return lambda payload, at_ns: self._event(vehicle, payload, at_ns)
+            case "loss":
+                return lambda payload, at_ns: self._loss(vehicle, payload, at_ns)
+            case "status" if role is not None:
+                return lambda payload, at_ns: self._status(vehicle, role, payload, at_ns)
+        return None
+
+    def changed(self, changes: Sequence[Change]) -> None:
+        """What the controller followed from which tick on."""
+        for change in changes:
+            self._add("change", "controller", described(change), change.tick)
+
+    @property
+    def age_us(self) -> dict[str, float] | None:
+        """Age of measurements when they were used [µs]; None if no status has it."""
+        return self._ages.figures()
+
+    def marks(self) -> list[Mark]:
+        """Everything that happened to the vehicle, in order of time; what was outside the session before or after."""
+        found = [placed for kind in self._kinds.values() for placed in kind.all()]
+        return [mark for _, mark in sorted(found, key=lambda placed: placed[0])]
+
+    def _event(self, vehicle: str, payload: bytes, at_ns: int) -> None:
+        if self._is_known(vehicle, payload, at_ns):
+            return
+        event = Event.model_validate_json(payload)
+        if event.kind == "tripped":
+            self.trips.append(event.text)
+        if vehicle != self._which[0] or self._is_a_change(event):
+            return
+        tick = event.tick if event.session == self._which[1] else None
+        self._add(event.kind, event.role, event.text, tick, event.session)
+
+    def _loss(self, vehicle: str, payload: bytes, at_ns: int) -> None:
+        if vehicle != self._which[0] or self._is_known(vehicle, payload, at_ns):
+            return
+        loss = Loss.model_validate_json(payload)
+        address = topics.read_key(loss.key)
+        name = address.topic.name if address else loss.key
+        self.losses[name] = self.losses.get(name, 0) + loss.count
+        self._add("lost", "recorder", f"{loss.count} of {name} lost: {_WHERE[loss.reason]}")
+
+    def _status(self, vehicle: str, role: str, payload: bytes, at_ns: int) -> None:
+        if at_ns <= self._status_ns.get((vehicle, role), 0):
+            return  # recorded again
+        self._status_ns[vehicle, role] = at_ns
+        status = self.statuses[vehicle, role] = Status.model_validate_json(payload)
+        if (vehicle, status.session) == self._which and role == "controller":
+            self._ages.add(status)
+
+    def _is_known(self, vehicle: str, payload: bytes, at_ns: int) -> bool:
+        """Whether the very same message was recorded before."""
+        message = hash((vehicle, payload, at_ns))
+        if message in self._known:
+            return True
+        self._known[message] = None
+        if len(self._known) > _RECENT:
+            del self._known[next(iter(self._known))]
+        return False
+
+    def _is_a_change(self, event: Event) -> bool:
+        """Whether it says in words what a change of the session says, too."""
+        return event.kind == "changed" and event.role == "controller" and event.session == self._which[1]
+
+    def _add(self, kind: str, role: str, text: str, tick: int | None = None, session: str | None = None) -> None:
+        reached = self._reached.get(self._which)
+        within = self._open.get(self._which[0]) == self._which[1] and session in (None, self._which[1])
+        if tick is None and (within or session == self._which[1]):
+            tick = reached or 0
+        time_s = None if tick is None else round(tick * self._period, 9)
+        place = (-1 if reached is None else 1, 0.0) if time_s is None else (0, time_s)
+        self._kinds[role, kind].add(place, Mark(time_s=time_s, kind=kind, role=role, text=text))
+
+
+_WHERE: Final = {
+    "network": "they never came",
+    "queue": "they came faster than they could be written",
+    "disk": "the log could not be written",
+}
+
+
+def described(change: Change) -> str:
+    """A change in words."""
+    said = []
+    if change.gains is not None:
+        said.append(_gains(change.gains))
+    if change.reference is not None:
+        within = f" within {change.within_s:g} s" if change.within_s else ""
+        said.append(f"follows {_reference(change.reference)}{within}")
+    return "; ".join(said)
+
+
+def _gains(gains: Gains) -> str:
+    diagonals: dict[str, Any] = {name: value for name, value in gains if value is not None}
+    return ", ".join(f"{name} = diag({', '.join(f'{x:g}' for x in value)})" for name, value in diagonals.items())
+
+
+def _reference(reference: Reference) -> str:
+    match reference:
+        case Sinusoid(amplitude=amplitude):
+            return f"a sinusoid of {_degrees(amplitude)}"
+        case Hold(attitude=None):
+            return "where it is"
+        case Hold(attitude=attitude) if attitude is not None:
+            return _degrees(attitude)
+        case Points(times=times):
+            return f"{len(times)} points over {times[-1]:g} s"
+        case _:
+            return "a stream of set-points"
+
+
+def _degrees(angles: tuple[float, float, float]) -> str:
+    return "roll, pitch, yaw " + ", ".join(f"{angle:.4g}°" for angle in angles)

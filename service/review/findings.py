@@ -1,0 +1,80 @@
+"""Findings and facts: what was observed of a session and published beside it, put into the models of report.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from aeroloop.service.figures import Figures
+from aeroloop.service.logs.runs import Run
+from aeroloop.service.logs.traces import Which
+from aeroloop.service.review.events import Story
+from aeroloop.service.review.report import Findings
+from aeroloop.service.review.session import Session
+
+
+def findings_of(figures: Figures, which: Which, session: Session, story: Story, run: Run) -> Findings:
+    """Everything that is known of a session.
+
+    Args:
+        figures: Its figures of merit; they are taken over as they are.
+        which: Its vehicle and name.
+        session: What was observed of it.
+        story: What was published in the whole log.
+        run: The log.
+    """
+    observer, offset = session.observer, session.reader.offset
+    timing, age = observer.timing, story.age_us
+    reasons = dict(figures.reasons)
+    if age is None:
+        reasons["age_us"] = "the log has no status of the controller with an age"
+    for name, why in (("period", "fewer than two measurements"), ("latency", "no measurement was answered")):
+        if name not in timing:
+            reasons[f"timing.{name}"] = why
+    known = offset.first_ns == offset.first_ns
+    if not known:
+        reasons["clock_offset_us"] = "too few ticks have all four times of sending and receiving"
+    theorem, unknown = observer.trial.findings()
+    return Findings(
+        **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},
+        reasons=reasons | unknown,
+        vehicle=which[0],
+        session=which[1],
+        sessions=len(run.extents),
+        started=observer.started,
+        timing=timing,
+        clock_offset_us=[round(ns * 1e-3, 1) for ns in (offset.first_ns, offset.last_ns)] if known else None,
+        age_us=age,
+        gaps=observer.gaps,
+        gap_count=observer.gap_count,
+        saturated=observer.saturated,
+        invalid=observer.invalid,
+        losses=story.losses,
+        missing_ticks={end: sum(gap.rows for gap in run.missing if gap.end == end) for end in ("controller", "plant")},
+        missing=run.missing,
+        lapses={name: count for name, count in session.lapses.items() if count},
+        theorem=theorem,
+        marks=story.marks(),
+    )
+
+
+def facts_of(run: Run, story: Story, vehicle: str) -> dict[str, dict[str, Any]]:
+    """About software and host, by role: what its contract says, what the log's metadata says, what was refused."""
+    facts: dict[str, dict[str, Any]] = {}
+    for (whose, role), contract in run.files.contracts.items():
+        if whose == vehicle:
+            facts[role] = {"host": contract.host, **contract.facts, "versions": contract.versions}
+    for name, said in run.files.metadata.items():
+        facts.setdefault(name, {}).update(said)
+    for (whose, role), status in story.statuses.items():
+        if whose == vehicle and status.notes:
+            facts.setdefault(role, {})["notes"] = status.notes
+    return facts
+
+
+def name_of(paths: Sequence[Path]) -> str:
+    """What to call a run: its file or folder, without what every log has."""
+    first = paths[0].resolve()
+    name = first.name if first.is_dir() else first.stem
+    return name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"

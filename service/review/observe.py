@@ -1,0 +1,155 @@
+"""What is looked at in a session beside its figures: timing, gaps, saturation, and every quantity over time.
+
+An `Observer` takes frames and ticks by the block and reduces them by numpy, so memory stays bounded however long the
+session is. Durations go into histograms, lines into buckets (thin.py), and of gaps the longest hundred are kept.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from math import nan
+from typing import Final
+
+import numpy as np
+
+from aeroloop.service.config import Settings
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.traces import Array, Integers
+from aeroloop.service.review.accumulators import Durations, Outermost
+from aeroloop.service.review.downsample import ThinnedLines
+from aeroloop.service.review.panels import columns_of, panels_of, with_level
+from aeroloop.service.review.report import Gap, Panel, Spread
+from aeroloop.service.review.theorem_check import Trial
+
+LONGEST_GAPS: Final = 100
+
+
+class Observer:
+    """Watches one session.
+
+    Args:
+        settings: The configuration of its controller.
+        trial: Holds it against the theorem.
+    """
+
+    def __init__(self, settings: Settings, trial: Trial) -> None:
+        wire = settings.wire
+        self._period = settings.loop.period
+        self.trial = trial
+        self._columns = columns_of(settings, theta=trial.damping_known)
+        self._lines = ThinnedLines(1 + len(self._columns))  # k, then what is drawn
+        self._outermost = {name: Outermost(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
+        self._timing = {name: Durations() for name in ("period", "latency", "measurement_delay", "command_delay")}
+        self._longest: list[tuple[int, int]] = []
+        self._last_answer: Integers = np.empty(0, dtype=np.int64)
+        self._last_sent_ns = nan
+        self._start_ns: int | None = None
+        self.gap_count = 0
+        self.invalid = {"measurement": 0, "command": 0}
+
+    # ── what it is given ──
+
+    def frames(self, measurements: Array, commands: Array) -> None:
+        """Codes of frames that were sent, answered or not. Shapes (n, 6) and (m, actuators)."""
+        wrong = self._outermost["attitude"].add(measurements[:, :3]) | self._outermost["rate"].add(measurements[:, 3:])
+        self.invalid["measurement"] += int(wrong.sum())
+        self.invalid["command"] += int(self._outermost["voltage"].add(commands).sum())
+
+    def answered(self, k: Integers) -> None:
+        """Ticks that were answered, be it by commands without a valid value. Shape (n,)."""
+        answers = np.concatenate([self._last_answer, k])
+        self._last_answer = answers[-1:]
+        missing = np.diff(answers) - 1
+        where = np.flatnonzero(missing)
+        self.gap_count += len(where)
+        found = [(int(missing[i]), int(answers[i]) + 1) for i in where]
+        self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
+
+    def ticks(self, ticks: Ticks) -> None:
+        """Ticks that are judged, a block at a time."""
+        if not len(ticks.k):
+            return
+        if self._start_ns is None:
+            self._start_ns = int(ticks.wall_ns[0])
+        sent = np.where(ticks.sent_ns >= 0, ticks.sent_ns.astype(np.float64), nan)
+        periods = np.full(len(sent), nan)
+        known = np.flatnonzero(ticks.sent_ns >= 0)
+        periods[known] = np.diff(sent[known], prepend=self._last_sent_ns)
+        if len(known):
+            self._last_sent_ns = float(sent[known[-1]])
+        durations = {
+            "period": periods,
+            "latency": ticks.latency_ns,
+            "measurement_delay": ticks.measurement_delay_ns,
+            "command_delay": ticks.command_delay_ns,
+        }
+        for name, values in durations.items():
+            self._timing[name].add(values[~np.isnan(values)])
+        desired, error = ticks.desired, ticks.attitude_error
+        true_angle, theorem = self.trial.ticks(ticks)
+        self._lines.add(
+            np.column_stack(
+                [
+                    ticks.k.astype(np.float64),
+                    _alternating(_beside(ticks.attitude, desired), desired),
+                    _alternating(ticks.rate, ticks.desired_rate),
+                    error,
+                    ticks.rate_error,
+                    ticks.voltages,
+                    np.degrees(2 * np.arcsin(np.minimum(1.0, np.linalg.norm(error, axis=1)))),
+                    true_angle,
+                    ticks.latency_ns * 1e-3,
+                    periods * 1e-3,
+                    ticks.damping_estimate,
+                    theorem,
+                ]
+            )
+        )
+
+    # ── what it has found ──
+
+    @property
+    def started(self) -> str:
+        """When the first measurement was sent, UTC; empty if there was none."""
+        if self._start_ns is None:
+            return ""
+        return datetime.fromtimestamp(self._start_ns * 1e-9, UTC).isoformat(timespec="milliseconds")
+
+    @property
+    def timing(self) -> dict[str, Spread]:
+        """Spreads by name, of what there was."""
+        return {name: spread for name, one in self._timing.items() if (spread := one.spread()) is not None}
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """The longest hundred, in order of time."""
+        return [
+            Gap(time_s=round(k * self._period, 9), tick=k, ticks=ticks)
+            for k, ticks in sorted((k, ticks) for ticks, k in self._longest)
+        ]
+
+    @property
+    def saturated(self) -> dict[str, float]:
+        """Share of values at the outermost level, by signal."""
+        return {name: share for name, signal in self._outermost.items() if (share := signal.share) is not None}
+
+    @property
+    def thinned(self) -> int:
+        """Ticks behind two points of a line."""
+        return self._lines.per_bucket
+
+    def lines(self) -> tuple[Array, list[Panel]]:
+        """Times on the law's clock [s] and panels."""
+        points = self._lines.points()
+        panels = panels_of(self._columns, points[:, 1:])
+        return points[:, 0] * self._period, with_level(panels, "z_norm", "guaranteed in the end", self.trial.radius)
+
+
+def _beside(attitude: Array, desired: Array) -> Array:
+    """Of ±q, the one beside q_d. Shape (n, 4)."""
+    return np.where(np.sum(attitude * desired, axis=1, keepdims=True) < 0, -attitude, attitude)
+
+
+def _alternating(one: Array, other: Array) -> Array:
+    """The columns of both by turns. Shape (n, 2·columns)."""
+    return np.stack([one, other], axis=2).reshape(len(one), -1)

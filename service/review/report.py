@@ -1,0 +1,223 @@
+"""A run as data: what `log review --json` prints and what its page draws.
+
+A `Report` is figures plus everything that happened, and lines thinned out so that a page can hold hours of them. It is
+filled by review.py and knows nothing of how it is shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.service.figures import Figures
+from aeroloop.service.logs.traces import Array, Missing
+
+
+class Spread(BaseModel):
+    """How a duration was spread: percentiles, and a histogram of bins 4.4 % wide."""
+
+    model_config = ConfigDict(frozen=True)
+
+    count: int
+    p50: float = Field(description="[µs]")
+    p90: float
+    p99: float
+    p999: float
+    max: float
+    bins: list[tuple[float, int]] = Field(description="lower edge [µs] and count of every bin that is not empty")
+
+
+class Gap(BaseModel):
+    """Ticks in a row that no command answered."""
+
+    model_config = ConfigDict(frozen=True)
+
+    time_s: float = Field(description="the first of them, on the law's clock [s]")
+    tick: int
+    ticks: int
+
+
+class Mark(BaseModel):
+    """Something that happened: an event, a change of gains or reference, a loss."""
+
+    model_config = ConfigDict(frozen=True)
+
+    time_s: float | None = Field(description="on the law's clock [s]; null if outside the session")
+    kind: str = Field(description="`tripped`, `fault`, `change`, `lost`… as in the log's events")
+    role: str
+    text: str
+
+
+class Check(BaseModel):
+    """A limit that was asked for, and whether it holds."""
+
+    model_config = ConfigDict(frozen=True)
+
+    text: str = Field(description="such as `z_track ≤ 0.005`")
+    holds: bool
+    found: str = Field(description="what was found, with its unit")
+
+
+class LemmaCheck(BaseModel):
+    """An inequality of Lemma 1, or of those that it builds on, held against true states."""
+
+    model_config = ConfigDict(frozen=True)
+
+    equation: str = Field(description="number in the paper")
+    what: str = Field(description="its left-hand side, in the paper's letters")
+    samples: int
+    broken: int = Field(description="samples at which it does not hold")
+    closest: float | None = Field(description="largest left-hand side as a share of the bound")
+    closest_s: float | None = Field(description="when that was, on the law's clock [s]")
+    broken_s: float | None = Field(description="when it was first broken [s]; null where never")
+
+
+class TheoremFindings(BaseModel):
+    """What Theorem 1 promises of a session, and what the session did.
+
+    The transient lasts three times the law's slower time constant: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
+    holds: bool | None = Field(description="null where nothing can be promised")
+    radius: float | None = Field(description="√(δ_Q/k), where ‖z‖ ends [1, rad/s]")
+    radius_deg: float | None = Field(description="the attitude error that this allows [deg]")
+    transient_s: float = Field(description="how long the transient is taken to last [s]")
+    since_s: float = Field(
+        description="judged from then on, on the law's clock: a session that begins far from its reference first goes "
+        "there [s]"
+    )
+    until_s: float | None = Field(
+        description="judged until gains or reference first changed, on the law's clock [s]; null: to the end"
+    )
+    z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the quantized signals [1, rad/s]")
+    z_norm_share: float | None = Field(description="that as a share of the radius")
+    error_deg: float | None = Field(description="largest attitude error after the transient, as the controller saw it")
+    true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the true states that were told")
+    true_error_deg: float | None = Field(description="likewise of the attitude error [deg]")
+    damping_known: bool = Field(description="whether the true V that is drawn has its θ̃ term: the plant's θ is known")
+    samples: int = Field(description="true states that belong to a tick that is judged")
+    outside: dict[str, int] = Field(
+        description="how many of them do not satisfy a premise: (C.28) and (C.29), that sensors err by no more than "
+        "the quantizers, and Assumption 3, the attitude error that the certificate assumes"
+    )
+    judged: int = Field(description="how many satisfy all of them; the inequalities are judged by these alone")
+    lemma: list[LemmaCheck]
+    broken: int | None = Field(description="inequalities broken, over all of them and all samples")
+
+
+class Findings(Figures):
+    """Figures of merit, and what else a log tells. What could not be had is null, with the reason in `reasons`."""
+
+    vehicle: str
+    session: str
+    sessions: int = Field(description="sessions in the log; the longest is judged")
+    started: str = Field(description="when the session's first measurement was sent, UTC")
+    timing: dict[str, Spread] = Field(
+        description="`period`: between measurements, and `latency`: from a measurement to the command that answers it, "
+        "on the plant's clock; `measurement_delay`, `command_delay`: one way, if both are equally fast at the median"
+    )
+    clock_offset_us: list[float] | None = Field(
+        default=None, description="the controller's monotonic clock less the plant's, at the first and the last tick"
+    )
+    age_us: dict[str, float] | None = Field(
+        description="age of measurements when they were used, as the controller tells it: p50, p99, max"
+    )
+    gaps: list[Gap] = Field(description="the longest hundred, in order of time")
+    gap_count: int
+    saturated: dict[str, float] = Field(
+        description="share of values at a quantizer's outermost level, 0…1: `attitude`, `rate`, `voltage`"
+    )
+    invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
+    losses: dict[str, int] = Field(description="messages that the recorder knows it has lost, by topic")
+    missing_ticks: dict[str, int] = Field(description="rows of either end that were never recorded, in all sessions")
+    missing: list[Missing] = Field(description="where they are, and sessions of whose last batch there is none")
+    lapses: dict[str, int] = Field(
+        description="what went otherwise than one frame each way a tick. At the controller: measurements that came "
+        "`late`, ticks `missed`, `malformed` measurements; at the plant: commands `stale`, `repeated`, `refused` "
+        "(malformed, or without a valid value), `withheld` by a fault"
+    )
+    frames: dict[str, dict[str, int]] | None = Field(
+        default=None,
+        description="where the recorder took frames from the wire, too: how many were `recorded` of either kind, and "
+        "how many `differ` from what the ends have in their traces",
+    )
+    marks: list[Mark]
+    theorem: TheoremFindings | None = None
+    checks: list[Check] = Field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a panel: values at the report's times. Shape (n,)."""
+
+    label: str
+    values: Array
+    desired: bool = False
+    """Whether it is what the measured one should follow."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines that share an axis.
+
+    Attributes:
+        group: What they are about, such as `attitude_error`; panels of a group stand together.
+        title: Such as `Attitude error`, with the paper's number where the paper has that figure.
+        label: Of the axis, such as `ε̃₁`.
+        unit: Such as `rad/s`; `1` if it has none.
+    """
+
+    group: str
+    title: str
+    label: str
+    unit: str
+    lines: Sequence[Line]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A run.
+
+    Attributes:
+        name: What to call it.
+        findings: What it is judged by.
+        time: Times of every line, on the law's clock [s]. Shape (n,).
+        panels: What is drawn over time, in the order of the paper's figures.
+        thinned: Ticks that stand behind two points of a line: 1 or 2 if nothing was thinned out. Of more, a line has
+            the least and the largest value.
+        settings: The effective configuration, as nested tables.
+        facts: About software and host, by role: versions, git revision, kernel, what was refused.
+    """
+
+    name: str
+    findings: Findings
+    time: Array
+    panels: Sequence[Panel]
+    thinned: int
+    settings: dict[str, Any]
+    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as one, with dotted keys: `{"law": {"C2": 1}}` is `{"law.C2": 1}`."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            found |= flat(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = value
+    return found
+
+
+def differences(reports: Sequence[Report]) -> list[tuple[str, list[Any]]]:
+    """What differs in the configurations of several runs: a dotted key, and each run's value (None if it has none)."""
+    tables = [flat(report.settings) for report in reports]
+    keys = sorted(set().union(*tables))
+    rows = [(key, [table.get(key) for table in tables]) for key in keys]
+    return [(key, values) for key, values in rows if any(value != values[0] for value in values)]

@@ -1,0 +1,100 @@
+"""Limits that figures are held to: `z_track=50e-4` holds if the figure is at most that."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.figures import Figures
+from aeroloop.service.review.report import Check, Findings
+
+_SPREADS: Final = ("latency", "period", "measurement_delay", "command_delay")
+_PERCENTILES: Final = ("p50", "p90", "p99", "p999", "max")
+
+UNITS: Final[dict[str, str]] = {
+    "duration_s": "s",
+    "z_track": "s",
+    "u_total": "V²·s",
+    "max_error_deg": "°",
+    "final_error_deg": "°",
+    "skipped_ticks": "",
+    "trips": "",
+    "gap_count": "",
+    "losses": "",
+    "lapses": "",
+    "missing_ticks": "",
+    "invalid": "",
+    "damages": "",
+    **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
+    **{f"timing.latency.{name}": "µs" for name in _PERCENTILES},
+    **{f"timing.{way}.{name}": "µs" for way in _SPREADS[1:] for name in _PERCENTILES},
+    **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
+    **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
+    **{f"theorem.{name}": "" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "broken")},
+    **{f"theorem.{name}": "°" for name in ("error_deg", "true_error_deg", "radius_deg")},
+}
+"""What can be held to a limit, as it is called in the findings, and its unit."""
+
+SHORT: Final[dict[str, str]] = {
+    "skipped": "skipped_ticks",
+    "gaps": "gap_count",
+    **{f"{name}.{p}": f"timing.{name}.{p}" for name in _SPREADS for p in _PERCENTILES},
+    **{name: f"theorem.{name}" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "radius_deg")},
+    "settled_error_deg": "theorem.error_deg",
+    "true_settled_error_deg": "theorem.true_error_deg",
+    "lemma_broken": "theorem.broken",
+    **{f"age.{name}": f"age_us.{name}" for name in ("p50", "p99", "max")},
+}
+"""Other names for some of them."""
+
+NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us.", "theorem."))), *SHORT)
+
+
+class LimitError(AeroloopError):
+    """Not a limit; one line that says how to write one."""
+
+
+class Limit(NamedTuple):
+    """The most that a figure may be. Of what is a list it is how many there are, of counts by name their sum."""
+
+    figure: str
+    most: float
+
+    @classmethod
+    def parse(cls, text: str) -> Limit:
+        """A limit as the command line gives it. Raises LimitError."""
+        name, equals, value = text.partition("=")
+        if not equals or not (name in SHORT or name in UNITS):
+            raise LimitError(f"--require takes FIGURE=LIMIT, not {text!r}; figures are {', '.join(NAMES)}")
+        try:
+            return cls(name, float(value))
+        except ValueError:
+            raise LimitError(f"--require {name} takes a number, not {value!r}") from None
+
+    def value(self, figures: Figures) -> float | None:
+        """What the figure is; None if it could not be had."""
+        found: object = figures
+        for part in SHORT.get(self.figure, self.figure).split("."):
+            found = found.get(part) if isinstance(found, dict) else getattr(found, part, None)
+        if isinstance(found, list):
+            return len(found)
+        if isinstance(found, dict):
+            return float(sum(found.values()))
+        return found if isinstance(found, int | float) else None
+
+    def broken(self, figures: Figures) -> str | None:
+        """Why it does not hold, in a line; None if it does. A figure that could not be had does not hold."""
+        value = self.value(figures)
+        if value is None:
+            return f"{self.figure} is not known, so it is not at most {self.most:g}"
+        return None if value <= self.most else f"{self.figure} is {value:.6g}, more than {self.most:g}"
+
+    def check(self, findings: Findings) -> Check:
+        """Whether it holds, and what was found."""
+        name, value = SHORT.get(self.figure, self.figure), self.value(findings)
+        unit = UNITS[name]
+        space = "" if unit in ("", "°") else " "
+        reasons = (why for key, why in findings.reasons.items() if name == key or name.startswith(f"{key}."))
+        found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
+        holds = self.broken(findings) is None
+        return Check(text=f"{self.figure} ≤ {self.most:g}{space}{unit}", holds=holds, found=found)

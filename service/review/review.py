@@ -1,0 +1,137 @@
+"""The review: every figure, from a log alone.
+
+The log holds the configuration (in the roles' contracts) and what each end did (in the traces), so the review computes
+what the controller did again, to the last bit. Of a log with several sessions the longest is judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.topics import Address
+from aeroloop.service.config import ConfigError
+from aeroloop.service.figures import Figures
+from aeroloop.service.logs.files import Progress, ReviewError
+from aeroloop.service.logs.runs import Run, Taker
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.traces import Which
+from aeroloop.service.logs.wire_check import WireCheck
+from aeroloop.service.review.certificate_cache import Library, damping_of
+from aeroloop.service.review.events import Story
+from aeroloop.service.review.findings import facts_of, findings_of, name_of
+from aeroloop.service.review.report import Findings, Report
+from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.session import Session
+from aeroloop.service.review.theorem_check import Trial
+
+
+class Review(NamedTuple):
+    """What a log says of its longest session.
+
+    Attributes:
+        figures: The figures of merit alone.
+        findings: The same figures and everything else.
+        session: The session.
+        which: Its vehicle and name.
+        name: What to call the run.
+        facts: About software and host, by role.
+    """
+
+    figures: Figures
+    findings: Findings
+    session: Session
+    which: Which
+    name: str
+    facts: dict[str, dict[str, Any]]
+
+    def report(self, limits: Sequence[Limit] = ()) -> Report:
+        """All of it as data, held to limits."""
+        observer = self.session.observer
+        time, panels = observer.lines()
+        return Report(
+            name=self.name,
+            findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),
+            time=time,
+            panels=panels,
+            thinned=observer.thinned,
+            settings=self.session.settings.contract(),
+            facts=self.facts,
+        )
+
+
+def review(*paths: Path) -> Figures:
+    """Judge a run: the figures of its longest session. Raises as `read` does."""
+    return read(*paths).figures
+
+
+def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
+    """Everything that a log says of its longest session, as data. Raises as `read` does.
+
+    Args:
+        paths: Logs, folders of logs, or the files of a rotated run.
+        limits: What its figures are held to.
+        progress: Called now and then with the share that is done, 0…1.
+    """
+    return read(*paths, progress=progress).report(limits)
+
+
+def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: Progress | None = None) -> Review:
+    """Read a run and judge its longest session. What cannot be read of a broken file is named in the figures.
+
+    Args:
+        paths: Logs, folders of logs, or the files of a rotated run.
+        watch: Called with every block of the session's ticks.
+        progress: Called now and then with the share that is done, 0…1.
+
+    Raises:
+        ReviewError: Not a log, or one without a session.
+    """
+    try:
+        run = Run(paths, progress)
+        which = run.longest
+        vehicle, files = which[0], run.files
+        settings, plant = files.settings(vehicle), files.plant(vehicle)
+        contract = files.contracts.get((vehicle, "controller"))
+        library, damping = Library(settings, contract.certificate if contract else None), damping_of(plant)
+
+        def trial(changes: Sequence[Change]) -> Trial:
+            return Trial(library.of(changes), settings.loop.period, damping)
+
+        missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
+        session = Session(settings, plant.watchdog_s, trial, missing, watch)
+        frames = WireCheck(which, settings.wire, run.reached)
+        story = Story(which, settings.loop.period, run.reached, run.open_sessions)
+
+        def route(address: Address) -> Taker | None:
+            if address.topic.name == "truth":
+                return session.truth if address.vehicle == vehicle else None
+            return frames.route(address) or story.route(address)
+
+        for block in run.read([which], route):
+            story.changed(block.changes)
+            frames.take(block)
+            session.take(block)
+        session.finish()
+    except (ValidationError, ConfigError) as error:
+        raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
+    figures = _figures(session, story, run, which)
+    findings = findings_of(figures, which, session, story, run)
+    findings = findings.model_copy(update={"frames": frames.findings()})
+    return Review(figures, findings, session, which, name_of(paths), facts_of(run, story, vehicle))
+
+
+def _figures(session: Session, story: Story, run: Run, which: Which) -> Figures:
+    reasons: dict[str, str] = {}
+    plant = story.statuses.get((which[0], "plant"))
+    latency = plant.latency_us if plant else None
+    if latency is None:
+        reasons["latency_us"] = "the log has no status of the plant with a latency"
+    files = run.files
+    return session.score.figures(
+        latency=latency, log=files.name, trips=story.trips, reasons=reasons, damages=files.unread
+    )

@@ -1,0 +1,122 @@
+"""One session under review: its ticks are scored, observed and held against the theorem."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import Outcome, Received
+from aeroloop.service.config import Settings
+from aeroloop.service.figures import Score
+from aeroloop.service.logs.runs import Block
+from aeroloop.service.logs.tick_reader import TickReader
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.logs.traces import Missing
+from aeroloop.service.review.observe import Observer
+from aeroloop.service.review.theorem_check import WAITING, Trial
+
+_TRUTHS: Final = TypeAdapter(list[Truth])
+"""Parsed as one text, they take a third of the time."""
+
+_OUTCOMES: Final = {
+    "stale": [Outcome.STALE],
+    "repeated": [Outcome.REPEATED],
+    "refused": [Outcome.MALFORMED, Outcome.INVALID],
+    "withheld": [Outcome.WITHHELD],
+}
+
+
+class Session:
+    """Reviews one session.
+
+    Args:
+        settings: The configuration of its controller.
+        watchdog_s: How long its plant holds a command that no other follows [s].
+        trial: Makes what holds it against the theorem, given the changes that it began with.
+        missing: What the log lacks of it.
+        watch: Called with every block of ticks, in order.
+
+    Attributes:
+        score: Its figures of merit.
+        lapses: How many ticks were late, missed and so on; see `Findings`.
+        reader: Reads its ticks.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        watchdog_s: float,
+        trial: Callable[[Sequence[Change]], Trial],
+        missing: Sequence[Missing] = (),
+        watch: Callable[[Ticks], None] | None = None,
+    ) -> None:
+        self.settings = settings
+        self.score = Score(settings.wire, settings.loop.period, watchdog_s)
+        self.lapses: Counter[str] = Counter()
+        self.reader = TickReader(settings)
+        self._trial = trial
+        self._gaps = [(gap.first_tick, gap.last_tick) for gap in missing if gap.end == "controller" and gap.rows]
+        self._watch = watch
+        self._observer: Observer | None = None
+        self._truths: deque[bytes] = deque(maxlen=WAITING)
+        self._session: str | None = None
+
+    @property
+    def observer(self) -> Observer:
+        """What was observed beside the figures."""
+        if self._observer is None:
+            self._observer = Observer(self.settings, self._trial(()))
+        return self._observer
+
+    def truth(self, payload: bytes, _at_ns: int) -> None:
+        """A message with what was true as a measurement was taken."""
+        self._truths.append(payload)
+
+    def take(self, block: Block) -> None:
+        """Review the next block."""
+        if self._observer is None:
+            self._observer = Observer(self.settings, self._trial(block.changes))
+        observer, trial = self._observer, self._observer.trial
+        trial.changed(block.changes)
+        self._session = block.which[1]
+        self._give_truths(trial)
+        self._count(block)
+        found = self.reader.take(block)
+        for tick in found.missed.tolist():
+            self.lapses["missed"] += not any(a <= tick and (b is None or tick <= b) for a, b in self._gaps)
+        observer.frames(found.measurements, found.commands)
+        self.score.errors(found.judged.k, found.judged.attitude_error)
+        self.score.commands(found.answered, found.voltages)
+        self.score.unsent(*found.unsent)
+        observer.answered(found.answered)
+        observer.ticks(found.judged)
+        if self._watch is not None and len(found.judged.k):
+            self._watch(found.judged)
+
+    def finish(self) -> None:
+        """Review what came after the last block."""
+        if self._observer is not None:
+            self._give_truths(self._observer.trial)
+            self._observer.trial.finish()
+
+    def _give_truths(self, trial: Trial) -> None:
+        for truth in _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]"):
+            if truth.session == self._session:
+                trial.truth(truth.session_tick, truth.attitude, truth.rate)
+        self._truths.clear()
+
+    def _count(self, block: Block) -> None:
+        """Count what went otherwise than one frame each way a tick."""
+        if rows := block.controller:
+            for name, kind in (("late", Received.LATE), ("malformed", Received.MALFORMED)):
+                self.lapses[name] += int((rows["received_as"] == kind).sum())
+        if block.plant:
+            outcomes = block.plant["outcome"][: int((block.at_plant >= 0).sum())]
+            for name, kinds in _OUTCOMES.items():
+                self.lapses[name] += int(np.isin(outcomes, kinds).sum())

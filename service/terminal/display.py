@@ -1,0 +1,281 @@
+"""What a person sees in the terminal: tables and progress, by rich."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import degrees
+from typing import TYPE_CHECKING
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab import paper
+
+if TYPE_CHECKING:
+    from aeroloop.service.host.doctor import Diagnosis
+    from aeroloop.service.host.operator import Statuses
+    from aeroloop.service.host.soak import Soak
+    from aeroloop.service.lab.calibrate import Calibration
+    from aeroloop.service.lab.demo import Progress as DemoProgress
+    from aeroloop.service.lab.tables import Tables
+
+_stderr = Console(stderr=True)
+
+
+def figures_table(figures: Figures) -> None:
+    """Print figures of merit."""
+    rows: list[tuple[str, str]] = [
+        ("duration", f"{figures.duration_s:g} s"),
+        ("z_track", _or_why(figures, "z_track", lambda z: f"{z:.6f}   ({z * 1e4:.2f} ×10⁻⁴)")),
+        ("u_total", _or_why(figures, "u_total", lambda u: f"{u:.1f} V²·s")),
+        ("largest attitude error", _or_why(figures, "max_error_deg", lambda e: f"{e:.2f}°")),
+        ("final attitude error", _or_why(figures, "final_error_deg", lambda e: f"{e:.2f}°")),
+    ]
+    for name, stream in (("measurements", figures.measurement), ("commands", figures.command)):
+        if stream.frames_per_s is not None and stream.bits_per_s is not None:
+            rows.append((name, f"{stream.frames_per_s:.1f} frames/s, {stream.bits_per_s:.0f} payload bits/s"))
+    rows.append(("skipped ticks", _or_why(figures, "skipped_ticks", lambda n: f"{n:.0f}")))
+    latency = figures.latency_us
+    rows.append(
+        (
+            "loop latency",
+            f"p50 {latency.p50:.0f} µs, p99 {latency.p99:.0f} µs"
+            if latency
+            else f"— ({figures.reasons.get('latency_us', 'not measured')})",
+        )
+    )
+    for trip in figures.trips:
+        rows.append(("tripped", trip))
+    for damage in figures.damages:
+        rows.append(("not read", damage))
+    if figures.log:
+        rows.append(("log", figures.log))
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def _or_why(figures: Figures, name: str, text: Callable[[float], str]) -> str:
+    value = getattr(figures, name)
+    return f"— ({figures.reasons.get(name, 'not measured')})" if value is None else text(value)
+
+
+@contextmanager
+def progress_bar(title: str, total_s: float, *, hidden: bool = False) -> Iterator[Callable[[float], None]]:
+    """A bar on stderr that is told the seconds reached; gone when it is done, and never in a pipe."""
+    with Progress(
+        TextColumn(title),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} s"),
+        TimeRemainingColumn(),
+        console=_stderr,
+        transient=True,
+        disable=hidden or not _stderr.is_terminal,
+    ) as bar:
+        task = bar.add_task(title, total=total_s)
+        yield lambda reached: bar.update(task, completed=reached)
+
+
+@contextmanager
+def count_bar(what: str, *, hidden: bool = False) -> Iterator[Callable[[int, int | None], None]]:
+    """A bar on stderr that is told how many are done, of how many if that is known; never in a pipe."""
+    with Progress(
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=_stderr,
+        transient=True,
+        disable=hidden or not _stderr.is_terminal,
+    ) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def paper_tables(tables: Tables) -> None:
+    """Print the paper's tables, ours beside the published."""
+    console = Console()
+    for title, table, digits in (
+        ("z_track [1e-4 s], Table C.2", tables.C2, 1),
+        ("u_total [V²·s], Table C.3", tables.C3, 0),
+    ):
+        grid = Table("in ╲ out", title=f"{title}: ours (paper's)", title_justify="left", box=None)
+        for out in paper.OUTPUT_BITS:
+            grid.add_column("cont" if out is None else f"{out} bits", justify="right")
+        for i, inp in enumerate(paper.INPUT_BITS):
+            spread = table.spread[i] if table.spread else [None] * len(paper.OUTPUT_BITS)
+            cells = [
+                _beside(mine, theirs, deviation, digits)
+                for mine, theirs, deviation in zip(table.ours[i], table.paper[i], spread, strict=True)
+            ]
+            grid.add_row("cont" if inp is None else f"{inp} bits", *cells)
+        console.print(grid)
+        console.print(f"mean absolute relative error of the 23 predicted cells: {table.mare:.1%}\n")
+    grid = Table("", title="with and without wind, Table C.4: ours (paper's)", title_justify="left", box=None)
+    for air in ("calm", "wind"):
+        grid.add_column(f"z_track, {air}", justify="right")
+        grid.add_column(f"u_total, {air}", justify="right")
+    for case, rows in tables.C4.ours.items():
+        cells = [
+            _beside(
+                rows[air][name],
+                tables.C4.paper[case][air][name],
+                tables.C4.spread[case][air][name] if tables.C4.spread else None,
+                digits,
+            )
+            for air in ("calm", "wind")
+            for name, digits in (("z_track_1e-4", 1), ("u_total", 0))
+        ]
+        grid.add_row(case, *cells)
+    console.print(grid)
+    console.print(f"mean absolute relative error of the predicted windy cell: {tables.C4.mare:.1%}")
+
+
+def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> str:
+    plus_minus = "" if spread is None else f" ±{spread:.{digits}f}"
+    return f"{mine:.{digits}f}{plus_minus} ({theirs})"
+
+
+def calibration_table(fit: Calibration) -> None:
+    """Print what was fitted, beside what was measured."""
+    table = Table("parameter", "fitted", "elsewhere", "what that is", box=None)
+    table.add_row(
+        "plant.friction.coulomb, yaw",
+        f"{fit.yaw_coulomb:.6f} N·m",
+        f"{fit.yaw_coulomb_measured} N·m",
+        "measured from spin-downs of another Aero",
+    )
+    table.add_row(
+        "plant.aero.centre_of_mass, z",
+        f"{fit.centre_of_mass_height:.6f} m",
+        f"{fit.centre_of_mass_height_paper} m",
+        "Table C.1, which the controller believes",
+    )
+    pitch, yaw = fit.wind_torque
+    table.add_row("plant.wind.torque", f"{pitch:.6f}, {yaw:.6f} N·m", "–", "the paper's fan was not measured")
+    Console().print(table)
+    for name, residual in fit.residuals.items():
+        Console().print(f"residual {name}: {residual:+.2%}")
+    Console().print(f"{fit.runs} experiments")
+
+
+@contextmanager
+def live_screen() -> Iterator[Callable[[RenderableType], None]]:
+    """The whole terminal, redrawn with whatever it is given."""
+    with Live(console=Console(), auto_refresh=False, screen=Console().is_terminal) as live:
+        yield lambda drawing: live.update(drawing, refresh=True)
+
+
+def diagnosis_table(diagnosis: Diagnosis) -> None:
+    """Print what was found on this machine."""
+    table = Table("", "looked at", "found", "to change", box=None)
+    for finding in diagnosis.findings:
+        table.add_row("✓" if finding.good else "✗", finding.what, finding.found, "" if finding.good else finding.advice)
+    Console().print(table)
+    Console().print(
+        f"this machine {'holds' if diagnosis.holds else 'does not hold'} {diagnosis.rate_hz:g} Hz", style="bold"
+    )
+
+
+def status_table(found: Statuses) -> None:
+    """Print the status of every role."""
+    table = Table("vehicle", "role", "state", "rate", "skipped", "latency p50/p99", "up", "", box=None)
+    for vehicle, roles in sorted(found.items()):
+        for role, status in sorted(roles.items()):
+            latency = status.latency_us
+            table.add_row(
+                vehicle,
+                role,
+                status.state,
+                f"{status.rate_hz:.0f}/s",
+                str(status.skipped),
+                f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+                f"{status.uptime_s:.0f} s",
+                "; ".join([*([status.cause] if status.cause else []), *status.notes]),
+            )
+    Console().print(table)
+
+
+@contextmanager
+def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
+    """The demo's live view on stderr: a bar and a line of what the loop is doing."""
+    bar = Progress(
+        BarColumn(), TextColumn("{task.completed:5.1f}/{task.total:g} s"), TimeRemainingColumn(), console=_stderr
+    )
+    task = bar.add_task("", total=total_s)
+    with Live(bar, console=_stderr, refresh_per_second=10, transient=True) as live:
+
+        def update(now: DemoProgress) -> None:
+            bar.update(task, completed=now.time_s)
+            up, down = now.bits_per_s
+            volts = "  ".join(f"{u:+6.1f}" for u in now.voltages) or "–"
+            line = (
+                f"error {degrees(now.error_rad):5.2f}°   volts {volts}   {now.rate_hz:5.0f} Hz   "
+                f"skipped {now.skipped}   {up / 1000:.1f} + {down / 1000:.1f} kbit/s"
+            )
+            live.update(Group(bar, line if now.statuses.get("controller") else "starting three processes …"))
+
+        yield update
+
+
+def soak_table(soak: Soak) -> None:
+    """Print what a soak has shown."""
+    console = Console()
+    loop = Table("at", "missed ticks", "unanswered", "latency p50/p99", "wake-up p50/p99", box=None)
+    for minute in soak.minutes:
+        latency, wake = minute.latency_us, minute.wake_us
+        loop.add_row(
+            f"{minute.at_s:.0f} s",
+            str(minute.skipped),
+            str(minute.unanswered),
+            f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+            f"{wake.p50:.0f}/{wake.p99:.0f} µs" if wake else "–",
+        )
+    console.print(loop)
+    console.print()
+    growth = Table("process", "memory", "threads", "open files", "CPU", box=None)
+    first, last = soak.minutes[0], soak.minutes[-1]
+    for role, before in first.usage.items():
+        after = last.usage[role]
+        share = (after.cpu_s - before.cpu_s) / max(1e-9, last.at_s - first.at_s)
+        growth.add_row(
+            role,
+            f"{before.memory_mb:.1f} → {after.memory_mb:.1f} MB",
+            f"{before.threads} → {after.threads}",
+            f"{before.files} → {after.files}",
+            f"{100 * share:.1f} %",
+        )
+    console.print(growth)
+    console.print(f"\n{soak.rate_hz:g} Hz; log {soak.log}, {soak.log_mb:g} MB")
+    for finding in soak.findings or ["nothing grew, and one session held throughout"]:
+        console.print(finding)
+
+
+@contextmanager
+def share_bar(what: str, *, hidden: bool = False) -> Iterator[Callable[[float], None]]:
+    """A bar on stderr that is told the share that is done, 0…1; gone when it is done, and never in a pipe."""
+    with Progress(
+        TextColumn(what),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeRemainingColumn(),
+        console=_stderr,
+        transient=True,
+        disable=hidden or not _stderr.is_terminal,
+    ) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)

@@ -1,0 +1,213 @@
+"""What a person sees of a log in the terminal: the account of a review, and what replaying has shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from math import log2
+from typing import TYPE_CHECKING, Final
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from aeroloop.service.review.report import Findings, Mark, Spread, TheoremFindings
+from aeroloop.service.terminal.display import figures_table
+
+if TYPE_CHECKING:
+    from aeroloop.service.logs.replay import Replay
+
+LABELS: Final = 22
+"""Width of the column of labels, as in the table of figures."""
+
+MARKS_SHOWN: Final = 12
+_TIMINGS: Final = {
+    "period": "period",
+    "latency": "latency",
+    "measurement_delay": "plant to controller",
+    "command_delay": "controller to plant",
+}
+_BARS: Final = "▁▂▃▄▅▆▇█"
+_SPARK_WIDTH: Final = 22
+
+
+def review_account(findings: Findings) -> None:
+    """Print figures of merit, timing, what happened, and whether the limits hold."""
+    figures_table(findings)
+    console = Console()
+    console.print()
+    if findings.timing:
+        console.print(_timing_table(findings))
+        console.print()
+    table = _labelled()
+    for label, text in _rows(findings):
+        table.add_row(label, text)
+    console.print(table)
+    if findings.theorem is not None:
+        console.print()
+        console.print(theorem_table(findings, findings.theorem))
+    if findings.marks:
+        console.print()
+        console.print(_marks_table(findings.marks))
+    if findings.checks:
+        console.print()
+        checks = Table(show_header=False, box=None, pad_edge=False)
+        for check in findings.checks:
+            style = "green" if check.holds else "bold red"
+            checks.add_row(f"[{style}]{'✓' if check.holds else '✗'}[/]", check.text, check.found)
+        console.print(checks)
+
+
+def _labelled() -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True, min_width=LABELS)
+    table.add_column(overflow="fold")
+    return table
+
+
+def _timing_table(findings: Findings) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="")
+    table.add_column("", style="bold", no_wrap=True, min_width=LABELS)
+    for name in ("p50", "p99", "p99.9", "max"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for name, spread in findings.timing.items():
+        percentiles = (spread.p50, spread.p99, spread.p999, spread.max)
+        table.add_row(_TIMINGS[name], *(f"{us:.0f}" for us in percentiles), "µs", sparkline(spread))
+    if (age := findings.age_us) is not None:
+        table.add_row("age when used", f"{age['p50']:.0f}", f"{age['p99']:.0f}", "", f"{age['max']:.0f}", "µs", "")
+    return table
+
+
+def sparkline(spread: Spread, width: int = _SPARK_WIDTH) -> str:
+    """The distribution as a row of bars, over the logarithm of the duration and high as the logarithm of the count.
+
+    So a single late tick in a million is seen, and how late it was.
+    """
+    first, last = log2(spread.bins[0][0]), log2(spread.bins[-1][0])
+    counts = [0] * width
+    for edge, count in spread.bins:
+        counts[min(width - 1, int((log2(edge) - first) / max(last - first, 1e-9) * width))] += count
+    top = log2(1 + max(counts))
+    bars = (_BARS[round(log2(1 + count) / top * (len(_BARS) - 1))] if count else " " for count in counts)
+    return "".join(bars).rstrip()
+
+
+def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
+    if findings.gap_count:
+        longest = max(findings.gaps, key=lambda gap: gap.ticks)
+        ticks = "1 tick" if longest.ticks == 1 else f"{longest.ticks} ticks"
+        yield "gaps", f"{findings.gap_count}, the longest {ticks} at {longest.time_s:.3f} s"
+    else:
+        yield "gaps", "none"
+    yield (
+        "at the outermost level",
+        ", ".join(f"{name} {100 * share:.2f} %" for name, share in findings.saturated.items()),
+    )
+    for name, count in findings.invalid.items():
+        if count:
+            yield f"invalid {name}s", str(count)
+    lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
+    yield "messages lost", lost or "none that the recorder knows of"
+    for gap in findings.missing:
+        yield "not recorded", str(gap)
+    if findings.lapses:
+        yield "otherwise than planned", ", ".join(f"{count} {name}" for name, count in findings.lapses.items())
+    if findings.clock_offset_us is not None:
+        first, last = findings.clock_offset_us
+        yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
+    for kind, counts in (findings.frames or {}).items():
+        yield f"{kind} frames", f"{counts['recorded']} on the wire, {counts['differ']} differ from the traces"
+    began = findings.started.replace("T", " ").replace("+00:00", " UTC")
+    others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
+    yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"
+
+
+def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
+    """What the theorem promises, and what the run did."""
+    table = _labelled()
+
+    def row(label: str, name: str, form: Callable[[float], str]) -> None:
+        value = getattr(found, name)
+        why = findings.reasons.get(f"theorem.{name}", "not known")
+        table.add_row(label, Text(f"— ({why})" if value is None else form(value)))
+
+    table.add_row("the theorem", Text(found.verdict, style="" if found.holds else "bold red"))
+    since = f"since {found.since_s + found.transient_s:.3g} s"
+    row(f"largest ‖z‖ {since}", "z_norm", lambda z: f"{z:.4f}{_beside(found.radius, '.4f')}")
+    row(f"largest error {since}", "error_deg", lambda e: f"{e:.2f}°{_beside(found.radius_deg, '.2f', '°')}")
+    if found.true_z_norm is not None and found.true_error_deg is not None:
+        table.add_row("of the true state", f"‖z‖ {found.true_z_norm:.4f}, error {found.true_error_deg:.2f}°")
+    if found.since_s:
+        table.add_row("judged from", f"{found.since_s:g} s, when the reference had been reached")
+    if found.until_s is not None:
+        table.add_row("judged until", f"{found.until_s:g} s, where gains or reference changed")
+    table.add_row("Lemma 1", Text(_lemma(findings, found), style="bold red" if found.broken else ""))
+    return table
+
+
+def _beside(bound: float | None, form: str, unit: str = "") -> str:
+    return "" if bound is None else f", of {bound:{form}}{unit} guaranteed"
+
+
+def _lemma(findings: Findings, found: TheoremFindings) -> str:
+    """Whether it held: which inequality came closest, or which were broken; and what it was judged by."""
+    if found.broken is None:
+        return f"— ({findings.reasons.get('theorem.broken', 'not known')})"
+    by = f"the {found.judged} of {found.samples} true states that satisfy its premises"
+    if found.broken:
+        which = ", ".join(f"({check.equation}) {check.broken}×" for check in found.lemma if check.broken)
+        return f"broken: {which}, of {by}"
+    closest = max(found.lemma, key=lambda check: check.closest or 0.0)
+    return f"holds at {by}; closest is ({closest.equation}), {100 * (closest.closest or 0.0):.0f} % of its bound"
+
+
+def _marks_table(marks: Sequence[Mark]) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for mark in marks[:MARKS_SHOWN]:
+        style = "bold red" if mark.kind in ("tripped", "fault") else ""
+        when = "–" if mark.time_s is None else f"{round(mark.time_s, 3) + 0.0:.3f} s"
+        table.add_row(when, mark.role, mark.kind, Text(mark.text), style=style)
+    if (more := len(marks) - MARKS_SHOWN) > 0:
+        table.add_row("", "", "", f"… and {more} more; --json has them all")
+    return table
+
+
+def replay_table(replay: Replay) -> None:
+    """Print what replaying has shown."""
+    console = Console()
+    table = Table("session", "from tick", "ticks", "differ", "rms", "largest", "u_total", box=None)
+    for session in replay.sessions:
+        table.add_row(
+            f"{session.vehicle}/{session.session}",
+            str(session.first_tick) if session.first_tick is not None else "–",
+            str(session.ticks),
+            str(session.differ),
+            f"{session.rms_v:.3f} V" if session.rms_v is not None else "–",
+            f"{session.max_v:.2f} V" if session.max_v is not None else "–",
+            f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s",
+        )
+    console.print(table)
+    for session in replay.sessions:
+        if (first := session.first_difference) is not None:
+            console.print(
+                f"{session.session}: first differs at tick {first.tick} ({first.time_s:g} s): "
+                f"{first.logged} logged, {first.computed} computed"
+            )
+    for plant in replay.plants:
+        if (other := plant.first_difference) is not None:
+            console.print(
+                f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} "
+                f"logged, {other.computed} computed"
+            )
+    for name, end in (("controller", replay.controller), ("plant", replay.plant)):
+        if end is None:
+            console.print(f"{name}: not replayed: {replay.reasons[name]}", markup=False)
+        else:
+            same = "every tick is the same, byte for byte" if not end.differ else f"{end.differ} differ"
+            why = f"; {replay.reasons[name]}" if name in replay.reasons else ""
+            console.print(f"{name}: {end.ticks} ticks, {same}{why}", markup=False)

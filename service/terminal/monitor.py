@@ -1,0 +1,150 @@
+"""A live view of everything on the network: every vehicle, every role, as they tell it themselves.
+
+It only listens. What it shows is gathered from status, telemetry, truth and event messages; a role whose status is old
+or whose liveliness token went is shown as gone.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import degrees
+from typing import Final
+
+import zenoh
+from pydantic import ValidationError
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Contract, Event, Status, Telemetry, Truth
+from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.wire.attitude import angle, to_euler
+from aeroloop.service.config import ConfigError, Settings, from_contract
+from aeroloop.service.host.bandwidth import PayloadRate
+
+REFRESH_S: Final = 0.2
+SILENT_S: Final = 3.0
+"""A role that has not told its status for this long, three times its period, is shown as silent."""
+EVENTS: Final = 5
+
+
+@dataclass
+class Vehicle:
+    """What is known of one vehicle."""
+
+    statuses: dict[str, tuple[float, Status]] = field(default_factory=dict)
+    telemetry: Telemetry | None = None
+    truth: Truth | None = None
+    settings: Settings | None = None
+    payload: PayloadRate = field(default_factory=PayloadRate)
+
+
+class Top:
+    """Gathers messages and draws them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._vehicles: dict[str, Vehicle] = {}
+        self._events: deque[str] = deque(maxlen=EVENTS)
+
+    def hear(self, key: str, payload: bytes) -> None:
+        """Take in any message of the table; what is not understood is left out."""
+        address = topics.read_key(key)
+        if address is None:
+            return
+        with self._lock:
+            vehicle = self._vehicles.setdefault(address.vehicle, Vehicle())
+            try:
+                match address.topic.name:
+                    case "status" if address.role is not None:
+                        status = Status.model_validate_json(payload)
+                        vehicle.statuses[address.role] = time.monotonic(), status
+                        if address.role == "controller":
+                            vehicle.payload.hear(status)
+                    case "telemetry":
+                        vehicle.telemetry = Telemetry.model_validate_json(payload)
+                    case "truth":
+                        vehicle.truth = Truth.model_validate_json(payload)
+                    case "contract" if address.role in ("plant", "controller"):
+                        vehicle.settings = from_contract(Contract.model_validate_json(payload).config)
+                    case "event":
+                        event = Event.model_validate_json(payload)
+                        self._events.append(f"{time.strftime('%H:%M:%S')} {address.vehicle} {event.role}: {event.text}")
+            except (ValidationError, ConfigError):
+                pass  # of another version; its other messages may still be read
+
+    def draw(self) -> RenderableType:
+        """What is known now."""
+        with self._lock:
+            if not self._vehicles:
+                return Text("nobody on the network yet")
+            blocks: list[RenderableType] = []
+            for name, vehicle in sorted(self._vehicles.items()):
+                blocks += [Text(name, style="bold"), _flight(vehicle), _roles(vehicle), Text("")]
+            return Group(*blocks, *(Text(event, overflow="ellipsis", no_wrap=True) for event in self._events))
+
+
+def _flight(vehicle: Vehicle) -> Text:
+    parts = []
+    if vehicle.truth is not None:
+        roll, pitch, yaw = (degrees(part) for part in to_euler(vehicle.truth.attitude))
+        parts.append(f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°")
+    if vehicle.telemetry is not None:
+        parts.append(f"error {degrees(angle(*vehicle.telemetry.attitude_error)):5.2f}°")
+        parts.append("volts " + " ".join(f"{u:+6.1f}" for u in vehicle.telemetry.voltages))
+    if vehicle.settings is not None and "controller" in vehicle.statuses:
+        measured, commanded = vehicle.payload.bits_per_s(vehicle.settings.wire)
+        parts.append(f"{measured / 1000:.1f} + {commanded / 1000:.1f} kbit/s")
+    return Text("   ".join(parts) or "no telemetry")
+
+
+def _roles(vehicle: Vehicle) -> Table:
+    table = Table(
+        "role", "state", "rate", "skipped", "latency", "answers in", "wake-up", "told", "", box=None, pad_edge=False
+    )
+    for role, (heard, status) in sorted(vehicle.statuses.items()):
+        latency, timing = status.latency_us, status.timing
+        age, sample = time.monotonic() - heard, status.age_us
+        wake = timing.recent_wake if timing else None
+        table.add_row(
+            role,
+            status.state if age < SILENT_S else "silent",
+            f"{status.rate_hz:.0f}/s",
+            str(status.skipped),
+            f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+            f"{sample.p50:.0f}/{sample.p99:.0f} µs" if sample else "–",
+            f"{wake.p50:.0f}/{wake.p99:.0f} µs" if wake else "–",
+            f"{age:.1f} s ago",
+            status.cause or "",
+            style="" if age < SILENT_S else "dim",
+        )
+    return table
+
+
+def watch(network: NetworkSettings, show: Callable[[RenderableType], None], stop: threading.Event) -> None:
+    """Listen and draw five times a second until told to stop.
+
+    Raises:
+        NetworkError: The network cannot be joined.
+    """
+    top = Top()
+
+    def heard(sample: zenoh.Sample) -> None:
+        top.hear(str(sample.key_expr), sample.payload.to_bytes())
+
+    with join(network) as session:
+        for name in ("status", "telemetry", "truth", "event"):
+            session.declare_subscriber(topics.key(name, "*"), heard)
+        asked = 0.0
+        while not stop.wait(REFRESH_S):
+            if time.monotonic() - asked > 2.0:  # who came since; a plant's contract has the wire
+                asked = time.monotonic()
+                for reply in session.get(topics.key("contract", "*"), timeout=1.0):
+                    if reply.ok is not None:
+                        top.hear(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+            show(top.draw())

@@ -1,0 +1,34 @@
+"""Several runs side by side in the terminal: the rows of their page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from aeroloop.service.report.page.setup import shown
+from aeroloop.service.report.rows import figure_rows
+from aeroloop.service.review.report import Report, differences
+
+
+def comparison_tables(reports: Sequence[Report]) -> None:
+    """Print the figures of several runs, and what differs in their configurations."""
+    console = Console()
+    figures = Table("", box=None)
+    differing = Table("differs in the configurations", box=None)
+    for report in reports:
+        figures.add_column(escape(report.name), justify="right")
+        differing.add_column(escape(report.name), overflow="fold")
+    figures.add_column("")
+    for row in figure_rows([report.findings for report in reports]):
+        figures.add_row(row.name, *(value.text for value in row.values), row.unit)
+    for key, values in differences(reports):
+        differing.add_row(key, *(escape(shown(value)) for value in values))
+    console.print(figures)
+    console.print()
+    console.print(differing if differing.row_count else "the configurations are the same")
+    for report in reports:
+        for line in [*report.findings.trips, *report.findings.damages]:
+            console.print(f"{report.name}: {line}", markup=False)

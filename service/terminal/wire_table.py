@@ -1,0 +1,58 @@
+"""What `show spec` prints of a wire: each signal's quantizer, and each frame's size."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Column, Table
+
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
+from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+from aeroloop.protocol.wire.quantizer import Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+
+
+def wire_table(wire: WireSpec) -> None:
+    """Print a wire spec: each signal's quantizer, each frame's size."""
+    console = Console()
+    table = Table("signal", Column("kind", no_wrap=True), "bits", "limit", "step", "largest error", box=None)
+    signals: dict[str, tuple[SignalSpec, str]] = {
+        "ε attitude": (wire.attitude, ""),
+        "ω rate": (wire.rate, " rad/s"),
+        "u voltage": (wire.voltage, " V"),
+    }
+    notes = list[str]()
+    for name, (signal, unit) in signals.items():
+        quantizer = signal.quantizer()
+        step, note = _steps(quantizer, unit)
+        if note is not None:
+            notes.append(f"{name}: {note}")
+        continuous = signal.bits is None
+        table.add_row(
+            name,
+            "–" if continuous else signal.kind,
+            "cont" if continuous else str(signal.bits),
+            f"±{signal.limit:g}{unit}",
+            step,
+            f"{quantizer.bound:.6g}{unit}",
+        )
+    console.print(table)
+    for note in notes:
+        console.print(note, highlight=False)
+    frames: tuple[tuple[str, FrameFormat], ...] = (("measurement", wire.measurement), ("command", wire.command))
+    for label, kind in frames:
+        console.print(f"{label}: {kind.bits} bits in {kind.size} bytes, {kind.counter_bits} of them the counter")
+
+
+def _steps(quantizer: Quantizer, unit: str) -> tuple[str, str | None]:
+    """The step between levels, and what else is to be said of them."""
+    if isinstance(quantizer, LogarithmicQuantizer):
+        least = quantizer.edges[1] - quantizer.edges[0]
+        return f"≤ {quantizer.step:.6g}{unit}", (
+            f"0 within ±{quantizer.deadzone:.6g}{unit}, then {quantizer.growing} steps that grow from {least:.3g}{unit}"
+            f" up to ±{quantizer.threshold:.6g}{unit}, and {quantizer.top - quantizer.growing} alike"
+        )
+    if isinstance(quantizer, HysteresisQuantizer):
+        note = f"a level is held for {quantizer.hysteresis:.6g}{unit} beyond its interval"
+        return f"{quantizer.step:.6g}{unit}", note
+    return (f"{quantizer.step:.6g}{unit}" if isinstance(quantizer, UniformQuantizer) else "–"), None

@@ -1,0 +1,329 @@
+"""Hardware in the loop, for tests: a controller, a plant and a recorder as processes, and what goes wrong with them.
+
+This is the `hil` fixture of the pytest plugin, and can be used without pytest. In real time `run` lets the clock pass;
+in lockstep the plant takes exactly so many steps, so that a test repeats bit for bit however busy the machine is.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from threading import Condition
+from types import TracebackType
+from typing import Any, Final, Literal, Self
+
+import zenoh
+from mcap.reader import make_reader
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Status, model_of
+from aeroloop.protocol.messages.operator import Advance, Answer, Ask, Change, Inject, Message
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
+from aeroloop.service.config import Settings, load
+from aeroloop.service.figures import Figures
+from aeroloop.service.review.review import review
+from aeroloop.service.testing.process_group import Bench, RoleName, free_rendezvous, private_bus
+
+ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
+PATIENCE_S: Final = 30.0
+"""For what another process must do: it takes a second to start here, and CI may have other work."""
+PATIENCE_PER_STEP_S: Final = 0.02
+"""In lockstep, for each step: a hundred times what it takes here."""
+
+
+class HilError(AeroloopError):
+    """The loop did not do what the test takes for granted; one line."""
+
+
+class HilLog:
+    """What a run left behind.
+
+    Attributes:
+        path: The MCAP file.
+        figures: Every figure of merit; raises ReviewError if the log holds no session.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def figures(self) -> Figures:
+        """Every figure of merit, from the log alone. Raises ReviewError if it holds no session."""
+        return review(self.path)
+
+    @property
+    def events(self) -> list[Event]:
+        """What happened, in order."""
+        return [message for _, message in self.messages("event") if isinstance(message, Event)]
+
+    @property
+    def trips(self) -> list[str]:
+        """Why the plant went to 0 V, each time it did."""
+        return [event.text for event in self.events if event.kind == "tripped"]
+
+    def batches(self, end: End) -> list[Batch]:
+        """What one end did tick by tick, in the order of recording."""
+        read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
+        return [batch for batch in read if batch is not None and batch.header.end == end]
+
+    def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
+        """When one end received or sent frames, on its wall clock [ns since 1970]; ticks without one are left out."""
+        frame = Received.FRAME if (end, column) == ("controller", "received") else Sent.FRAME
+        return [
+            at_ns + batch.header.wall_ns - batch.header.monotonic_ns
+            for batch in self.batches(end)
+            for at_ns, what in zip(batch.times_ns(column).tolist(), batch.columns[f"{column}_as"].tolist(), strict=True)
+            if at_ns >= 0 and what == frame
+        ]
+
+    @property
+    def changes(self) -> list[Change]:
+        """What controllers followed from which tick on, in order."""
+        return [change for batch in self.batches("controller") for change in batch.tail.changes]
+
+    def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
+        """Time of publication [ns] and content of every message of one topic; frames and traces are bytes."""
+        found: list[tuple[int, Message | bytes]] = []
+        topic = topics.TOPICS[name]
+        with self.path.open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                address = topics.read_key(channel.topic)
+                if address is not None and address.topic is topic:
+                    raw = topic.carries != "json"
+                    content = message.data if raw else model_of(topic).model_validate_json(message.data)
+                    found.append((message.publish_time, content))
+        return found
+
+
+class Hil:
+    """A loop of real processes.
+
+    Args:
+        folder: Where logs go.
+        lockstep: Whether `run` counts steps instead of waiting.
+        plant: What stands at the plant end: as `plant.via`, or can-node for an emulated node on a bus of its own.
+        config: The TOML file to start from, unless `start` is given another.
+
+    Attributes:
+        events: What has happened so far, as it was told on the network.
+        settings: The configuration, once started.
+        bench: The processes, once started.
+    """
+
+    settings: Settings
+    bench: Bench
+
+    def __init__(
+        self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
+    ) -> None:
+        self._folder = folder
+        self._via = plant.replace("can-node", "can")
+        self._bus_of_its_own = plant == "can-node"
+        self._config = config
+        self._lockstep = lockstep
+        self._running = False
+        self._logs: list[HilLog] = []
+        self._changed = Condition()
+        self._statuses: dict[str, Status] = {}
+        self._asked_ticks = 0
+        self.events: list[Event] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.finish()
+
+    def start(
+        self, config: Path | str | None = None, settings: Mapping[str, Any] | None = None, *, drive: bool = True
+    ) -> None:
+        """Start a recorder, a plant and a controller, and wait until the controller has the plant.
+
+        Args:
+            config: A TOML file, as for `--config`.
+            settings: What to override, as for `--set`: section.key to value.
+            drive: Whether to start a controller and wait for it.
+
+        Raises:
+            ConfigError: The configuration is wrong.
+            HilError: The loop did not close.
+        """
+        self.finish()
+        log = self._folder / f"hil-{len(self._logs)}.mcap"
+        ours = {
+            "network.rendezvous": free_rendezvous(),
+            "recorder.path": str(log),
+            "recorder.max_file_mb": 1e6,  # a test looks into one file
+            "recorder.max_file_s": 1e6,
+            "controller.require_recorder": True,
+            "loop.lockstep": self._lockstep,
+            "plant.steps_on_request": self._lockstep and self._via == "emulator",
+            "plant.via": self._via,
+        }
+        overrides = [f"{key}={json.dumps(value)}" for key, value in {**ours, **(settings or {})}.items()]
+        self.settings = load(Path(config) if config else self._config, overrides)
+        if self._bus_of_its_own:
+            self.settings = self.settings.model_copy(update={"can": private_bus(self.settings.can)})
+        self.events.clear()
+        self._statuses.clear()
+        self._asked_ticks = 0
+        self.bench = Bench(self.settings)
+        self._running = True
+        self._logs.append(HilLog(log))
+        for name, hear in (("event", self._hear_event), ("status", self._hear_status)):
+            self.bench.zenoh.declare_subscriber(topics.key(name, self.settings.vehicle), hear)
+        self.bench.start("recorder")
+        self.bench.start_plant()
+        if drive:
+            self.bench.start("controller")  # which waits for the recorder by itself
+        for role in ROLES:
+            self.bench.await_role(role)
+        if drive:
+            ready = {PlantState.GRANTED, PlantState.DRIVEN} if self._lockstep else {PlantState.DRIVEN}
+            self.eventually("the controller drives the plant", lambda: self.state("plant") in ready)
+
+    def run(self, seconds: float) -> None:
+        """Let the loop run for so long; in lockstep, exactly so many steps, or until the session ends.
+
+        In lockstep only an emulator waits between two calls; other plants run on, and it is at least so many steps.
+
+        Raises:
+            BenchError: A process has failed.
+            HilError: In lockstep, the plant does not step.
+        """
+        if not self._lockstep:
+            time.sleep(seconds)
+            self.bench.check()
+            return
+        self._asked_ticks += self.settings.loop.ticks(seconds)
+        if self._via == "emulator":
+            self._ask("advance", Advance(seconds=seconds))
+
+        def over() -> bool:
+            plant = self._statuses.get("plant")
+            return plant is not None and (plant.ticks >= self._asked_ticks or plant.session is None)
+
+        self.eventually(
+            f"{seconds:g} s in lockstep",
+            over,
+            PATIENCE_S + PATIENCE_PER_STEP_S * self.settings.loop.ticks(seconds),
+        )
+        self.bench.check()
+
+    def inject(self, fault: str | None) -> None:
+        """Let something go wrong with the emulated plant, now or later: `signal:kind[=value][@start[..end]]`.
+
+        Args:
+            fault: In seconds from now; None takes all faults away.
+
+        Raises:
+            HilError: It is not a fault, or the plant is not emulated.
+        """
+        self._ask("inject", Inject(fault=fault))
+
+    def arm(self) -> None:
+        """As `aeroloop op arm`."""
+        self._ask("arm", Ask())
+
+    def stop(self) -> None:
+        """As `aeroloop op stop`."""
+        self._ask("stop", Ask())
+
+    def kill(self, role: RoleName) -> None:
+        """kill −9."""
+        self.bench.stop(role, signal.SIGKILL)
+
+    def pause(self, role: RoleName) -> None:
+        """SIGSTOP: the process stands still, and its links stay open."""
+        self.bench.signal(role, signal.SIGSTOP)
+
+    def resume(self, role: RoleName) -> None:
+        """SIGCONT."""
+        self.bench.signal(role, signal.SIGCONT)
+
+    def restart(self, role: RoleName) -> None:
+        """Start a role again that has ended or was killed, and wait until it is on the network.
+
+        A recorder begins another log, which is `log` from then on.
+        """
+        if role == "recorder":
+            self._logs.append(HilLog(self._folder / f"hil-{len(self._logs)}.mcap"))
+            self.bench.replace_log(self._logs[-1].path)
+        self.bench.start(role)
+        if role != "controller":
+            self.bench.await_role(role)
+
+    def state(self, role: str) -> str | None:
+        """What `plant`, `controller` or `recorder` is doing, as it last said; None if it has said nothing."""
+        status = self._statuses.get(role)
+        return status.state if status else None
+
+    def status(self, role: str) -> Status:
+        """The last status of a role. Raises HilError if it has told none."""
+        if role not in self._statuses:
+            raise HilError(f"the {role} has told no status")
+        return self._statuses[role]
+
+    def happened(self, kind: str, text: str = "") -> bool:
+        """Whether an event of this kind, with this in its text, has been told."""
+        return any(event.kind == kind and text in event.text for event in self.events)
+
+    def eventually(self, what: str, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
+        """Wait for something that the loop brings about.
+
+        Raises:
+            HilError: It did not, or a process has failed meanwhile.
+        """
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while not condition():
+                if time.monotonic() > deadline:
+                    states = ", ".join(f"{role} {status.state}" for role, status in sorted(self._statuses.items()))
+                    last = "; ".join(f"{event.role} {event.kind}: {event.text}" for event in self.events[-3:])
+                    raise HilError(
+                        f"not within {timeout_s:g} s: {what} ({states or 'no status was received'}"
+                        f"{f'; last events: {last}' if last else ''})"
+                    )
+                self._changed.wait(0.05)
+
+    def finish(self) -> None:
+        """Stop all processes; the log is whole then."""
+        if self._running:
+            self._running = False
+            self.bench.__exit__(None, None, None)
+
+    @property
+    def log(self) -> HilLog:
+        """Everything that crossed the network since `start`; asking for it ends the run."""
+        self.finish()
+        if not self._logs:
+            raise HilError("nothing was started, so there is no log")
+        return self._logs[-1]
+
+    def _ask(self, topic: str, message: Message) -> None:
+        key = topics.key(topic, self.settings.vehicle)
+        for reply in self.bench.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
+            if reply.ok is not None:
+                answer = Answer.model_validate_json(reply.ok.payload.to_bytes())
+                if not answer.done:
+                    raise HilError(answer.text)
+                return
+        raise HilError(f"nobody answers {topic!r}")
+
+    def _hear_event(self, sample: zenoh.Sample) -> None:
+        with self._changed:
+            self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
+            self._changed.notify_all()
+
+    def _hear_status(self, sample: zenoh.Sample) -> None:
+        status = Status.model_validate_json(sample.payload.to_bytes())
+        with self._changed:
+            self._statuses[status.role] = status
+            self._changed.notify_all()

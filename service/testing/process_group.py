@@ -1,0 +1,204 @@
+"""Roles as child processes of this one: what the demo and the tests on real processes start and stop.
+
+Each child runs the same command a user would type, with the effective configuration in a file of its own. It ends when
+its parent does, so that nothing is left behind. ^C reaches only the parent, which stops its children one by one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Literal, Self
+
+import zenoh
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.can_link import CanSettings
+from aeroloop.protocol.transport.network import join
+from aeroloop.service.config import ENV_PREFIX, Settings
+from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
+
+RoleName = Literal["controller", "plant", "can-node", "recorder"]
+
+Child = subprocess.Popen[bytes] | ForkedProcess
+
+START_WAIT_S: Final = 20.0
+STOP_WAIT_S: Final = 10.0
+
+
+class BenchError(AeroloopError):
+    """A process did not start or ended early; one line with what it said last."""
+
+
+def free_rendezvous() -> str:
+    """A loopback endpoint that nobody listens on right now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def private_bus(can: CanSettings) -> CanSettings:
+    """The same bus, for processes of this machine only, where the interface knows no bounds by itself."""
+    if can.interface != "udp_multicast":
+        return can
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port: int = probe.getsockname()[1]
+    return can.model_copy(update={"options": {"hop_limit": 0, "port": port, **can.options}})
+
+
+class Bench:
+    """Processes of one network on this machine. A context: leaving it stops them all.
+
+    Args:
+        settings: The configuration of them all.
+
+    Attributes:
+        zenoh: A session of our own on their network.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._folder = tempfile.TemporaryDirectory(prefix="aeroloop-")
+        self._config = Path(self._folder.name) / "aeroloop.toml"
+        self._config.write_text(settings.toml())
+        self._children: dict[str, Child] = {}
+        self._alive: set[str] = set()
+        self._killed: set[str] = set()  # on purpose
+        self._changed = threading.Condition()
+        self.zenoh = join(settings.network)
+        self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        roles: tuple[RoleName, ...] = ("controller", "plant", "can-node", "recorder")
+        for role in roles:
+            if role in self._children:
+                self.stop(role)
+        self.zenoh.close()
+        self._folder.cleanup()
+
+    def start_plant(self) -> None:
+        """Start the plant end that the configuration names, and a node on the bus if that is one of software only."""
+        if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
+            self.start("can-node")
+        self.start("plant")
+
+    def start(self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None) -> Child:
+        """Start a role; it is not yet on the network when this returns.
+
+        Args:
+            role: Which.
+            arguments: For its command line, besides the configuration of all.
+            environment: For its environment, besides this process's. A process with one is started from nothing, since
+                the dynamic linker reads it, too; any other is a fork (see `fork_server`).
+        """
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
+        server = None if environment else fork_server()
+        parent = server.pid if server else os.getpid()
+        words = [role, "--config", str(self._config), f"--with-parent={parent}", "--quiet", *arguments]
+        child: Child
+        with self._log(role).open("ab") as stderr:
+            if server:
+                child = server.start(words, inherited, stderr.fileno())
+            else:
+                child = subprocess.Popen(
+                    [sys.executable, "-P", "-m", "aeroloop", *words],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=stderr,
+                    env={**inherited, **(environment or {})},
+                    start_new_session=True,
+                )
+        self._children[role] = child
+        self._killed.discard(role)
+        return child
+
+    def await_role(self, role: RoleName, timeout_s: float = START_WAIT_S) -> None:
+        """Wait until a role's liveliness token is there.
+
+        Raises:
+            BenchError: It ended, or the time is over.
+        """
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while role not in self._alive:
+                self._check(role)
+                if time.monotonic() > deadline:
+                    raise BenchError(f"the {role} did not join the network within {timeout_s:g} s")
+                self._changed.wait(0.1)
+
+    def running(self, role: RoleName) -> bool:
+        """Whether a role that was started is still running."""
+        return self._children[role].poll() is None
+
+    def stop(self, role: RoleName, how: signal.Signals = signal.SIGTERM) -> int:
+        """Stop a role and wait for it; killed if it does not end by itself. Returns its exit code."""
+        self._killed.add(role)
+        child = self._children[role]
+        if child.poll() is None:
+            child.send_signal(how)
+            child.send_signal(signal.SIGCONT)  # a process that stands still ends no other way
+        try:
+            return child.wait(STOP_WAIT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            return child.wait()
+
+    def signal(self, role: RoleName, which: signal.Signals) -> None:
+        """Send a signal to a role that was started."""
+        self._children[role].send_signal(which)
+
+    def pid(self, role: RoleName) -> int:
+        """Process id of a role that was started."""
+        return self._children[role].pid
+
+    def replace_log(self, path: Path) -> None:
+        """Let a recorder that is started from now on write another log."""
+        self._settings = self._settings.model_copy(
+            update={"recorder": self._settings.recorder.model_copy(update={"path": path})}
+        )
+        self._config.write_text(self._settings.toml())
+
+    def check(self) -> None:
+        """Raise if any process has failed.
+
+        Raises:
+            BenchError: With what it said last.
+        """
+        for role in self._children:
+            self._check(role)
+
+    def _check(self, role: str) -> None:
+        code = self._children[role].poll()
+        if code and role not in self._killed:
+            said = self._log(role).read_text(errors="replace").strip().splitlines()
+            raise BenchError(f"the {role} ended with exit code {code}" + (f": {said[-1]}" if said else ""))
+
+    def _log(self, role: str) -> Path:
+        return Path(self._folder.name) / f"{role}.stderr"
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        address = topics.read_key(str(sample.key_expr))
+        if address is None or address.role is None:
+            return
+        with self._changed:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._alive.add(address.role)
+            else:
+                self._alive.discard(address.role)
+            self._changed.notify_all()

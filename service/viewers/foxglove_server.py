@@ -1,0 +1,169 @@
+"""What happens now, for Foxglove and Lichtblick: a WebSocket server of decoded topics.
+
+A process of its own that only listens. Frames and whatever else streams wait in rings of one, written by Zenoh's own
+threads, and are taken at a fixed pace: what comes between is never decoded. foxglove-sdk sends from threads of its own,
+and drops what a slow client does not take, so that it reaches neither the other clients nor the loop.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from threading import Event
+from time import time_ns
+from typing import Final
+
+import foxglove
+import zenoh
+from pydantic import ValidationError
+from zenoh.handlers import RingChannel
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Contract
+from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.publication import Delivery, RecoveringSubscriber, read_sample
+from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder, topic_of
+from aeroloop.service.viewers.schemas import Shape
+
+log: Final = logging.getLogger("aeroloop")
+
+KEPT: Final = 1024
+"""How many of what happens once may wait for the next turn."""
+BACKLOG: Final = 256
+"""Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
+
+
+class LiveError(AeroloopError):
+    """The server cannot be started; one line that says why and what to do."""
+
+
+class Feed:
+    """What is published about a vehicle, decoded.
+
+    Args:
+        session: An open session; it outlives the feed.
+        vehicle: Whose topics.
+    """
+
+    def __init__(self, session: zenoh.Session, vehicle: str) -> None:
+        self._decoder = Decoder(None)  # the pace at which it is asked bounds the rate
+        self._contracts = RecoveringSubscriber(session, topics.key("contract", vehicle), KEPT)
+        self._subscribers = {
+            session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
+            for names, room in ((UNLIMITED, KEPT), (LIMITED.union(topics.FRAMES), 1))
+            for name in sorted(names)
+        }
+
+    def take(self) -> Iterator[Decoded]:
+        """What came since the last time: the newest of what streams, and all of what happens once. Never waits."""
+        for contract in self._contracts.take():
+            try:
+                self._decoder.configure(Contract.model_validate_json(contract.payload))
+            except ValidationError:
+                log.warning("live: %s carries no contract of this version", contract.key)
+        for subscriber, room in self._subscribers.items():
+            for _ in range(room):
+                if (sample := subscriber.try_recv()) is None:
+                    break
+                yield from self._decode(read_sample(sample))
+
+    def _decode(self, received: Delivery) -> list[Decoded]:
+        address = topics.read_key(received.key)
+        if address is None:
+            return []
+        at_ns = time_ns() if received.published_ns is None else max(received.published_ns, 0)
+        read = self._decoder.frame if address.topic.carries == "frame" else self._decoder.take
+        return read(address, received.payload, at_ns)
+
+
+class Outlet:
+    """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
+
+    Args:
+        vehicle: Whose topics are there from the start.
+        address: Where it listens.
+        port: Its port; 0 for any free one.
+
+    Attributes:
+        url: Where clients find it.
+
+    Raises:
+        LiveError: It cannot listen there.
+    """
+
+    def __init__(self, vehicle: str, address: str, port: int) -> None:
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # clients that come and go are no news
+        self._context = foxglove.Context()
+        self._channels: dict[str, foxglove.Channel] = {}
+        for name, shape in SHAPES.items():
+            self._open(topic_of(vehicle, name), shape)
+        try:
+            self._server = foxglove.start_server(
+                name=f"aeroloop {vehicle}",
+                host=address,
+                port=port,
+                context=self._context,
+                message_backlog_size=BACKLOG,
+            )
+        except RuntimeError as error:
+            reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
+            where = f"{_host(address)}:{port}"
+            raise LiveError(f"cannot listen on {where}: {reason.lower()}; choose by --address and --port") from None
+        self.url = f"ws://{_host(address)}:{self._server.port}"
+
+    def __enter__(self) -> Outlet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.stop()
+        for channel in self._channels.values():
+            channel.close()
+
+    def send(self, message: Decoded) -> None:
+        """Send a message to the clients that subscribe to its topic. Never waits."""
+        channel = self._channels.get(message.topic) or self._open(message.topic, message.shape)
+        channel.log(message.data, log_time=message.at_ns)
+
+    def _open(self, topic: str, shape: Shape) -> foxglove.Channel:
+        schema = foxglove.Schema(name=shape.name, encoding=shape.encoding, data=shape.schema)
+        channel = foxglove.Channel(topic, schema=schema, message_encoding=shape.message_encoding, context=self._context)
+        self._channels[topic] = channel
+        return channel
+
+
+def serve(
+    network: NetworkSettings,
+    vehicle: str,
+    stop: Event,
+    *,
+    address: str,
+    port: int,
+    rate_hz: float,
+    ready: Callable[[str], None],
+) -> None:
+    """Show a vehicle until `stop` is set.
+
+    Args:
+        network: Where to join.
+        vehicle: Whose topics.
+        stop: Set to end it.
+        address: Where to listen.
+        port: At which port; 0 for any free one.
+        rate_hz: How often what streams is taken, decoded and sent [Hz].
+        ready: Called with the URL once clients can connect.
+
+    Raises:
+        LiveError: The address or port cannot be listened on.
+        NetworkError: The network cannot be joined.
+    """
+    with Outlet(vehicle, address, port) as outlet, join(network) as session:
+        feed = Feed(session, vehicle)
+        ready(outlet.url)
+        while not stop.wait(1 / rate_hz):
+            for message in feed.take():
+                outlet.send(message)
+
+
+def _host(address: str) -> str:
+    return f"[{address}]" if ":" in address else address

@@ -1,0 +1,204 @@
+"""What a person is shown: messages in degrees, volts and microseconds.
+
+Every field has its unit in its name; what has no valid value is null. Values are rounded far below a quantizer's step,
+so that they do not fill a log with digits that say nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import degrees, sqrt
+from typing import Final, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.protocol.messages.models import Percentiles, Status, Telemetry
+from aeroloop.protocol.wire.attitude import Quaternion, Vector, angle, to_euler
+
+ANGLES: Final = "Z–Y–X, body relative to inertial"
+NO_MOTOR: Final = "null: no valid value, or no such motor"
+
+
+class View(BaseModel):
+    """A message for people."""
+
+    model_config = ConfigDict(frozen=True)
+
+    def encode(self) -> bytes:
+        """The message as JSON."""
+        return self.model_dump_json().encode()
+
+
+class Attitude(View):
+    """Attitude and rates."""
+
+    roll_deg: float | None = Field(description=f"{ANGLES} [deg]")
+    pitch_deg: float | None = Field(description=f"{ANGLES} [deg]")
+    yaw_deg: float | None = Field(description=f"{ANGLES}, −180…180 [deg]")
+    p_deg_s: float | None = Field(description="rate about the body's x axis [deg/s]")
+    q_deg_s: float | None = Field(description="rate about the body's y axis [deg/s]")
+    r_deg_s: float | None = Field(description="rate about the body's z axis [deg/s]")
+
+    @classmethod
+    def of(cls, attitude: Quaternion | None, rate: Vector) -> Self:
+        """Of an attitude, None if it is not known, and rates in the body frame [rad/s], NaN if they are not."""
+        roll, pitch, yaw = _degrees(to_euler(attitude)) if attitude else (None, None, None)
+        p, q, r = (_degree(part) if part == part else None for part in rate)
+        return cls(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, p_deg_s=p, q_deg_s=q, r_deg_s=r)
+
+
+class Setpoint(View):
+    """An operator's set-point."""
+
+    roll_deg: float = Field(description=f"{ANGLES} [deg]")
+    pitch_deg: float = Field(description=f"{ANGLES} [deg]")
+    yaw_deg: float = Field(description=f"{ANGLES} [deg]")
+
+    @classmethod
+    def of(cls, attitude: Vector) -> Self:
+        """Of roll, pitch and yaw [deg]."""
+        return cls(roll_deg=attitude[0], pitch_deg=attitude[1], yaw_deg=attitude[2])
+
+
+class Voltages(View):
+    """Voltages as commanded, quantized."""
+
+    voltage_1_v: float | None = Field(description=f"u₁; {NO_MOTOR} [V]")
+    voltage_2_v: float | None = Field(description=f"u₂; {NO_MOTOR} [V]")
+    voltage_3_v: float | None = Field(description=f"u₃; {NO_MOTOR} [V]")
+    saturated_1: bool | None = Field(description=f"u₁ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_2: bool | None = Field(description=f"u₂ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_3: bool | None = Field(description=f"u₃ is at the quantizer's outermost level; {NO_MOTOR}")
+
+    @classmethod
+    def of(cls, codes: Sequence[float], level: Callable[[float], float], outermost: float) -> Self:
+        """Of the codes of u₂ and u₃, or of all three, and the quantizer's levels [V]."""
+        levels = [*[float("nan")] * (3 - len(codes)), *map(level, codes)]
+        volts = [round(u, 4) if u == u else None for u in levels]
+        saturated = [abs(u) >= outermost if u == u else None for u in levels]
+        return cls(
+            voltage_1_v=volts[0],
+            voltage_2_v=volts[1],
+            voltage_3_v=volts[2],
+            saturated_1=saturated[0],
+            saturated_2=saturated[1],
+            saturated_3=saturated[2],
+        )
+
+
+class Tracking(View):
+    """How well the body follows its reference, as the controller saw it at one tick."""
+
+    time_s: float | None = Field(description="on the law's clock; null if its period is not known [s]")
+    error_deg: float = Field(description="angle from the desired to the measured attitude, 0…180 [deg]")
+    roll_deg: float = Field(description=f"measured; {ANGLES} [deg]")
+    pitch_deg: float = Field(description=f"measured; {ANGLES} [deg]")
+    yaw_deg: float = Field(description=f"measured; {ANGLES}, −180…180 [deg]")
+    desired_roll_deg: float = Field(description=f"{ANGLES} [deg]")
+    desired_pitch_deg: float = Field(description=f"{ANGLES} [deg]")
+    desired_yaw_deg: float = Field(description=f"{ANGLES}, −180…180 [deg]")
+    error_p_deg_s: float = Field(description="ω_e about the body's x axis [deg/s]")
+    error_q_deg_s: float = Field(description="ω_e about the body's y axis [deg/s]")
+    error_r_deg_s: float = Field(description="ω_e about the body's z axis [deg/s]")
+    damping_1: float = Field(description="θ̂₁ [N·m·s/rad]")
+    damping_2: float = Field(description="θ̂₂ [N·m·s/rad]")
+    damping_3: float = Field(description="θ̂₃ [N·m·s/rad]")
+    sign: int = Field(description="the equilibrium approached, z₁₊ or z₁₋")
+
+    @classmethod
+    def of(cls, told: Telemetry, period: float | None) -> Self:
+        """Of the controller's telemetry, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
+        x, y, z = told.attitude_error
+        scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
+        measured = _product(told.desired, (scalar if told.sign >= 0 else -scalar, x, y, z))
+        roll, pitch, yaw = _degrees(to_euler(measured))
+        desired_roll, desired_pitch, desired_yaw = _degrees(to_euler(told.desired))
+        error_p, error_q, error_r = _degrees(told.rate_error)
+        damping_1, damping_2, damping_3 = (round(theta, 6) for theta in told.damping_estimate)
+        return cls(
+            time_s=None if period is None else round(told.tick * period, 6),
+            error_deg=_degree(angle(x, y, z)),
+            roll_deg=roll,
+            pitch_deg=pitch,
+            yaw_deg=yaw,
+            desired_roll_deg=desired_roll,
+            desired_pitch_deg=desired_pitch,
+            desired_yaw_deg=desired_yaw,
+            error_p_deg_s=error_p,
+            error_q_deg_s=error_q,
+            error_r_deg_s=error_r,
+            damping_1=damping_1,
+            damping_2=damping_2,
+            damping_3=damping_3,
+            sign=told.sign,
+        )
+
+
+class RoleStatus(View):
+    """How a role is doing. Percentiles are of the last ten seconds."""
+
+    state: str
+    cause: str | None = Field(description="plant: why it may not be driven, where that is so")
+    session: str | None
+    rate_hz: float = Field(description="ticks (recorder: messages) a second since the last status [Hz]")
+    skipped: int = Field(description="grid ticks of the session that were missed")
+    refused: int = Field(description="malformed frames since start")
+    stale: int = Field(description="frames since start that came too late to be acted upon")
+    saturated: int = Field(description="values beyond a quantizer's range since start")
+    latency_p50_us: float | None = Field(description="plant: from a measurement to the command that answers it [µs]")
+    latency_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
+    age_p50_us: float | None = Field(
+        description="controller: how much later than the fastest a measurement was received [µs]"
+    )
+    age_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
+    wake_p50_us: float | None = Field(description="from when a tick was due to when it began [µs]")
+    wake_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
+    uptime_s: float = Field(description="since it joined the network [s]")
+
+    @classmethod
+    def of(cls, told: Status) -> Self:
+        """Of what a role published."""
+        latency_p50, latency_p99 = _percentiles(told.recent_latency_us)
+        age_p50, age_p99 = _percentiles(told.age_us)
+        wake_p50, wake_p99 = _percentiles(told.timing.recent_wake if told.timing else None)
+        return cls(
+            state=told.state,
+            cause=told.cause,
+            session=told.session,
+            rate_hz=round(told.rate_hz, 3),
+            skipped=told.skipped,
+            refused=told.refused,
+            stale=told.stale,
+            saturated=told.saturated,
+            latency_p50_us=latency_p50,
+            latency_p99_us=latency_p99,
+            age_p50_us=age_p50,
+            age_p99_us=age_p99,
+            wake_p50_us=wake_p50,
+            wake_p99_us=wake_p99,
+            uptime_s=round(told.uptime_s, 1),
+        )
+
+
+def _degree(radians: float) -> float:
+    return round(degrees(radians), 4) + 0.0  # never −0
+
+
+def _degrees(radians: Vector) -> Vector:
+    return _degree(radians[0]), _degree(radians[1]), _degree(radians[2])
+
+
+def _percentiles(durations: Percentiles | None) -> tuple[float | None, float | None]:
+    return (durations.p50, durations.p99) if durations else (None, None)
+
+
+def _product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Hamilton product p ⊗ q."""
+    a, b, c, d = p
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
