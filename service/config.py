@@ -114,13 +114,13 @@ class Settings(BaseSettings):
             f"twice {name}, which is {patience_s * 1e3:g} ms: {', or '.join(ways)}"
         )
 
-    def contract(self) -> dict[str, Any]:
-        """The effective configuration, for a role's contract."""
+    def description(self) -> dict[str, Any]:
+        """The effective configuration, for a role's description."""
         return self.model_dump(mode="json")
 
     def toml(self) -> str:
         """The effective configuration as a TOML file that gives it again."""
-        return tomli_w.dumps(_for_toml(self.contract()))
+        return tomli_w.dumps(_for_toml(self.description()))
 
 
 def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
@@ -149,8 +149,8 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
 
 
-def from_contract(config: dict[str, Any]) -> Settings:
-    """The configuration that a role told in its contract.
+def from_description(config: dict[str, Any]) -> Settings:
+    """The configuration that a role told in its description.
 
     Raises:
         ConfigError: It is not one that this version understands.
@@ -163,10 +163,10 @@ def from_contract(config: dict[str, Any]) -> Settings:
 
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     """A configuration with some values replaced. Raises ConfigError as `load` does."""
-    tree = settings.contract()
+    tree = settings.description()
     for override in overrides:
         _merge(tree, _tree([override]))
-    return from_contract(tree)
+    return from_description(tree)
 
 
 def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:

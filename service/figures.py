@@ -23,7 +23,7 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
-class Stream(BaseModel):
+class StreamFigures(BaseModel):
     """Traffic in one direction, over the time that was judged."""
 
     model_config = ConfigDict(frozen=True)
@@ -42,8 +42,8 @@ class Figures(BaseModel):
     u_total: float | None = Field(description="∫ uᵀu dt of the commands as sent [V²·s]")
     max_error_deg: float | None = Field(description="largest attitude error as measured [deg]")
     final_error_deg: float | None = Field(description="attitude error at the last tick as measured [deg]")
-    measurement: Stream
-    command: Stream
+    measurement: StreamFigures
+    command: StreamFigures
     skipped_ticks: int | None = Field(description="ticks that no command answered, whatever the reason")
     latency_us: Percentiles | None
     log: str | None
@@ -195,7 +195,7 @@ def added(start: float, terms: Floats) -> float:
     return float(np.add.accumulate(np.append(start, terms))[-1])
 
 
-def _stream(frames: int, kind: FrameFormat, duration: float) -> Stream:
+def _stream(frames: int, kind: FrameFormat, duration: float) -> StreamFigures:
     if not duration:
-        return Stream(frames_per_s=None, bits_per_s=None)
-    return Stream(frames_per_s=frames / duration, bits_per_s=frames * kind.size * 8 / duration)
+        return StreamFigures(frames_per_s=None, bits_per_s=None)
+    return StreamFigures(frames_per_s=frames / duration, bits_per_s=frames * kind.size * 8 / duration)

@@ -1,6 +1,6 @@
 """How a plant end is seen: the side of it that controllers, bridges and operators are on.
 
-A Driver runs a plant; a Front stands between it and the network. On Zenoh that is a Presence, on a CAN bus a CanFront.
+A Driver runs a plant; a Front connects it to the network: a ZenohFront on Zenoh, a CanFront on a CAN bus.
 Everything here is called by the driver's thread, between ticks.
 """
 
@@ -58,11 +58,11 @@ class Front(ABC):
         """
 
     @abstractmethod
-    def tell_when_due(self) -> None:
+    def publish_when_due(self) -> None:
         """Tell how things are, if it is time to."""
 
     @abstractmethod
-    def tell(self) -> None:
+    def publish_status(self) -> None:
         """Tell how things are."""
 
     @abstractmethod

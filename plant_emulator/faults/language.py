@@ -40,7 +40,7 @@ class Signal(NamedTuple):
 
     Attributes:
         whole: What it is, or is a part of.
-        part: Which part of it: axis 0…2, or motor from 0; None for all of it.
+        part: SessionKey part of it: axis 0…2, or motor from 0; None for all of it.
         kinds: What can go wrong with it.
     """
 

@@ -108,7 +108,7 @@ class FaultyStream:
     """Frames of one direction, with faults.
 
     Args:
-        signal: Which direction it is.
+        signal: SessionKey direction it is.
         faults: What goes wrong; those of other signals are left to others.
         seed: Of all random numbers, from 0 up.
     """

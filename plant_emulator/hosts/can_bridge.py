@@ -16,7 +16,7 @@ from threading import Condition
 from typing import Final, Literal
 
 from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
-from aeroloop.plant_emulator.hosts.presence import Presence
+from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCause
 from aeroloop.protocol.messages.trace import Outcome
@@ -207,7 +207,7 @@ class Bridge:
         )
         self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
-        self._presence = Presence(role, loop, self._relay, self._changed)
+        self._presence = ZenohFront(role, loop, self._relay, self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._beat_due = 0.0
         self._reopen_due = 0.0
@@ -238,7 +238,7 @@ class Bridge:
                     count = f"the bus: {self._bus.errors} errors, {self._bus.refused} malformed frames"
                     presence.notes = [*self._machine_notes, count]
                 presence.follow_session()
-                presence.tell_when_due()
+                presence.publish_when_due()
         finally:
             if relay.session is not None:
                 relay.release(relay.session)
@@ -279,7 +279,7 @@ class Bridge:
             relay.expire(TripCause.BUS, bus.fault)
             self._mend(bus.fault)
             return
-        heard = bus.heard
+        heard = bus.peer
         if relay.session is None or heard is None:
             return
         if bus.silent:
@@ -297,9 +297,9 @@ class Bridge:
         bus = self._bus
         if bus.fault is not None:
             return bus.fault
-        if bus.heard is None or bus.silent:
+        if bus.peer is None or bus.silent:
             return f"node {self._node} is silent on the bus"
-        if bus.heard.fingerprint != self._fingerprint:
+        if bus.peer.fingerprint != self._fingerprint:
             return f"node {self._node} has another wire spec, period or lockstep setting than the bridge"
         return None
 

@@ -66,14 +66,14 @@ class CanFront(Front):
     def serve(self) -> None:
         """Be there from now on."""
         log.info("node %d waits on %s:%s", self._settings.node, self._settings.interface, self._settings.channel)
-        self.tell()
+        self.publish_status()
 
     def take_inbox(self) -> None:
         """Follow the controller's side: a session that begins, ends, or whose other end is gone."""
         bus, endpoint = self._bus, self._endpoint
         if bus.fault is not None:
             self._mend(bus.fault)
-        heard = bus.heard
+        heard = bus.peer
         gone = heard is None or bus.silent
         if gone or heard is None or heard.state is not PlantState.GRANTED:
             if endpoint.session is not None:
@@ -102,20 +102,20 @@ class CanFront(Front):
         self._endpoint.operations.clear()  # the bridge writes the trace
         if self._endpoint.state is not self._told:
             self._told = self._endpoint.state
-            self.tell()
+            self.publish_status()
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Tell what happened. The trace is written at the bridge."""
         del measurement, arrival, sent_ns
         self.follow_session()
-        self.tell_when_due()
+        self.publish_when_due()
 
-    def tell_when_due(self) -> None:
+    def publish_when_due(self) -> None:
         """Beat, ten times a second."""
         if time.monotonic() >= self._beat_due:
-            self.tell()
+            self.publish_status()
 
-    def tell(self) -> None:
+    def publish_status(self) -> None:
         """Beat."""
         self._beat_due = time.monotonic() + HEARTBEAT_S
         self._bus.beat(Heartbeat(self._endpoint.state, number_of(self._endpoint.trip), self._fingerprint))

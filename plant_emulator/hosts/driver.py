@@ -120,7 +120,7 @@ class Driver:
             self._front.take_inbox()
             if self._front.link is None or not self._may_step():
                 time.sleep(IDLE_WAIT_S if self._front.link is None else 0)
-                self._front.tell_when_due()
+                self._front.publish_when_due()
                 continue
             echo = self._tick(arrival, self.endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
@@ -168,7 +168,7 @@ class Driver:
             if time.monotonic() > deadline:
                 self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
             self._front.follow_session()
-            self._front.tell_when_due()
+            self._front.publish_when_due()
         return None
 
     # ── where somebody may stand in between ──

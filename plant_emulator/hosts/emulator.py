@@ -14,7 +14,7 @@ from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.faults.streams import FaultyStream
 from aeroloop.plant_emulator.hosts.driver import Driver
-from aeroloop.plant_emulator.hosts.presence import Presence
+from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
@@ -122,7 +122,7 @@ class EmulatorOnZenoh(Emulator):
         """Run until the role is told to stop; then 0 V and a last status."""
         self._role.serve("inject", Inject, lambda inject: self._inject(inject.fault))
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        super().run(front or Presence(self._role, self._loop, self.endpoint))
+        super().run(front or ZenohFront(self._role, self._loop, self.endpoint))
 
     def reconfigure(self, settings: PlantSettings) -> None:
         """Take over limits, watchdog, and how often the truth is told."""
@@ -143,7 +143,7 @@ class EmulatorOnZenoh(Emulator):
     def _await_answer(self, echo: int) -> Arrival | None:
         arrival = super()._await_answer(echo)
         if self._steps == 0:
-            self._front.tell()  # whoever asked for the steps waits for this
+            self._front.publish_status()  # whoever asked for the steps waits for this
         return arrival
 
     def _ticks_between_truths(self) -> int:

@@ -125,7 +125,7 @@ class PlantReplay:
             self._wire.command.size,
             self._wire.actuators,
         ):
-            return "the rows are not of the wire that the contract describes"
+            return "the rows are not of the wire that the description describes"
         if header.first_row > self._rows:
             if not self._rows:
                 return "the log lacks the plant's first row, so the plant's state is not known"

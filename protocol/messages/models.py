@@ -65,7 +65,7 @@ class Release(Message):
     session: str
 
 
-class Contract(Message):
+class Description(Message):
     """Who a role is and how it was configured: all that a reader of the log needs to read it."""
 
     protocol: int = Field(description="version of SPEC.md that the role speaks; 1 did not say")

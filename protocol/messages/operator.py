@@ -124,7 +124,7 @@ class Track(Message):
 class Change(Message):
     """What a controller follows from a tick on: told at the start of every session, and whenever it changes.
 
-    With the frames, the changes and the contract, the session can be computed again to the last bit.
+    With the frames, the changes and the description, the session can be computed again to the last bit.
     """
 
     session: str

@@ -25,7 +25,7 @@ class Topic:
         key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
         carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model of messages.py),
             `query` (request and reply), `token` (liveliness, no payload).
-        sender: Which end speaks.
+        sender: SessionKey end speaks.
         rate: How often.
         model: The class in messages.py, or the frame's name.
     """
@@ -51,7 +51,7 @@ TOPICS: Final = {
         Topic("track", "track", "query", "operator", "when needed", "Track"),
         Topic("inject", "inject", "query", "operator", "when needed", "Inject"),
         Topic("advance", "advance", "query", "operator", "when needed", "Advance"),
-        Topic("contract", "contract/{role}", "json", "every role", "at start and on change", "Contract"),
+        Topic("description", "description/{role}", "json", "every role", "at start and on change", "Description"),
         Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", "Measurement"),
         Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),
         Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", "Telemetry"),

@@ -158,7 +158,7 @@ class Header(NamedTuple):
     """What a batch says of all its rows.
 
     Attributes:
-        end: Which end.
+        end: SessionKey end.
         final: Whether the session's rows end with it.
         actuators: Number of motors.
         measurement_bytes: Size of a measurement frame.
@@ -303,7 +303,7 @@ class TraceWriter:
     """Gathers one end's rows.
 
     Args:
-        end: Which end.
+        end: SessionKey end.
         wire: Sizes of the frames.
         run: A random number of this process, 64 bits.
         every_ns: A batch is due this long after its first row [ns].

@@ -1,4 +1,4 @@
-"""What a process runs on and is made of, for its contract: a log without it cannot be judged a year later."""
+"""What a process runs on and is made of, for its description: a log without it cannot be judged a year later."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Event, EventKind, Status
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
 from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.throttle import Throttle
@@ -60,7 +60,7 @@ class Role:
         role: `plant`, `controller` or `recorder`.
         vehicle: Whose topics it speaks on.
         network: Where to meet the others.
-        config: Its effective configuration, for the contract.
+        config: Its effective configuration, for the description.
         name: Name of its liveliness token; the role's name if None.
 
     Raises:
@@ -81,8 +81,8 @@ class Role:
         self._throttle = Throttle()
         self._started = time.monotonic()
         self.configured(config)
-        key = topics.key("contract", vehicle, role=role)
-        self.answer(key, lambda query: query.reply(key, self._contract))
+        key = topics.key("description", vehicle, role=role)
+        self.answer(key, lambda query: query.reply(key, self._description))
         status = topics.key("status", vehicle, role=role)
         self.answer(status, lambda query: query.reply(status, self._status) if self._status else None)
 
@@ -124,7 +124,7 @@ class Role:
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
 
     def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
-        """Publish the role's contract with this configuration, and what is promised of it, and answer queries with it.
+        """Publish the role's description: its configuration, and the certificate if there is one.
 
         Args:
             config: The effective configuration.
@@ -134,7 +134,7 @@ class Role:
         if "wire" in config and "loop" in config:
             period_ns = LoopSettings.model_validate(config["loop"]).period_ns
             freshness_s = WireSpec.model_validate(config["wire"]).freshness_ns(period_ns) * 1e-9
-        self._contract = Contract(
+        self._description = Description(
             protocol=PROTOCOL_VERSION,
             role=self.role,
             vehicle=self.vehicle,
@@ -145,7 +145,7 @@ class Role:
             freshness_s=freshness_s,
             certificate=certificate,
         ).encode()
-        self.publish_bytes("contract", self._contract)
+        self.publish_bytes("description", self._description)
 
     @property
     def uptime_s(self) -> float:

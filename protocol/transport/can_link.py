@@ -149,12 +149,12 @@ class CanLink(Link):
     Args:
         settings: The bus.
         wire: Sizes of the frames.
-        end: Which end this is.
+        end: SessionKey end this is.
         changed: Notified when a frame comes; see Mailbox.
         lockstep: Whether an empty frame may stand for one that says nothing new.
 
     Attributes:
-        heard: The other end's last heartbeat, or None.
+        peer: The other end's last heartbeat, or None.
         fault: Why the bus cannot be used now, or None; `reopen` may mend it.
         errors: Error frames, failed sends and receives so far.
         refused: Frames of a wrong length so far.
@@ -185,8 +185,8 @@ class CanLink(Link):
         self._mailbox = Mailbox(changed)
         self._unsent = 0
         self._open = False
-        self.heard: Heartbeat | None = None
-        self.heard_ns = 0  # when anything of the other end came last
+        self.peer: Heartbeat | None = None
+        self.peer_ns = 0  # when anything of the other end came last
         self.fault: str | None = None
         self.errors = self.refused = 0
         self._connect()
@@ -214,7 +214,7 @@ class CanLink(Link):
 
     def silent_s(self) -> float:
         """How long nothing has come from the other end [s]; infinite if nothing ever has."""
-        return (time.monotonic_ns() - self.heard_ns) * 1e-9 if self.heard_ns else float("inf")
+        return (time.monotonic_ns() - self.peer_ns) * 1e-9 if self.peer_ns else float("inf")
 
     @property
     def silent(self) -> bool:
@@ -299,25 +299,25 @@ class CanLink(Link):
                     self._fail("the controller is bus-off")
                     return
             elif not message.is_extended_id and not message.is_remote_frame:
-                self._hear(message.arbitration_id, bytes(message.data))
+                self._accept(message.arbitration_id, bytes(message.data))
 
-    def _hear(self, identifier: int, data: bytes) -> None:
+    def _accept(self, identifier: int, data: bytes) -> None:
         now = time.monotonic_ns()
         if identifier == self._receive_id:
             size = self._receives.size
             if data == SILENCE and self._may_be_silent:
-                self.heard_ns = now
+                self.peer_ns = now
                 self._mailbox.put(data)
                 return
             if len(data) < size or any(data[size:]) or (len(data) != size and size <= CLASSIC_BYTES):
                 self.refused += 1
                 return
-            self.heard_ns = now
+            self.peer_ns = now
             self._mailbox.put(data[:size])
         elif identifier == self._heard_id:
             heartbeat = Heartbeat.unpack(data, now)
             if heartbeat is None:
                 self.refused += 1
                 return
-            self.heard_ns = now
-            self.heard = heartbeat
+            self.peer_ns = now
+            self.peer = heartbeat

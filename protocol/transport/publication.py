@@ -105,7 +105,7 @@ class Missed(NamedTuple):
     missing: int
 
 
-class Join:
+class CacheQuery:
     """Queries the cache of a new publisher for what it published before the first message that was received.
 
     A message that is published while a link is being set up can be received before Zenoh's subscriber learns that
@@ -178,7 +178,7 @@ class RecoveringSubscriber:
         self._misses = self._subscriber.sample_miss_listener(RingChannel(1024))
         self._session = session
         self._known: set[_Publisher] = set()
-        self._joins: dict[_Publisher, Join] = {}
+        self._joins: dict[_Publisher, CacheQuery] = {}
         self._ready: deque[Delivery] = deque()  # no longer held back, and not yet taken
 
     @property
@@ -205,7 +205,7 @@ class RecoveringSubscriber:
                 yield received
             else:
                 self._known.add(publisher)
-                self._joins[publisher] = Join(self._session, received)
+                self._joins[publisher] = CacheQuery(self._session, received)
         for publisher, join in list(self._joins.items()):
             if join.finished() or held:
                 del self._joins[publisher]

@@ -126,7 +126,7 @@ def run_role(
         from aeroloop.service.daemon.claim import controller_name
 
         name = controller_name() if kind == "controller" else None
-        with Role(kind, settings.vehicle, settings.network, settings.contract(), name) as role:
+        with Role(kind, settings.vehicle, settings.network, settings.description(), name) as role:
             role.stop_on_signals()
             run(role)
 

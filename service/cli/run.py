@@ -109,7 +109,7 @@ def controller(
     settings, load = reloadable(config, [*(overrides or []), *options])
 
     def run(role: Role) -> None:
-        from aeroloop.service.config import from_contract
+        from aeroloop.service.config import from_description
         from aeroloop.service.daemon.daemon import Daemon
         from aeroloop.service.daemon.reload import reload_on_hangup
 
@@ -118,13 +118,13 @@ def controller(
         def promise(now: Settings) -> dict[str, Any] | None:
             return daemon.promise(now.law, now.reference, now.controller)
 
-        role.configured(settings.contract(), promise(settings))
+        role.configured(settings.description(), promise(settings))
         reload_on_hangup(
             role,
             settings,
             load,
             lambda new: daemon.reconfigure(new.law, new.reference, new.controller),
-            lambda effective: promise(from_contract(effective)),
+            lambda effective: promise(from_description(effective)),
         )
         daemon.run()
 

@@ -57,7 +57,7 @@ def layout(
 @group.command()
 def examples(
     name: Annotated[
-        str | None, typer.Argument(help="Which one; all are listed if left out.", show_default=False)
+        str | None, typer.Argument(help="SessionKey one; all are listed if left out.", show_default=False)
     ] = None,
 ) -> None:
     """List the example configurations, or print one of them."""

@@ -25,7 +25,7 @@ from aeroloop.service.control.reference import Motion
 Codes = tuple[float, ...]
 
 
-class ControllerState(BaseModel):
+class ControllerSnapshot(BaseModel):
     """All that goes from tick to tick, besides reference and gains. As JSON it keeps every bit of its floats.
 
     Attributes:
@@ -112,7 +112,7 @@ class Controller:
         self._read, self._write = wire.measurement.unpack, wire.command.pack
         self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
         self._rate_level: Callable[[float], float] = wire.rate.quantizer().level
-        self.restore(ControllerState(damping_estimate=law.damping_estimate))
+        self.restore(ControllerSnapshot(damping_estimate=law.damping_estimate))
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Answer a measurement.
@@ -201,11 +201,11 @@ class Controller:
         self.motion.change(change, self.period)
 
     @property
-    def state(self) -> ControllerState:
+    def state(self) -> ControllerSnapshot:
         """All that the next tick goes by, besides reference and gains."""
         said, at = self._sender.memory
         held, encoded = self._held, self._voltage_codes
-        return ControllerState(
+        return ControllerSnapshot(
             attitude=self.attitude,
             sign=self.sign,  # type: ignore[arg-type]  # one of the three
             damping_estimate=self.damping_estimate,
@@ -215,7 +215,7 @@ class Controller:
             sent_tick=at,
         )
 
-    def restore(self, state: ControllerState) -> None:
+    def restore(self, state: ControllerSnapshot) -> None:
         """Go on, bit for bit, as the controller that had this state, given the same reference and gains."""
         self._last[:] = memoryview(array("d", state.attitude))
         self._sign[0] = state.sign

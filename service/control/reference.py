@@ -133,7 +133,7 @@ class Plan:
         return Plan(*(np.concatenate([getattr(p, name) for p in (self, later)]) for name in self.__annotations__))
 
     def piece(self, t: float) -> int:
-        """Which piece time t [s] lies in."""
+        """SessionKey piece time t [s] lies in."""
         return max(0, int(np.searchsorted(self.starts, t, side="right")) - 1)
 
     def at(self, tau: Floats) -> Angles:

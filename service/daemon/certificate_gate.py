@@ -64,7 +64,7 @@ class Verdict(NamedTuple):
         return cls(certificate, text, f"; what would do: {', or '.join(ways) or 'no bits and no gains'}")
 
 
-class Assurance:
+class CertificateGate:
     """What the theorem promises of one controller.
 
     Args:
@@ -124,7 +124,7 @@ class Assurance:
             raise UncertifiedError(f"controller.require_certificate is set, and then {verdict.text}{verdict.helps}")
 
     def promise(self, gains: Gains, reference: Reference) -> dict[str, Any] | None:
-        """The certificate as a contract carries it; None of a stream."""
+        """The certificate as a description carries it; None of a stream."""
         certificate = self.weigh(gains, reference).certificate
         return None if certificate is None else certificate.model_dump(mode="json")
 
@@ -143,7 +143,7 @@ class Assurance:
         self._now = gains, reference
         self._verdict = self._known(gains, reference)
         if self._verdict is not None:
-            self.tell()
+            self.publish()
             return
 
         def weigh() -> None:
@@ -152,7 +152,7 @@ class Assurance:
 
         threading.Thread(target=weigh, name="weigh", daemon=True).start()
 
-    def tell(self) -> None:
+    def publish(self) -> None:
         """Tell the verdict, if it is not what was told last."""
         if self._verdict is None:
             return
@@ -165,7 +165,7 @@ class Assurance:
     def _stand_by(self, gains: Gains, reference: Reference, verdict: Verdict) -> None:
         if self._now == (gains, reference):
             self._verdict = verdict
-            self.tell()
+            self.publish()
 
     def _known(self, gains: Gains, reference: Reference) -> Verdict | None:
         for weighed in tuple(self._weighed):

@@ -29,7 +29,7 @@ class SessionLostError(AeroloopError):
     """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
 
 
-class Claimant:
+class ClaimClient:
     """Asks for one vehicle.
 
     Args:

@@ -30,9 +30,9 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
-from aeroloop.service.daemon.certificate_gate import Assurance, gains_of
-from aeroloop.service.daemon.claim import Claimant, SessionLostError
-from aeroloop.service.daemon.operator_changes import Live
+from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
+from aeroloop.service.daemon.claim import ClaimClient, SessionLostError
+from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.daemon.telemetry import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick, TickSource
 from aeroloop.service.settings import ControllerSettings
@@ -79,10 +79,12 @@ class Daemon:
         self._settings = settings
         self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
-        self._claimant = Claimant(role, loop, wire, auto_arm=settings.auto_arm)
-        self._assurance = Assurance(role, wire, law, reference, settings)
+        self._claimant = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
+        self._assurance = CertificateGate(role, wire, law, reference, settings)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
-        self._live = Live(role, law, reference, settings, self._trace, self._assurance, rolls=wire.actuators == 3)
+        self._live = OperatorChanges(
+            role, law, reference, settings, self._trace, self._assurance, rolls=wire.actuators == 3
+        )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
         self._recorders = 0
@@ -243,7 +245,7 @@ class Daemon:
         recorded = self._recorders > 0 or not self._settings.require_recorder
         blocks = self._assurance.blocks
         if recorded or blocks:
-            self._assurance.tell()
+            self._assurance.publish()
         return recorded and not blocks
 
     def _claim(self) -> ZenohLink | None:
@@ -322,7 +324,7 @@ class Daemon:
         return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
 
     def promise(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> dict[str, Any] | None:
-        """What the theorem promises of a configuration, for the contract; in any thread, before `reconfigure`.
+        """What the theorem promises of a configuration, for the description; in any thread, before `reconfigure`.
 
         Raises:
             UncertifiedError: It must hold, would not, and a session runs: no vehicle is dropped for a configuration.

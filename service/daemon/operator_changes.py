@@ -23,7 +23,7 @@ from aeroloop.protocol.wire.attitude import Vector, distance, to_euler
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import FollowError, Limits, Plan
-from aeroloop.service.daemon.certificate_gate import Assurance, gains_of
+from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
 from aeroloop.service.settings import ControllerSettings
 
 START_S: Final = 1.0
@@ -44,7 +44,7 @@ def _described(reference: Reference) -> str:
             return f"follows a {reference.kind}, reached"
 
 
-class Live:
+class OperatorChanges:
     """Gains and reference of one controller, and how they change.
 
     Args:
@@ -67,7 +67,7 @@ class Live:
         reference: Reference,
         settings: ControllerSettings,
         trace: TraceWriter,
-        assurance: Assurance | None = None,
+        assurance: CertificateGate | None = None,
         *,
         rolls: bool,
     ) -> None:

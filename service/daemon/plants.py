@@ -36,9 +36,9 @@ def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> N
         reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
         emulator.run()
         return
-    from aeroloop.plant_emulator.hosts.presence import Presence
     from aeroloop.plant_emulator.hosts.quanser.board import BoardDriver
+    from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
 
     driver = BoardDriver(loop, wire, plant, role.stop)
     reload_on_hangup(role, settings, load, lambda new: driver.reconfigure(new.plant))
-    driver.run(Presence(role, loop, driver.endpoint))
+    driver.run(ZenohFront(role, loop, driver.endpoint))

@@ -51,24 +51,24 @@ def reload_on_hangup(
         settings: Its configuration so far.
         load: Reads it again; raises ConfigError.
         take_over: Given the new configuration between two ticks, takes what is in `LIVE`.
-        promise: What the theorem promises of an effective configuration, for the contract; raises an AeroloopError
+        promise: What the theorem promises of an effective configuration, for the description; raises an AeroloopError
             where it must hold and does not, and nothing changes.
     """
     current = settings
-    effective = settings.contract()
+    effective = settings.description()
 
     def reload() -> Action:
         nonlocal current, effective
         before, now = current, load()
         lines = differences(before, now, role.role)
-        contract = _with_what_is_live(effective, now.contract(), role.role)
-        promised = promise(contract)
-        current, effective = now, contract
+        description = _with_what_is_live(effective, now.description(), role.role)
+        promised = promise(description)
+        current, effective = now, description
 
         def take() -> None:
             take_over(now)
             # What needs a restart is not in effect, and a log must not say so.
-            role.configured(contract, promised)
+            role.configured(description, promised)
             role.event("changed", f"configuration read again: {'; '.join(lines) or 'nothing has changed'}")
 
         return take
@@ -87,7 +87,7 @@ def _with_what_is_live(effective: dict[str, Any], after: dict[str, Any], role: s
 
 def differences(before: Settings, after: Settings, role: str) -> list[str]:
     """What has changed for a role, one line a key: from what, to what, and whether it needs a restart."""
-    old, new = (_flat(settings.contract(), _SECTIONS[role]) for settings in (before, after))
+    old, new = (_flat(settings.description(), _SECTIONS[role]) for settings in (before, after))
     lines = []
     for key in sorted(old.keys() | new.keys()):
         if old.get(key) != new.get(key):

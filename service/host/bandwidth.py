@@ -23,7 +23,7 @@ class PayloadRate:
         self._before: Status | None = None
         self._frames_per_s: tuple[float, float] | None = None  # measurements and commands
 
-    def hear(self, status: Status) -> None:
+    def receive(self, status: Status) -> None:
         """Take in a status of the controller."""
         self._rate_hz = status.rate_hz
         before, passed_s = self._before, 0.0

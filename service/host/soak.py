@@ -18,7 +18,13 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import Settings
 from aeroloop.service.recording.rolling import parts
-from aeroloop.service.testing.process_group import Bench, BenchError, RoleName, free_rendezvous, private_bus
+from aeroloop.service.testing.process_group import (
+    ProcessGroup,
+    ProcessGroupError,
+    RoleName,
+    free_rendezvous,
+    private_bus,
+)
 
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 WARM_UP: Final = 0.1
@@ -76,10 +82,10 @@ def run_soak(
         progress: Called once a sample with the seconds reached and the sample.
 
     Raises:
-        BenchError: A process did not start, or failed, or the log exists.
+        ProcessGroupError: A process did not start, or failed, or the log exists.
     """
     if parts(log):
-        raise BenchError(f"{log} exists, and a log is never written over; name another with --log PATH")
+        raise ProcessGroupError(f"{log} exists, and a log is never written over; name another with --log PATH")
     settings = settings.model_copy(
         update={
             "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
@@ -91,7 +97,7 @@ def run_soak(
     statuses: dict[str, Status] = {}
     sessions: list[str] = []
 
-    def hear(sample: zenoh.Sample) -> None:
+    def receive(sample: zenoh.Sample) -> None:
         status = Status.model_validate_json(sample.payload.to_bytes())
         statuses[status.role] = status
         if status.role == "plant" and status.session and status.session not in sessions:
@@ -99,18 +105,18 @@ def run_soak(
 
     samples: list[Minute] = []
     total_s, every_s = minutes * 60, min(60.0, max(2.0, minutes * 60 / 10))
-    with Bench(settings) as bench:
-        bench.zenoh.declare_subscriber(topics.key("status", settings.vehicle), hear)
-        bench.start("recorder")
-        bench.start_plant()
-        bench.start("controller")
-        bench.await_role("plant")
-        bench.await_role("recorder")
+    with ProcessGroup(settings) as processes:
+        processes.zenoh.declare_subscriber(topics.key("status", settings.vehicle), receive)
+        processes.start("recorder")
+        processes.start_plant()
+        processes.start("controller")
+        processes.await_role("plant")
+        processes.await_role("recorder")
         start = time.monotonic()
         while (reached := time.monotonic() - start) < total_s:
             time.sleep(min(every_s, total_s - reached))
-            bench.check()
-            sample = _sample(bench, statuses, time.monotonic() - start)
+            processes.check()
+            sample = _sample(processes, statuses, time.monotonic() - start)
             samples.append(sample)
             if progress is not None:
                 progress(sample.at_s, sample)
@@ -123,7 +129,7 @@ def run_soak(
     )
 
 
-def _sample(bench: Bench, statuses: dict[str, Status], at_s: float) -> Minute:
+def _sample(processes: ProcessGroup, statuses: dict[str, Status], at_s: float) -> Minute:
     plant = statuses.get("plant")
     return Minute(
         at_s=round(at_s, 1),
@@ -131,7 +137,7 @@ def _sample(bench: Bench, statuses: dict[str, Status], at_s: float) -> Minute:
         unanswered=plant.sent - plant.received if plant else 0,
         latency_us=plant.recent_latency_us if plant else None,
         wake_us=plant.timing.recent_wake if plant and plant.timing else None,
-        usage={role: _usage(bench.pid(role)) for role in ROLES},
+        usage={role: _usage(processes.pid(role)) for role in ROLES},
     )
 
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from aeroloop.protocol.wire.transmit import Policy
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
-from aeroloop.service.lab.burden_grid import SENSORS, BurdenError, Cell, cell_settings
+from aeroloop.service.lab.burden_grid import SENSORS, BurdenCell, BurdenError, cell_settings
 from aeroloop.service.lab.experiment import LoopEndedError, run_experiment
 from aeroloop.service.lab.traffic import Traffic, codes_of, sent_ticks, traffic
 from aeroloop.service.lab.workers import Workers
@@ -121,7 +121,7 @@ class Observation(NamedTuple):
 
 def measure_burden(
     settings: Settings,
-    cells: Sequence[Cell],
+    cells: Sequence[BurdenCell],
     duration_s: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Burden:
@@ -137,7 +137,7 @@ def measure_burden(
         BurdenError: Float64 itself does not keep the loop running, or makes no error at all; or a cell does not fit the
             configuration.
     """
-    jobs = [(cell_settings(settings, cell).contract(), duration_s, cell.counted) for cell in cells]
+    jobs = [(cell_settings(settings, cell).description(), duration_s, cell.counted) for cell in cells]
     told = progress or (lambda _done, _total: None)
     told(0, len(jobs))
     with Workers() as workers:
@@ -187,7 +187,7 @@ def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observa
 
 
 def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
-    """Which of these pairs no other is as good as in both, and better in one; less is better."""
+    """SessionKey of these pairs no other is as good as in both, and better in one; less is better."""
     pairs = list(costs)
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
 
@@ -196,7 +196,7 @@ def _heartbeat(settings: Settings) -> int:
     return settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns, settings.wire.measurement.counters)
 
 
-def _points(cell: Cell, found: Observation) -> list[Point]:
+def _points(cell: BurdenCell, found: Observation) -> list[Point]:
     def point(policy: Policy, **figures: Any) -> Point:
         return Point(
             bits_out=cell.bits_out,

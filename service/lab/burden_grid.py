@@ -33,7 +33,7 @@ class BurdenError(AeroloopError):
     """The grid cannot be run; one line that says why."""
 
 
-class Sensors(NamedTuple):
+class SensorChoice(NamedTuple):
     """What measures.
 
     Attributes:
@@ -46,19 +46,19 @@ class Sensors(NamedTuple):
 
 
 SENSORS: Final = {
-    "perfect": Sensors(
+    "perfect": SensorChoice(
         "the true attitude and rate, so that only quantizers come between the body and the law",
         {"attitude": "perfect", "rate": "perfect"},
     ),
-    "encoders": Sensors(
+    "encoders": SensorChoice(
         "encoders and their filtered derivative, as on the paper's bench",
         {"attitude": "encoders", "rate": "derivative"},
     ),
-    "gyro": Sensors(
+    "gyro": SensorChoice(
         "encoders and a gyro with 2 mrad/s of noise, as MEMS gyros have at rest; a quarter of the 8-bit step",
         {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.002},
     ),
-    "shaken-gyro": Sensors(
+    "shaken-gyro": SensorChoice(
         "encoders and a gyro with 20 mrad/s of noise, as of one that the rotors shake; 2.5 steps of 8 bits",
         {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02},
     ),
@@ -66,7 +66,7 @@ SENSORS: Final = {
 """Whatever else `plant.sensors` says stays as configured."""
 
 
-class Cell(NamedTuple):
+class BurdenCell(NamedTuple):
     """One experiment. Bits of None are float64; the quantizer is None where nothing is quantized."""
 
     bits_out: int | None
@@ -78,7 +78,7 @@ class Cell(NamedTuple):
 
 def grid(
     settings: Settings, bits: Sequence[str] = (), quantizers: Sequence[str] = (), sensors: Sequence[str] = ()
-) -> list[Cell]:
+) -> list[BurdenCell]:
     """The cells of a grid; float64 is always among them. What is left empty is all there is.
 
     Args:
@@ -97,7 +97,7 @@ def grid(
     levels = [_one_of("--sensors", name, tuple(SENSORS)) for name in dict.fromkeys(sensors)] or list(SENSORS)
     counted_with = "encoders" if "encoders" in levels else levels[0]
     cells = [
-        Cell(*pair, kind, level, pair in COUNTED and kind in (None, kinds[0]) and level == counted_with)
+        BurdenCell(*pair, kind, level, pair in COUNTED and kind in (None, kinds[0]) and level == counted_with)
         for level in levels
         for pair, of_kinds in (*((pair, kinds) for pair in pairs), (FLOAT64, [None]))
         for kind in of_kinds
@@ -107,7 +107,7 @@ def grid(
     return cells
 
 
-def cell_settings(settings: Settings, cell: Cell) -> Settings:
+def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
     """The configuration of a cell, which sends at every tick.
 
     Raises:

@@ -52,4 +52,4 @@ class Pool(Workers):
 
     def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:
         """Results of cells in their order; `progress` hears how many are done."""
-        return self.each(run_cell, ((settings.contract(), cell) for settings, cell in jobs), progress)
+        return self.each(run_cell, ((settings.description(), cell) for settings, cell in jobs), progress)

@@ -20,7 +20,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.host.bandwidth import PayloadRate
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.process_group import Bench, BenchError, free_rendezvous, private_bus
+from aeroloop.service.testing.process_group import ProcessGroup, ProcessGroupError, free_rendezvous, private_bus
 
 REFRESH_S = 0.1
 
@@ -36,7 +36,7 @@ class Progress:
     statuses: dict[str, Status] = field(default_factory=dict)
     payload: PayloadRate = field(default_factory=PayloadRate)
 
-    def hear(self, sample: zenoh.Sample) -> None:
+    def receive(self, sample: zenoh.Sample) -> None:
         """Take in a telemetry or status message."""
         address = topics.read_key(str(sample.key_expr))
         if address is None:
@@ -50,7 +50,7 @@ class Progress:
         elif address.topic.name == "status" and address.role is not None:
             self.statuses[address.role] = status = Status.model_validate_json(payload)
             if address.role == "controller":
-                self.payload.hear(status)
+                self.payload.receive(status)
 
     @property
     def rate_hz(self) -> float:
@@ -83,12 +83,12 @@ def run_demo(
         The figures, and whether it ran to the end (False after ^C).
 
     Raises:
-        BenchError: A process did not start, or failed, or the log exists.
+        ProcessGroupError: A process did not start, or failed, or the log exists.
         ReviewError: The log cannot be judged.
     """
     path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
     if parts(path):
-        raise BenchError(f"{path} exists, and a log is never written over; name another with --log PATH")
+        raise ProcessGroupError(f"{path} exists, and a log is never written over; name another with --log PATH")
     settings = settings.model_copy(
         update={
             "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
@@ -101,19 +101,19 @@ def run_demo(
     )
     progress = Progress(settings)
     interrupted = threading.Event()
-    with Bench(settings) as bench, _on_interrupt(interrupted):
+    with ProcessGroup(settings) as processes, _on_interrupt(interrupted):
         for topic in ("telemetry", "status"):
-            bench.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.hear)
-        bench.start("recorder")
-        bench.start_plant()
-        bench.await_role("recorder")
-        bench.await_role("plant")
-        bench.start("controller")
-        while bench.running("controller") and not interrupted.wait(REFRESH_S):
-            bench.check()
+            processes.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.receive)
+        processes.start("recorder")
+        processes.start_plant()
+        processes.await_role("recorder")
+        processes.await_role("plant")
+        processes.start("controller")
+        while processes.running("controller") and not interrupted.wait(REFRESH_S):
+            processes.check()
             if show is not None:
                 show(progress)
-        bench.check()
+        processes.check()
     return review(*parts(path)), not interrupted.is_set()
 
 

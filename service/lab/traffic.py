@@ -14,13 +14,13 @@ from pydantic import Field
 
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.transmit import Policy, Sender
-from aeroloop.service.figures import Stream
+from aeroloop.service.figures import StreamFigures
 from aeroloop.service.lab.bus import BITRATE, bus_bits, classic_frames
 
 Codes: TypeAlias = tuple[float, ...]
 
 
-class Traffic(Stream):
+class Traffic(StreamFigures):
     """Traffic of one direction under one policy, over the time that was judged."""
 
     frames_per_s: float

@@ -43,7 +43,7 @@ class LinkBytes(NamedTuple):
     command: int
 
 
-class Relay:
+class CountingRelay:
     """Passes one TCP connection on, and counts. A context; the connection may come at any time within it.
 
     Args:
@@ -120,7 +120,7 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
     port = _free_port()
     here = {"rendezvous": "", "gossip": False}  # two need neither, and they would be counted
     plant_side = network.model_copy(update={**here, "listen": [f"tcp/127.0.0.1:{port}"], "connect": []})
-    with Relay(port) as relay, join(plant_side) as plant:
+    with CountingRelay(port) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})
         with join(other_side) as controller:
             to_controller, to_plant = (Mailbox(depth=max(1, len(frames))) for frames in (measurements, commands))

@@ -19,7 +19,7 @@ from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.protocol.wire.transmit import Sender
-from aeroloop.service.control.controller import ControllerState, resume
+from aeroloop.service.control.controller import ControllerSnapshot, resume
 from aeroloop.service.control.law import LawSettings, law_of_many
 from aeroloop.service.control.reference import Motion, reference_function
 from aeroloop.service.logs.codes import encoded_by, levels
@@ -98,16 +98,16 @@ class BatchController:
         counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), counters)
         self._sender = Sender(wire.transmit.command, heartbeat, counters)
-        self.restore(ControllerState(damping_estimate=law.damping_estimate))
+        self.restore(ControllerSnapshot(damping_estimate=law.damping_estimate))
 
     @property
-    def state(self) -> ControllerState:
+    def state(self) -> ControllerSnapshot:
         """After the last measurement computed and the last command encoded; `held` is of the last row."""
         said, at = self._sender.memory
         codes = None if said is None else tuple(map(float, said))
         return self._state.model_copy(update={"sent_codes": codes, "sent_tick": at})
 
-    def restore(self, state: ControllerState) -> None:
+    def restore(self, state: ControllerSnapshot) -> None:
         """Go on as the controller that had this state, given the same reference and gains."""
         self._state = state
         resume(self._voltage, state.voltage_codes)

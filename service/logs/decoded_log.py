@@ -40,8 +40,8 @@ def write_decoded(files: LogFiles, out: Path, progress: Callable[[float], None])
         OSError: It cannot be read, or not be written.
     """
     decoder = Decoder(rate_hz=None)
-    for contract in files.contracts.values():
-        decoder.configure(contract)
+    for description in files.descriptions.values():
+        decoder.configure(description)
     damages: dict[Path, list[Damage]] = {}
     sizes = [path.stat().st_size for path in files.paths]
     with out.open("wb") as file:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import Received
 from aeroloop.service.config import Settings
-from aeroloop.service.control.controller import Codes, ControllerState
+from aeroloop.service.control.controller import Codes, ControllerSnapshot
 from aeroloop.service.logs.batch import BatchController, Commands, Computed
 from aeroloop.service.logs.codes import codes_in
 from aeroloop.service.logs.runs import Block
@@ -63,7 +63,7 @@ class Evaluator:
     def used(self, block: Block) -> Used:
         """What the controller used at the ticks of the next block; `compute` is to be called with it next."""
         if block.state is not None and (self._resumes or not self._begun):
-            state = ControllerState.model_validate(block.state)
+            state = ControllerSnapshot.model_validate(block.state)
             self._controller.restore(state)
             self._held = state.held
         self._changes += [
@@ -112,7 +112,7 @@ def held_codes(framed: npt.NDArray[np.bool_], codes: Array, before: Codes | None
     """Codes that hold at each row: its frame's, or those of the last frame before it.
 
     Args:
-        framed: Which rows have a frame. Shape (n,).
+        framed: SessionKey rows have a frame. Shape (n,).
         codes: Of their frames. Shape (frames, columns).
         before: Those that hold before the first row; None for none.
 

@@ -21,10 +21,10 @@ from aeroloop.protocol.runtime.host_facts import versions
 from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
 from aeroloop.service.logs.runs import Block, Run, Taker
-from aeroloop.service.logs.table import Rows, Truths, groups
+from aeroloop.service.logs.table import Rows, TruthColumns, groups
 from aeroloop.service.logs.table_files import FILES, ExportError, TableFile
 from aeroloop.service.logs.tick_reader import TickReader
-from aeroloop.service.logs.traces import Integers, Which
+from aeroloop.service.logs.traces import Integers, SessionKey
 
 Format = Literal["parquet", "csv", "mat", "mcap"]
 ALL: Final = "all"
@@ -142,7 +142,7 @@ def _table(paths: Sequence[Path], to: Format, part: Path, session: str | None, p
 class _Writer:
     """Writes one session's ticks into a table."""
 
-    def __init__(self, which: Which, file: TableFile, settings: Settings) -> None:
+    def __init__(self, which: SessionKey, file: TableFile, settings: Settings) -> None:
         self.truths: list[tuple[float, ...]] = []  # tick, attitude, rate, voltages
         self.rows = 0
         self._which = which
@@ -156,14 +156,14 @@ class _Writer:
             self._file.write(Rows(*self._which, judged, self._true_at(judged.k)))
             self.rows += len(judged.k)
 
-    def _true_at(self, k: Integers) -> Truths:
+    def _true_at(self, k: Integers) -> TruthColumns:
         """Of each tick the last truth by then. Shapes (n, columns)."""
         columns = 8 + self._actuators
         known = np.array(self.truths, dtype=np.float64).reshape(-1, columns)
         at = np.searchsorted(known[:, 0], k, side="right")
         self.truths = self.truths[max(0, int(at[-1]) - 1) :]
         true = np.vstack([np.full((1, columns), np.nan), known])[at]
-        return Truths(true[:, 0], true[:, 1:5], true[:, 5:8], true[:, 8:])
+        return TruthColumns(true[:, 0], true[:, 1:5], true[:, 5:8], true[:, 8:])
 
 
 def beside(log: Path, ending: str) -> Path:
@@ -196,15 +196,15 @@ def writing(out: Path) -> Iterator[Path]:
 def facts(files: LogFiles, settings: Settings, sessions: Sequence[str]) -> dict[str, Any]:
     """What a file tells of itself as a whole."""
     return {
-        "config": settings.contract(),
+        "config": settings.description(),
         "sessions": list(sessions),
         "logs": [str(path) for path in files.paths],
-        "recorded_by": {role: contract.versions for (_, role), contract in files.contracts.items()},
+        "recorded_by": {role: description.versions for (_, role), description in files.descriptions.items()},
         "exported_by": versions(),
     }
 
 
-def _chosen(run: Run, session: str | None) -> list[Which]:
+def _chosen(run: Run, session: str | None) -> list[SessionKey]:
     known = [which for which, extent in run.extents.items() if extent.rows["controller"]]
     if session is None:
         return [run.longest]

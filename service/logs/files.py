@@ -13,9 +13,9 @@ from pydantic import ValidationError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.service.config import Settings, from_contract
+from aeroloop.service.config import Settings, from_description
 from aeroloop.service.logs.mcap_file import (
     CHANGE_METADATA,
     CONTRACT_METADATA,
@@ -26,7 +26,7 @@ from aeroloop.service.logs.mcap_file import (
     records,
     skim,
 )
-from aeroloop.service.logs.traces import Which
+from aeroloop.service.logs.traces import SessionKey
 
 METADATA_PREFIX: Final = "aeroloop."
 
@@ -47,8 +47,8 @@ class LogFiles:
 
     Attributes:
         paths: The files, in the order of their first messages.
-        contracts: Who took part, by vehicle and role; the last of each.
-        first_contracts: The first of each.
+        descriptions: Who took part, by vehicle and role; the last of each.
+        first_descriptions: The first of each.
         changes: What controllers followed when a file began, by vehicle and session.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
@@ -58,14 +58,14 @@ class LogFiles:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self.contracts: dict[tuple[str, str], Contract] = {}
-        self.first_contracts: dict[tuple[str, str], Contract] = {}
-        self.changes: dict[Which, list[Change]] = {}
+        self.descriptions: dict[tuple[str, str], Description] = {}
+        self.first_descriptions: dict[tuple[str, str], Description] = {}
+        self.changes: dict[SessionKey, list[Change]] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
-        if not self.contracts:  # one that is damaged may have a copy; where none can be read, it is not damage
+        if not self.descriptions:  # one that is damaged may have a copy; where none can be read, it is not damage
             for path, damages in self.damages.items():
                 for damage in damages:
                     if CONTRACT_METADATA in damage.what:
@@ -80,14 +80,16 @@ class LogFiles:
             ConfigError: It is not of this version.
         """
         for role in ("controller", "plant"):
-            if contract := self.contracts.get((vehicle, role)):
-                return from_contract(contract.config)
-        raise ReviewError(f"{self.name} has no contract of {vehicle}'s controller or plant: its frames cannot be read")
+            if description := self.descriptions.get((vehicle, role)):
+                return from_description(description.config)
+        raise ReviewError(
+            f"{self.name} has no description of {vehicle}'s controller or plant: its frames cannot be read"
+        )
 
     def plant(self, vehicle: str) -> PlantSettings:
         """The plant's own configuration if the logs have it, else what the controller assumed. Raises as `settings`."""
-        contract = self.contracts.get((vehicle, "plant"))
-        return self.settings(vehicle).plant if contract is None else from_contract(contract.config).plant
+        description = self.descriptions.get((vehicle, "plant"))
+        return self.settings(vehicle).plant if description is None else from_description(description.config).plant
 
     @property
     def name(self) -> str:
@@ -124,22 +126,22 @@ class LogFiles:
         return [f"{path}: {damage.what}" for path, found in self.damages.items() for damage in found]
 
     def _prelude(self, path: Path) -> int:
-        """Collect contracts and other metadata.
+        """Collect descriptions and other metadata.
 
         Returns:
             When its first message was recorded [ns].
         """
         first = 0
-        contracts: set[int] = set()
+        descriptions: set[int] = set()
         damages: list[Damage] = []
         try:
-            for record in skim(path, _is_contract) or records(path, damages):
+            for record in skim(path, _is_description) or records(path, damages):
                 if isinstance(record, Message):
                     first = first or record.log_time
-                    if record.channel_id in contracts:
-                        self._add_contract(record.data, path)
-                elif isinstance(record, Channel) and _is_contract(record.topic):
-                    contracts.add(record.id)
+                    if record.channel_id in descriptions:
+                        self._add_description(record.data, path)
+                elif isinstance(record, Channel) and _is_description(record.topic):
+                    descriptions.add(record.id)
                 elif isinstance(record, Metadata):
                     try:
                         self._add_metadata(record, path)
@@ -158,7 +160,7 @@ class LogFiles:
     def _add_metadata(self, record: Metadata, path: Path) -> None:
         text = record.metadata.get("json", "{}")
         if record.name == CONTRACT_METADATA:
-            self._add_contract(text.encode(), path)
+            self._add_description(text.encode(), path)
         elif record.name == CHANGE_METADATA:
             change, address = Change.model_validate_json(text), topics.read_key(record.metadata["key"])
             known = self.changes.setdefault((address.vehicle if address else "", change.session), [])
@@ -168,21 +170,21 @@ class LogFiles:
             said = json.loads(text)
             self.metadata[record.name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
 
-    def _add_contract(self, text: bytes, path: Path) -> None:
+    def _add_description(self, text: bytes, path: Path) -> None:
         said = json.loads(text)
-        old = isinstance(said, dict) and said.keys() <= Contract.model_fields.keys() - {"protocol"}
+        old = isinstance(said, dict) and said.keys() <= Description.model_fields.keys() - {"protocol"}
         if old or said["protocol"] != PROTOCOL_VERSION:
             version = 1 if old else said["protocol"]
             written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
             raise ReviewError(f"{path} is a log of protocol version {version}; read it with {written_by} wrote it")
-        contract = Contract.model_validate(said)
-        self.contracts[contract.vehicle, contract.role] = contract
-        self.first_contracts.setdefault((contract.vehicle, contract.role), contract)
+        description = Description.model_validate(said)
+        self.descriptions[description.vehicle, description.role] = description
+        self.first_descriptions.setdefault((description.vehicle, description.role), description)
 
 
-def _is_contract(key: str) -> bool:
+def _is_description(key: str) -> bool:
     address = topics.read_key(key)
-    return address is not None and address.topic.name == "contract"
+    return address is not None and address.topic.name == "description"
 
 
 def _share_of(progress: Progress | None, before: int, size: int) -> Callable[[int], None] | None:

@@ -29,8 +29,8 @@ from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Metada
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-CONTRACT_METADATA: Final = "aeroloop.contract"
-"""Name of the metadata record with a role's contract, as JSON under `json`, and its key under `key`."""
+CONTRACT_METADATA: Final = "aeroloop.description"
+"""Name of the metadata record with a role's description, as JSON under `json`, and its key under `key`."""
 
 CHANGE_METADATA: Final = "aeroloop.change"
 """Name of a metadata record with what a controller followed when the file began: a Change as JSON, and its key."""

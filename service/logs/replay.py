@@ -18,23 +18,23 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
-from aeroloop.protocol.messages.models import Contract
+from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import ENDS, Batch, End, Sent, read_batch
 from aeroloop.protocol.wire.spec import SignalSpec
-from aeroloop.service.config import Settings, from_contract, load_over
+from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Codes
 from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.codes import codes_in, frames_of, levels
 from aeroloop.service.logs.evaluate import Evaluator, held_codes
 from aeroloop.service.logs.files import Progress, ReviewError
-from aeroloop.service.logs.runs import Block, Join, Run, Taker
-from aeroloop.service.logs.traces import Array, Source, Which
+from aeroloop.service.logs.runs import Block, Run, Taker, TraceJoin
+from aeroloop.service.logs.traces import Array, SessionKey, Source
 
 _NOT_ASKED: Final = "only the other end was replayed"
 
 
-class Difference(BaseModel):
+class TickDifference(BaseModel):
     """The first row that was computed otherwise than it was logged."""
 
     model_config = ConfigDict(frozen=True)
@@ -55,7 +55,7 @@ class SessionReplay(BaseModel):
     first_tick: int | None = Field(description="where the replay began; null without any row")
     ticks: int = Field(description="ticks that were computed again")
     differ: int = Field(description="rows whose command is not the same")
-    first_difference: Difference | None
+    first_difference: TickDifference | None
     rms_v: float | None = Field(description="root mean square of the difference between computed and logged levels [V]")
     max_v: float | None = Field(description="largest difference of a motor [V]")
     u_total_logged: float = Field(description="∫ uᵀu dt of the commands compared [V²·s]")
@@ -97,12 +97,12 @@ class Replayer:
         settings: The configuration that it computes with.
     """
 
-    def __init__(self, which: Which, evaluator: Evaluator, settings: Settings) -> None:
+    def __init__(self, which: SessionKey, evaluator: Evaluator, settings: Settings) -> None:
         self._which = which
         self._evaluator = evaluator
         self._wire, self._period = settings.wire, settings.loop.period
         self._held: Codes | None = None  # codes of the last command sent
-        self._first: Difference | None = None
+        self._first: TickDifference | None = None
         self._first_tick: int | None = None
         self._ticks = self._differ = 0
         self._square = self._largest = self._logged = self._computed = 0.0
@@ -126,7 +126,7 @@ class Replayer:
         differ = (rows["sent_as"] != expected["sent_as"]) | (logged != expected["command"]).any(axis=1)
         if differ.any() and self._first is None:
             i = int(np.argmax(differ))
-            self._first = Difference(
+            self._first = TickDifference(
                 tick=int(rows["tick"][i]),
                 time_s=round(int(rows["tick"][i]) * self._period, 9),
                 logged=_said(rows["sent_as"][i], logged[i]),
@@ -186,22 +186,22 @@ class Plants:
     """
 
     def __init__(self, run: Run) -> None:
-        self._contracts = dict(run.files.first_contracts)
+        self._descriptions = dict(run.files.first_descriptions)
         self._replays: dict[Source, PlantReplay] = {}
         self._reason = "the log has no trace of a plant"
 
     def route(self, address: Address) -> Taker | None:
         """Contracts, since a process is replayed with what it began with."""
-        return self._contract if address.topic.name == "contract" else None
+        return self._description if address.topic.name == "description" else None
 
     def take(self, source: Source, batch: Batch) -> None:
         """The next batch of a plant."""
         if source not in self._replays:
-            contract = self._contracts.get((source.vehicle, "plant"))
-            if contract is None:
-                self._reason = f"the log has no contract of {source.vehicle}'s plant"
+            description = self._descriptions.get((source.vehicle, "plant"))
+            if description is None:
+                self._reason = f"the log has no description of {source.vehicle}'s plant"
                 return
-            settings = from_contract(contract.config)
+            settings = from_description(description.config)
             if (why := why_not(settings.plant)) is not None:
                 self._reason = why
                 return
@@ -214,9 +214,9 @@ class Plants:
         stopped = next((result.stopped for result in results if result.stopped is not None), None)
         return results, stopped if results else self._reason
 
-    def _contract(self, payload: bytes, _: int) -> None:
-        contract = Contract.model_validate_json(payload)
-        self._contracts[contract.vehicle, contract.role] = contract
+    def _description(self, payload: bytes, _: int) -> None:
+        description = Description.model_validate_json(payload)
+        self._descriptions[description.vehicle, description.role] = description
 
 
 def replay(
@@ -232,7 +232,7 @@ def replay(
         overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
             or of the reference stands in for every change that the log has of them. The plant is not replayed then.
         progress: Called now and then with the share that is done, 0…1.
-        ends: Which ends to replay; the plant takes most of the time.
+        ends: SessionKey ends to replay; the plant takes most of the time.
 
     Raises:
         ReviewError: It cannot be read, or has no controller's configuration.
@@ -249,8 +249,8 @@ def replay(
 def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Replay:
     own_gains = any(override.startswith("law.") for override in overrides)
     own_reference = any(override.startswith("reference") for override in overrides)
-    replayers: dict[Which, Replayer] = {}
-    joins: dict[Which, Join] = {}
+    replayers: dict[SessionKey, Replayer] = {}
+    joins: dict[SessionKey, TraceJoin] = {}
     plants = Plants(run)
     for arrived in run.batches(plants.route):
         source = arrived.source

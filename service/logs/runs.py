@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import NEVER, End, Header, Outcome, Received, join_columns
 from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
-from aeroloop.service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, TraceIndex, Which
+from aeroloop.service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, SessionKey, TraceIndex
 
 BLOCK: Final = 4096
 """Ticks of a block, about: numpy is quick with so many, and they stay in the cache."""
@@ -54,7 +54,7 @@ class Block(NamedTuple):
         state: Where rows before this block's are missing, the controller's state before its first row; else None.
     """
 
-    which: Which
+    which: SessionKey
     k: Integers
     controller: Rows
     plant: Rows
@@ -95,13 +95,13 @@ class Run:
             index.add(found.answer, found.data)
         index.finish()
         self._index = index
-        self.extents: dict[Which, Extent] = index.extents
+        self.extents: dict[SessionKey, Extent] = index.extents
         self.missing: list[Missing] = index.missing
-        self.reached: dict[Which, int] = {}
+        self.reached: dict[SessionKey, int] = {}
         self.open_sessions: dict[str, str] = {}
 
     @property
-    def longest(self) -> Which:
+    def longest(self) -> SessionKey:
         """The session with the most ticks. Raises ReviewError if there is none."""
         which = self._index.longest
         if which is None:
@@ -131,14 +131,14 @@ class Run:
 
     def read(
         self,
-        sessions: Collection[Which],
+        sessions: Collection[SessionKey],
         route: Callable[[Address], Taker | None] = lambda _: None,
         block: int = BLOCK,
     ) -> Iterator[Block]:
         """Blocks of some sessions; those of one session in order.
 
         Args:
-            sessions: Which.
+            sessions: SessionKey.
             route: As for `batches`.
             block: Ticks of a block, about.
         """
@@ -151,21 +151,21 @@ class Run:
         for join in joins.values():
             yield from join.blocks(finished=True)
 
-    def join(self, which: Which, block: int = BLOCK, *, alone: bool = False) -> Join:
+    def join(self, which: SessionKey, block: int = BLOCK, *, alone: bool = False) -> TraceJoin:
         """What joins the rows of a session.
 
         Args:
             which: The session.
             block: Ticks of a block, about.
-            alone: Join the controller's rows with none of the plant.
+            alone: TraceJoin the controller's rows with none of the plant.
         """
         extent = self.extents[which]
         begins = extent.first["controller"]
         before = [change for change in self.files.changes.get(which, ()) if change.tick < begins]
         margin = self.files.settings(which[0]).loop.ticks(ANSWER_S)
-        return Join(which, margin, extent.of("controller") if alone else extent, block, before)
+        return TraceJoin(which, margin, extent.of("controller") if alone else extent, block, before)
 
-    def _follow(self, which: Which, arrived: Arrived) -> None:
+    def _follow(self, which: SessionKey, arrived: Arrived) -> None:
         """Keep how far the plant's trace has come; the controller's, where the log has none of the plant."""
         vehicle, session = which
         header = arrived.header
@@ -185,7 +185,7 @@ class _Segment:
     """Rows of one end that wait, with none missing between them.
 
     Args:
-        end: Which end.
+        end: SessionKey end.
         state: The controller's state before the first of them, where rows before that are missing.
     """
 
@@ -222,7 +222,7 @@ class _Segment:
             self.state = None
 
 
-class Join:
+class TraceJoin:
     """Puts the rows of one session's two ends together.
 
     Args:
@@ -233,7 +233,9 @@ class Join:
         changes: What the controller followed before its first row.
     """
 
-    def __init__(self, which: Which, margin: int, extent: Extent, block: int, changes: Sequence[Change] = ()) -> None:
+    def __init__(
+        self, which: SessionKey, margin: int, extent: Extent, block: int, changes: Sequence[Change] = ()
+    ) -> None:
         self._which = which
         self._margin = margin
         self._block = block
@@ -290,7 +292,7 @@ class Join:
 
 
 def _block(
-    which: Which, controller: Rows, plant: Rows, p: int, changes: list[Change], state: dict[str, Any] | None
+    which: SessionKey, controller: Rows, plant: Rows, p: int, changes: list[Change], state: dict[str, Any] | None
 ) -> Block:
     """The block of these rows of the controller and the first p rows of the plant."""
     none = np.empty(0, dtype=np.int64)

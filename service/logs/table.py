@@ -24,7 +24,7 @@ AXES: Final = ("x", "y", "z")
 EULER: Final = ("roll", "pitch", "yaw")
 
 
-class Truths(NamedTuple):
+class TruthColumns(NamedTuple):
     """What was true as measurements were taken, a row each, in order. Shapes (n,), (n, 4), (n, 3), (n, actuators)."""
 
     k: Array
@@ -44,7 +44,7 @@ class Rows(NamedTuple):
     vehicle: str
     session: str
     ticks: Ticks
-    truth: Truths
+    truth: TruthColumns
 
 
 class Column(NamedTuple):

@@ -30,7 +30,7 @@ from aeroloop.protocol.messages.trace import (
     row_dtype,
 )
 
-Which = tuple[str, str]
+SessionKey = tuple[str, str]
 """A vehicle and a session."""
 
 Key = tuple[int, bool, int, int]
@@ -133,7 +133,7 @@ class TraceIndex:
 
     def __init__(self) -> None:
         self.sources: dict[Source, Batches] = {}
-        self.extents: dict[Which, Extent] = {}
+        self.extents: dict[SessionKey, Extent] = {}
         self.missing: list[Missing] = []
         self.malformed = 0
         self._names: dict[str, int] = {"": 0}
@@ -149,8 +149,8 @@ class TraceIndex:
 
     def finish(self) -> None:
         """No more is to come: find sessions, and what is missing of them."""
-        proofs: dict[tuple[Which, End], int] = {}
-        ended: set[tuple[Which, End]] = set()
+        proofs: dict[tuple[SessionKey, End], int] = {}
+        ended: set[tuple[SessionKey, End]] = set()
         names = list(self._names)
         for (vehicle, end, _), batches in self.sources.items():
             batches.finish()
@@ -172,7 +172,7 @@ class TraceIndex:
                 self._find_end(which, end, extent.last[end], proofs.get((which, end), NO_TICK), (which, end) in ended)
 
     @property
-    def longest(self) -> Which | None:
+    def longest(self) -> SessionKey | None:
         """The session with the most ticks of a controller; None if there is none."""
         return max(self.extents, key=lambda which: self.extents[which].ticks, default=None)
 
@@ -194,7 +194,7 @@ class TraceIndex:
             else:
                 self._lacks(source, session[i], ends + 1, None, rows)
 
-    def _find_end(self, which: Which, end: End, last: int, proof: int, ended: bool) -> None:
+    def _find_end(self, which: SessionKey, end: End, last: int, proof: int, ended: bool) -> None:
         """What the other end proves to be missing after the last row, or that the session's end is."""
         known = any((m.vehicle, m.session) == which and m.end == end and m.last_tick is None for m in self.missing)
         if known:

@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import Sent
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.logs.runs import Block, Rows, Taker
-from aeroloop.service.logs.traces import Integers, Which
+from aeroloop.service.logs.traces import Integers, SessionKey
 
 
 class WireCheck:
@@ -27,7 +27,7 @@ class WireCheck:
         reached: The last tick that the traces have come to, by session.
     """
 
-    def __init__(self, which: Which, wire: WireSpec, reached: Mapping[Which, int]) -> None:
+    def __init__(self, which: SessionKey, wire: WireSpec, reached: Mapping[SessionKey, int]) -> None:
         self._which = which
         self._reached = reached
         self._formats = {"measurement": wire.measurement, "command": wire.command}

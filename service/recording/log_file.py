@@ -139,7 +139,7 @@ class LogFile:
 
     def attach_specification(self, at_ns: int) -> None:
         """Attach the wire's specification, by which frames are read."""
-        text = files("protocol").joinpath("SPEC.md").read_bytes()
+        text = files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
         self._writer.add_attachment(at_ns, at_ns, "protocol/SPEC.md", "text/markdown", text)
 
     def commit(self) -> None:
@@ -181,11 +181,9 @@ class LogFile:
 
 def _raw_shape(topic: topics.Topic) -> Shape:
     if topic.carries == "trace":
-        text = "batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's contract"
+        text = "batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's description"
         return Shape("aeroloop.Trace", TRACE_ENCODING, text.encode(), TRACE_ENCODING)
     if topic.carries == "frame":
-        text = (
-            f"{topic.model} frame: bits as in the attachment protocol/SPEC.md, by the wire spec in the plant's contract"
-        )
+        text = f"{topic.model} frame: bits as in the attachment protocol/SPEC.md, by the plant's wire spec"
         return Shape(f"aeroloop.{topic.model}", FRAME_ENCODING, text.encode(), FRAME_ENCODING)
     return json_shape(f"aeroloop.{topic.model}", model_of(topic))

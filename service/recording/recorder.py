@@ -1,7 +1,7 @@
 """The recorder process: what both ends and all others publish, into MCAP files.
 
-It subscribes, and asks nobody: traces, messages and contracts are published from caches, so a recorder that starts late
-or again recovers the last minute. Twice a second it takes what was received and writes it, so log times are exact
+It only subscribes. Traces, messages and descriptions are published from caches, so a recorder that starts late or again
+recovers the last minute. Twice a second it takes what was received and writes it, so log times are exact
 to 0.5 s. A channel per key holds the raw payloads, decoded channels stand beside them at a bounded rate, and what was
 lost is published and recorded.
 
@@ -18,7 +18,7 @@ from typing import Final, Literal
 from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Contract, Loss, Status
+from aeroloop.protocol.messages.models import Description, Loss, Status
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.publication import Delivery
@@ -103,7 +103,7 @@ class Recorder:
 
     def _settle(self) -> None:
         """Take what is on its way. A role's answer follows all that it published before, as a link keeps the order."""
-        for _ in self._role.zenoh.get(topics.key("contract", "*"), timeout=ANSWER_S):
+        for _ in self._role.zenoh.get(topics.key("description", "*"), timeout=ANSWER_S):
             pass
         now = last = time.monotonic()
         deadline = now + GOES_ON_S
@@ -129,7 +129,7 @@ class Recorder:
         for received in self._subscriptions.take(held=held):
             count += 1
             address = _address(received.key)
-            if address is not None and address.topic.name == "contract":
+            if address is not None and address.topic.name == "description":
                 self._configure(received)  # at once: without it the rest cannot be read
             if not self._backlog.room(received):
                 self._write()
@@ -158,13 +158,13 @@ class Recorder:
 
     def _configure(self, received: Delivery) -> None:
         try:
-            contract = Contract.model_validate_json(received.payload)
+            description = Description.model_validate_json(received.payload)
         except ValidationError:
-            self._role.warn(received.key, "fault", f"{received.key} carries no contract of this version")
+            self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
-        self.log.add_contract(received.key, received.payload)
+        self.log.add_description(received.key, received.payload)
         if self._decoder is not None:
-            self._decoder.configure(contract)
+            self._decoder.configure(description)
 
     def _publish_losses(self) -> None:
         """Publish, and thereby record, what was lost; what found no room once the disk has some again."""

@@ -1,6 +1,6 @@
 """The files of a run, one after another, on a disk that may be full.
 
-A file is closed when it is large or old enough, and the next one begins with what it needs to be read alone: contracts,
+A file is closed when it is large or old enough. The next one begins with what it needs to be read alone: descriptions
 and what the sessions' controllers follow. When the disk refuses, nothing is thrown away here: `writable` turns false,
 the caller keeps its messages, and `tend` tries again every second. A disk that is only full is tried with the same
 file; one that has gone away, with a new file.
@@ -70,7 +70,7 @@ class RollingLog:
         self.trouble = ""
         self._tell = tell
         self._base = settings.path or settings.directory / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap")
-        self._contracts: dict[str, bytes] = {}
+        self._descriptions: dict[str, bytes] = {}
         self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[_Entry] = []
         self._part = 0  # of the next file
@@ -104,10 +104,10 @@ class RollingLog:
         if self._file.full:
             self._commit()
 
-    def add_contract(self, key: str, payload: bytes) -> None:
-        """Put a role's contract into this file and all that follow."""
-        if self._contracts.get(key) != payload:
-            self._contracts[key] = payload
+    def add_description(self, key: str, payload: bytes) -> None:
+        """Put a role's description into this file and all that follow."""
+        if self._descriptions.get(key) != payload:
+            self._descriptions[key] = payload
             self._file.add_metadata(CONTRACT_METADATA, {"key": key, "json": payload.decode()})
 
     def add_change(self, key: str, change: Change) -> None:
@@ -244,8 +244,8 @@ class RollingLog:
             told = {"run": self._base.stem, "part": path.stem, "started": started.isoformat(timespec="seconds")}
             file.add_metadata(RECORDER_METADATA, {"json": json.dumps(told)})
             file.attach_specification(round(started.timestamp() * 1e9))
-            for key, contract in self._contracts.items():
-                file.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract.decode()})
+            for key, description in self._descriptions.items():
+                file.add_metadata(CONTRACT_METADATA, {"key": key, "json": description.decode()})
             for key, changes in self._changes.items():
                 for change in changes:
                     file.add_metadata(CHANGE_METADATA, {"key": key, "json": change.model_dump_json()})

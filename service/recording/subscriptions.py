@@ -68,7 +68,7 @@ class Subscriptions:
         return any(subscriber.joining for subscriber in self._topics.values())
 
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
-        """What was received and not yet taken, topic by topic, contracts first. Never waits.
+        """What was received and not yet taken, topic by topic, descriptions first. Never waits.
 
         Args:
             held: Also take what is held back.

@@ -55,7 +55,7 @@ class Durations:
         )
 
 
-class Outermost:
+class SaturationCount:
     """How many values of a signal were at the quantizer's outermost level."""
 
     def __init__(self, signal: SignalSpec) -> None:

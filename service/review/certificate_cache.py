@@ -1,7 +1,7 @@
 """What a session is held against: the certificate of what it began with, and the bounds that it is made of.
 
-The controller's contract carries the certificate of its configuration, so a log needs none computed; where the session
-began with other gains or another reference, or the log is older, it is computed from what the log says. The bounds of
+The controller's description carries the certificate of its configuration, so none is computed; where the session began
+with other gains or another reference, or the log is older, it is computed from what the log says. The bounds of
 Lemma 1 always are.
 """
 
@@ -21,7 +21,7 @@ from aeroloop.service.theorem.certificate import Certificate, Evaluated, bounds_
 from aeroloop.service.theorem.extremes import BoundlessError
 
 
-class Grounds(NamedTuple):
+class CertifiedBounds(NamedTuple):
     """What a session is held against.
 
     Attributes:
@@ -42,20 +42,20 @@ class Grounds(NamedTuple):
         return None if self.certificate is None or not self.certificate.holds else self.certificate.radius
 
 
-class Library:
+class CertificateCache:
     """The grounds of a log's sessions, most of which began alike.
 
     Args:
         settings: The controller's configuration.
-        promised: The certificate in its contract, if there is one.
+        promised: The certificate in its description, if there is one.
     """
 
     def __init__(self, settings: Settings, promised: dict[str, Any] | None = None) -> None:
         self._settings = settings
         self._promised = promised
-        self._last: tuple[Gains | None, Reference, Grounds] | None = None
+        self._last: tuple[Gains | None, Reference, CertifiedBounds] | None = None
 
-    def of(self, changes: Sequence[Change]) -> Grounds:
+    def of(self, changes: Sequence[Change]) -> CertifiedBounds:
         """The grounds of a session.
 
         Args:
@@ -69,24 +69,24 @@ class Library:
             self._last = gains, reference, self._made(gains, reference)
         return self._last[2]
 
-    def _made(self, gains: Gains | None, reference: Reference) -> Grounds:
+    def _made(self, gains: Gains | None, reference: Reference) -> CertifiedBounds:
         settings = self._settings
         given = {name: value for name, value in gains or () if value is not None}
         law = settings.law.model_copy(update=given)
         try:
             bounds = bounds_of(settings.wire, law, reference, settings.controller)
         except BoundlessError as error:
-            return Grounds(law, None, None, f"Nothing is promised: {error}.")
+            return CertifiedBounds(law, None, None, f"Nothing is promised: {error}.")
         certificate = None
         if (law, reference) == (settings.law, settings.reference) and self._promised is not None:
             certificate = _read(self._promised)
         if certificate is None:
             certificate = certify(settings.wire, law, reference, settings.controller)
-        return Grounds(law, certificate, bounds, certificate.verdict)
+        return CertifiedBounds(law, certificate, bounds, certificate.verdict)
 
 
 def _read(promised: dict[str, Any]) -> Certificate | None:
-    """A contract's certificate; None if it is not of this version."""
+    """A description's certificate; None if it is not of this version."""
     try:
         return Certificate.model_validate(promised)
     except ValidationError:

@@ -17,7 +17,7 @@ from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import report
 
 
-class Difference(BaseModel):
+class SettingDifference(BaseModel):
     """A key of the configuration whose value is not the same in every run."""
 
     model_config = ConfigDict(frozen=True)
@@ -32,7 +32,7 @@ class Comparison(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     runs: dict[str, Findings] = Field(description="what each log tells, by the run's name")
-    differences: list[Difference]
+    differences: list[SettingDifference]
 
     @classmethod
     def of(cls, reports: Sequence[Report]) -> Comparison:
@@ -41,7 +41,7 @@ class Comparison(BaseModel):
         return cls(
             runs={run.name: run.findings for run in reports},
             differences=[
-                Difference(key=key, values=dict(zip(names, values, strict=True)))
+                SettingDifference(key=key, values=dict(zip(names, values, strict=True)))
                 for key, values in differences(reports)
             ],
         )

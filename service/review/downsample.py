@@ -63,7 +63,7 @@ class Buckets(NamedTuple):
         return self.part(slice(since)).followed_by(merged).followed_by(self.part(slice(end, None)))
 
 
-class ThinnedLines:
+class DownsampledLines:
     """Columns over a position that rises, in bounded memory.
 
     Args:

@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.operator import Change, Gains, Hold, Points, Ref
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.timing import Histogram
 from aeroloop.service.logs.runs import Taker
-from aeroloop.service.logs.traces import Which
+from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.review.report import Mark
 
 MAX_MARKS: Final = 300
@@ -55,7 +55,7 @@ class Kind:
         return [*self.first, (place, mark.model_copy(update={"text": f"{self.more} more, the last: {mark.text}"}))]
 
 
-class Ages:
+class MeasurementAges:
     """Age of measurements by a controller's statuses, each over ten seconds."""
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class Ages:
         return {"p50": round(self._p50.percentile(50), 1), "p99": self._p99, "max": self._max}
 
 
-class Story:
+class EventLog:
     """What a log has beside its traces, of one session and its vehicle.
 
     Args:
@@ -91,7 +91,7 @@ class Story:
     """
 
     def __init__(
-        self, which: Which, period: float, reached: Mapping[Which, int], open_sessions: Mapping[str, str]
+        self, which: SessionKey, period: float, reached: Mapping[SessionKey, int], open_sessions: Mapping[str, str]
     ) -> None:
         self.statuses: dict[tuple[str, str], Status] = {}
         self.trips: list[str] = []
@@ -101,7 +101,7 @@ class Story:
         self._reached = reached
         self._open = open_sessions
         self._kinds: defaultdict[tuple[str, str], Kind] = defaultdict(Kind)
-        self._ages = Ages()
+        self._ages = MeasurementAges()
         self._known: dict[int, None] = {}
         self._status_ns: dict[tuple[str, str], int] = {}
 

@@ -8,13 +8,13 @@ from typing import Any
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.runs import Run
-from aeroloop.service.logs.traces import Which
-from aeroloop.service.review.events import Story
+from aeroloop.service.logs.traces import SessionKey
+from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.session import Session
 
 
-def findings_of(figures: Figures, which: Which, session: Session, story: Story, run: Run) -> Findings:
+def findings_of(figures: Figures, which: SessionKey, session: Session, story: EventLog, run: Run) -> Findings:
     """Everything that is known of a session.
 
     Args:
@@ -59,12 +59,12 @@ def findings_of(figures: Figures, which: Which, session: Session, story: Story, 
     )
 
 
-def facts_of(run: Run, story: Story, vehicle: str) -> dict[str, dict[str, Any]]:
-    """About software and host, by role: what its contract says, what the log's metadata says, what was refused."""
+def facts_of(run: Run, story: EventLog, vehicle: str) -> dict[str, dict[str, Any]]:
+    """About software and host, by role: what its description says, what the log's metadata says, what was refused."""
     facts: dict[str, dict[str, Any]] = {}
-    for (whose, role), contract in run.files.contracts.items():
+    for (whose, role), description in run.files.descriptions.items():
         if whose == vehicle:
-            facts[role] = {"host": contract.host, **contract.facts, "versions": contract.versions}
+            facts[role] = {"host": description.host, **description.facts, "versions": description.versions}
     for name, said in run.files.metadata.items():
         facts.setdefault(name, {}).update(said)
     for (whose, role), status in story.statuses.items():

@@ -15,11 +15,11 @@ import numpy as np
 from aeroloop.service.config import Settings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
-from aeroloop.service.review.accumulators import Durations, Outermost
-from aeroloop.service.review.downsample import ThinnedLines
+from aeroloop.service.review.accumulators import Durations, SaturationCount
+from aeroloop.service.review.downsample import DownsampledLines
 from aeroloop.service.review.panels import columns_of, panels_of, with_level
 from aeroloop.service.review.report import Gap, Panel, Spread
-from aeroloop.service.review.theorem_check import Trial
+from aeroloop.service.review.theorem_check import TheoremCheck
 
 LONGEST_GAPS: Final = 100
 
@@ -32,13 +32,13 @@ class Observer:
         trial: Holds it against the theorem.
     """
 
-    def __init__(self, settings: Settings, trial: Trial) -> None:
+    def __init__(self, settings: Settings, trial: TheoremCheck) -> None:
         wire = settings.wire
         self._period = settings.loop.period
         self.trial = trial
         self._columns = columns_of(settings, theta=trial.damping_known)
-        self._lines = ThinnedLines(1 + len(self._columns))  # k, then what is drawn
-        self._outermost = {name: Outermost(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
+        self._lines = DownsampledLines(1 + len(self._columns))  # k, then what is drawn
+        self._outermost = {name: SaturationCount(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
         self._timing = {name: Durations() for name in ("period", "latency", "measurement_delay", "command_delay")}
         self._longest: list[tuple[int, int]] = []
         self._last_answer: Integers = np.empty(0, dtype=np.int64)

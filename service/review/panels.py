@@ -39,11 +39,11 @@ NUMBERS: Final[dict[tuple[str, Case], str]] = {
     ("rate_error", "wind"): "C.13",
     ("input", "wind"): "C.14",
 }
-"""Which figure of the paper shows a quantity in a case."""
+"""SessionKey figure of the paper shows a quantity in a case."""
 
 
 def case_of(settings: Settings) -> Case:
-    """Which of the paper's cases a session was."""
+    """SessionKey of the paper's cases a session was."""
     if settings.plant.wind.blowing and not settings.plant.ideal:
         return "wind"
     bits = (settings.wire.attitude.bits, settings.wire.rate.bits, settings.wire.voltage.bits)
@@ -56,7 +56,7 @@ def title_of(name: str, quantity: str, case: Case) -> str:
     return f"{f'Figure {number}: ' if number else ''}{quantity} {CASES[case]}"
 
 
-class Column(NamedTuple):
+class PanelColumn(NamedTuple):
     """One line: the panel that it is drawn in, and what it is there."""
 
     group: str
@@ -67,7 +67,7 @@ class Column(NamedTuple):
     desired: bool = False
 
 
-def columns_of(settings: Settings, *, theta: bool = False) -> list[Column]:
+def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
     """What is kept of every tick, in the order in which it is drawn; as `Observer` gathers it.
 
     Args:
@@ -77,7 +77,7 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[Column]:
     return list(_columns(case_of(settings), settings.wire.actuators, theta=theta))
 
 
-def panels_of(columns: list[Column], values: Array) -> list[Panel]:
+def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
     """Panels of columns; lines that share an axis share a panel, and a line without any value is left out.
 
     Args:
@@ -105,29 +105,29 @@ def with_level(panels: list[Panel], group: str, label: str, level: float | None)
     ]
 
 
-def _columns(case: Case, actuators: int, *, theta: bool) -> Iterator[Column]:
+def _columns(case: Case, actuators: int, *, theta: bool) -> Iterator[PanelColumn]:
     def titled(name: str, quantity: str) -> str:
         return title_of(name, quantity, case)
 
     for label in ("η", "ε₁", "ε₂", "ε₃"):
-        yield Column("attitude", titled("attitude", "Attitude"), label, "1", "measured")
-        yield Column("attitude", titled("attitude", "Attitude"), label, "1", "desired", desired=True)
+        yield PanelColumn("attitude", titled("attitude", "Attitude"), label, "1", "measured")
+        yield PanelColumn("attitude", titled("attitude", "Attitude"), label, "1", "desired", desired=True)
     for label in ("ω₁", "ω₂", "ω₃"):
-        yield Column("rate", titled("rate", "Angular velocity"), label, "rad/s", "measured")
-        yield Column("rate", titled("rate", "Angular velocity"), label, "rad/s", "desired", desired=True)
+        yield PanelColumn("rate", titled("rate", "Angular velocity"), label, "rad/s", "measured")
+        yield PanelColumn("rate", titled("rate", "Angular velocity"), label, "rad/s", "desired", desired=True)
     for label in ("ε̃₁", "ε̃₂", "ε̃₃"):
-        yield Column("attitude_error", titled("error", "Attitude error"), label, "1", "measured")
+        yield PanelColumn("attitude_error", titled("error", "Attitude error"), label, "1", "measured")
     for label in ("ω_e1", "ω_e2", "ω_e3"):
-        yield Column("rate_error", titled("rate_error", "Angular velocity error"), label, "rad/s", "measured")
+        yield PanelColumn("rate_error", titled("rate_error", "Angular velocity error"), label, "rad/s", "measured")
     for label in ("u₁", "u₂", "u₃")[3 - actuators :]:
-        yield Column("input", titled("input", "Input"), label, "V", "commanded")
-    yield Column("error_angle", "Attitude error, as an angle", "angle", "deg", "measured")
-    yield Column("error_angle", "Attitude error, as an angle", "angle", "deg", "true")
-    yield Column("latency", "Loop latency", "latency", "µs", "latency")
-    yield Column("period", "Period between measurements", "period", "µs", "period")
+        yield PanelColumn("input", titled("input", "Input"), label, "V", "commanded")
+    yield PanelColumn("error_angle", "Attitude error, as an angle", "angle", "deg", "measured")
+    yield PanelColumn("error_angle", "Attitude error, as an angle", "angle", "deg", "true")
+    yield PanelColumn("latency", "Loop latency", "latency", "µs", "latency")
+    yield PanelColumn("period", "Period between measurements", "period", "µs", "period")
     for label in ("θ̂₁", "θ̂₂", "θ̂₃"):
-        yield Column("damping_estimate", "Damping estimate", label, "N·m·s/rad", "estimated")
-    yield Column("z_norm", "Error of Theorem 1", "‖z‖", "1", "measured")
-    yield Column("z_norm", "Error of Theorem 1", "‖z‖", "1", "true")
-    yield Column("lyapunov", "Lyapunov function", "V", "N·m", "measured, without θ̃")
-    yield Column("lyapunov", "Lyapunov function", "V", "N·m", "true, with θ̃" if theta else "true, without θ̃")
+        yield PanelColumn("damping_estimate", "Damping estimate", label, "N·m·s/rad", "estimated")
+    yield PanelColumn("z_norm", "Error of Theorem 1", "‖z‖", "1", "measured")
+    yield PanelColumn("z_norm", "Error of Theorem 1", "‖z‖", "1", "true")
+    yield PanelColumn("lyapunov", "Lyapunov function", "V", "N·m", "measured, without θ̃")
+    yield PanelColumn("lyapunov", "Lyapunov function", "V", "N·m", "true, with θ̃" if theta else "true, without θ̃")

@@ -1,7 +1,7 @@
 """The review: every figure, from a log alone.
 
-The log holds the configuration (in the roles' contracts) and what each end did (in the traces), so the review computes
-what the controller did again, to the last bit. Of a log with several sessions the longest is judged.
+The log holds the configuration (roles' descriptions) and what each end did (traces), so the review computes the
+controller again, to the last bit. Of a log with several sessions the longest is judged.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.logs.files import Progress, ReviewError
 from aeroloop.service.logs.runs import Run, Taker
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.logs.traces import Which
+from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.logs.wire_check import WireCheck
-from aeroloop.service.review.certificate_cache import Library, damping_of
-from aeroloop.service.review.events import Story
+from aeroloop.service.review.certificate_cache import CertificateCache, damping_of
+from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.findings import facts_of, findings_of, name_of
 from aeroloop.service.review.report import Findings, Report
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.session import Session
-from aeroloop.service.review.theorem_check import Trial
+from aeroloop.service.review.theorem_check import TheoremCheck
 
 
 class Review(NamedTuple):
@@ -45,7 +45,7 @@ class Review(NamedTuple):
     figures: Figures
     findings: Findings
     session: Session
-    which: Which
+    which: SessionKey
     name: str
     facts: dict[str, dict[str, Any]]
 
@@ -59,7 +59,7 @@ class Review(NamedTuple):
             time=time,
             panels=panels,
             thinned=observer.thinned,
-            settings=self.session.settings.contract(),
+            settings=self.session.settings.description(),
             facts=self.facts,
         )
 
@@ -96,16 +96,19 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         which = run.longest
         vehicle, files = which[0], run.files
         settings, plant = files.settings(vehicle), files.plant(vehicle)
-        contract = files.contracts.get((vehicle, "controller"))
-        library, damping = Library(settings, contract.certificate if contract else None), damping_of(plant)
+        description = files.descriptions.get((vehicle, "controller"))
+        library, damping = (
+            CertificateCache(settings, description.certificate if description else None),
+            damping_of(plant),
+        )
 
-        def trial(changes: Sequence[Change]) -> Trial:
-            return Trial(library.of(changes), settings.loop.period, damping)
+        def trial(changes: Sequence[Change]) -> TheoremCheck:
+            return TheoremCheck(library.of(changes), settings.loop.period, damping)
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
         session = Session(settings, plant.watchdog_s, trial, missing, watch)
         frames = WireCheck(which, settings.wire, run.reached)
-        story = Story(which, settings.loop.period, run.reached, run.open_sessions)
+        story = EventLog(which, settings.loop.period, run.reached, run.open_sessions)
 
         def route(address: Address) -> Taker | None:
             if address.topic.name == "truth":
@@ -125,7 +128,7 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
     return Review(figures, findings, session, which, name_of(paths), facts_of(run, story, vehicle))
 
 
-def _figures(session: Session, story: Story, run: Run, which: Which) -> Figures:
+def _figures(session: Session, story: EventLog, run: Run, which: SessionKey) -> Figures:
     reasons: dict[str, str] = {}
     plant = story.statuses.get((which[0], "plant"))
     latency = plant.latency_us if plant else None

@@ -19,7 +19,7 @@ from aeroloop.service.logs.tick_reader import TickReader
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Missing
 from aeroloop.service.review.observe import Observer
-from aeroloop.service.review.theorem_check import WAITING, Trial
+from aeroloop.service.review.theorem_check import WAITING, TheoremCheck
 
 _TRUTHS: Final = TypeAdapter(list[Truth])
 """Parsed as one text, they take a third of the time."""
@@ -52,7 +52,7 @@ class Session:
         self,
         settings: Settings,
         watchdog_s: float,
-        trial: Callable[[Sequence[Change]], Trial],
+        trial: Callable[[Sequence[Change]], TheoremCheck],
         missing: Sequence[Missing] = (),
         watch: Callable[[Ticks], None] | None = None,
     ) -> None:
@@ -105,7 +105,7 @@ class Session:
             self._give_truths(self._observer.trial)
             self._observer.trial.finish()
 
-    def _give_truths(self, trial: Trial) -> None:
+    def _give_truths(self, trial: TheoremCheck) -> None:
         for truth in _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]"):
             if truth.session == self._session:
                 trial.truth(truth.session_tick, truth.attitude, truth.rate)

@@ -22,7 +22,7 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
-from aeroloop.service.review.certificate_cache import Grounds
+from aeroloop.service.review.certificate_cache import CertifiedBounds
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem.lemma import (
     Inequality,
@@ -52,7 +52,7 @@ class Truths(NamedTuple):
     rate: Array
 
 
-class Tally:
+class InequalityCount:
     """One inequality: how often it was judged, how often broken, and how close it came."""
 
     def __init__(self, inequality: Inequality) -> None:
@@ -88,7 +88,7 @@ class Tally:
         )
 
 
-class Trial:
+class TheoremCheck:
     """Holds one session against the theorem.
 
     Args:
@@ -100,7 +100,7 @@ class Trial:
         damping_known: Whether it is.
     """
 
-    def __init__(self, grounds: Grounds, period: float, damping: Vector | None) -> None:
+    def __init__(self, grounds: CertifiedBounds, period: float, damping: Vector | None) -> None:
         self._grounds = grounds
         self._period = period
         self._damping = damping
@@ -110,7 +110,7 @@ class Trial:
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
         self._before: Ticks | None = None  # the last block: a truth may come a little late
         self._drawn = np.empty((0, 4))  # the last true state: its tick, ‖z‖, V and the angle of its error [deg]
-        self._tallies: dict[str, Tally] = {}
+        self._tallies: dict[str, InequalityCount] = {}
         self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
         self._settled = transient(grounds.law) / period  # tick from which the transient is over
@@ -219,7 +219,7 @@ class Trial:
         self._judged += int(judged.sum())
         for inequality in inequalities:
             if inequality.equation not in PREMISES:
-                self._tallies.setdefault(inequality.equation, Tally(inequality)).add(inequality, judged, time)
+                self._tallies.setdefault(inequality.equation, InequalityCount(inequality)).add(inequality, judged, time)
 
     # ── what it has found ──
 

@@ -21,10 +21,10 @@ from rich.table import Table
 from rich.text import Text
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Contract, Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
 from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.protocol.wire.attitude import angle, to_euler
-from aeroloop.service.config import ConfigError, Settings, from_contract
+from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.host.bandwidth import PayloadRate
 
 REFRESH_S: Final = 0.2
@@ -52,7 +52,7 @@ class Top:
         self._vehicles: dict[str, Vehicle] = {}
         self._events: deque[str] = deque(maxlen=EVENTS)
 
-    def hear(self, key: str, payload: bytes) -> None:
+    def receive(self, key: str, payload: bytes) -> None:
         """Take in any message of the table; what is not understood is left out."""
         address = topics.read_key(key)
         if address is None:
@@ -65,13 +65,13 @@ class Top:
                         status = Status.model_validate_json(payload)
                         vehicle.statuses[address.role] = time.monotonic(), status
                         if address.role == "controller":
-                            vehicle.payload.hear(status)
+                            vehicle.payload.receive(status)
                     case "telemetry":
                         vehicle.telemetry = Telemetry.model_validate_json(payload)
                     case "truth":
                         vehicle.truth = Truth.model_validate_json(payload)
-                    case "contract" if address.role in ("plant", "controller"):
-                        vehicle.settings = from_contract(Contract.model_validate_json(payload).config)
+                    case "description" if address.role in ("plant", "controller"):
+                        vehicle.settings = from_description(Description.model_validate_json(payload).config)
                     case "event":
                         event = Event.model_validate_json(payload)
                         self._events.append(f"{time.strftime('%H:%M:%S')} {address.vehicle} {event.role}: {event.text}")
@@ -135,16 +135,16 @@ def watch(network: NetworkSettings, show: Callable[[RenderableType], None], stop
     top = Top()
 
     def heard(sample: zenoh.Sample) -> None:
-        top.hear(str(sample.key_expr), sample.payload.to_bytes())
+        top.receive(str(sample.key_expr), sample.payload.to_bytes())
 
     with join(network) as session:
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), heard)
         asked = 0.0
         while not stop.wait(REFRESH_S):
-            if time.monotonic() - asked > 2.0:  # who came since; a plant's contract has the wire
+            if time.monotonic() - asked > 2.0:  # who came since; a plant's description has the wire
                 asked = time.monotonic()
-                for reply in session.get(topics.key("contract", "*"), timeout=1.0):
+                for reply in session.get(topics.key("description", "*"), timeout=1.0):
                     if reply.ok is not None:
-                        top.hear(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+                        top.receive(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
             show(top.draw())

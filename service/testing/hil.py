@@ -27,7 +27,7 @@ from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_ba
 from aeroloop.service.config import Settings, load
 from aeroloop.service.figures import Figures
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.process_group import Bench, RoleName, free_rendezvous, private_bus
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
 
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
 PATIENCE_S: Final = 30.0
@@ -112,11 +112,11 @@ class Hil:
     Attributes:
         events: What has happened so far, as it was told on the network.
         settings: The configuration, once started.
-        bench: The processes, once started.
+        processes: The processes, once started.
     """
 
     settings: Settings
-    bench: Bench
+    processes: ProcessGroup
 
     def __init__(
         self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
@@ -174,17 +174,17 @@ class Hil:
         self.events.clear()
         self._statuses.clear()
         self._asked_ticks = 0
-        self.bench = Bench(self.settings)
+        self.processes = ProcessGroup(self.settings)
         self._running = True
         self._logs.append(HilLog(log))
-        for name, hear in (("event", self._hear_event), ("status", self._hear_status)):
-            self.bench.zenoh.declare_subscriber(topics.key(name, self.settings.vehicle), hear)
-        self.bench.start("recorder")
-        self.bench.start_plant()
+        for name, receive in (("event", self._receive_event), ("status", self._receive_status)):
+            self.processes.zenoh.declare_subscriber(topics.key(name, self.settings.vehicle), receive)
+        self.processes.start("recorder")
+        self.processes.start_plant()
         if drive:
-            self.bench.start("controller")  # which waits for the recorder by itself
+            self.processes.start("controller")  # which waits for the recorder by itself
         for role in ROLES:
-            self.bench.await_role(role)
+            self.processes.await_role(role)
         if drive:
             ready = {PlantState.GRANTED, PlantState.DRIVEN} if self._lockstep else {PlantState.DRIVEN}
             self.eventually("the controller drives the plant", lambda: self.state("plant") in ready)
@@ -195,12 +195,12 @@ class Hil:
         In lockstep only an emulator waits between two calls; other plants run on, and it is at least so many steps.
 
         Raises:
-            BenchError: A process has failed.
+            ProcessGroupError: A process has failed.
             HilError: In lockstep, the plant does not step.
         """
         if not self._lockstep:
             time.sleep(seconds)
-            self.bench.check()
+            self.processes.check()
             return
         self._asked_ticks += self.settings.loop.ticks(seconds)
         if self._via == "emulator":
@@ -215,7 +215,7 @@ class Hil:
             over,
             PATIENCE_S + PATIENCE_PER_STEP_S * self.settings.loop.ticks(seconds),
         )
-        self.bench.check()
+        self.processes.check()
 
     def inject(self, fault: str | None) -> None:
         """Let something go wrong with the emulated plant, now or later: `signal:kind[=value][@start[..end]]`.
@@ -238,15 +238,15 @@ class Hil:
 
     def kill(self, role: RoleName) -> None:
         """kill −9."""
-        self.bench.stop(role, signal.SIGKILL)
+        self.processes.stop(role, signal.SIGKILL)
 
     def pause(self, role: RoleName) -> None:
         """SIGSTOP: the process stands still, and its links stay open."""
-        self.bench.signal(role, signal.SIGSTOP)
+        self.processes.signal(role, signal.SIGSTOP)
 
     def resume(self, role: RoleName) -> None:
         """SIGCONT."""
-        self.bench.signal(role, signal.SIGCONT)
+        self.processes.signal(role, signal.SIGCONT)
 
     def restart(self, role: RoleName) -> None:
         """Start a role again that has ended or was killed, and wait until it is on the network.
@@ -255,10 +255,10 @@ class Hil:
         """
         if role == "recorder":
             self._logs.append(HilLog(self._folder / f"hil-{len(self._logs)}.mcap"))
-            self.bench.replace_log(self._logs[-1].path)
-        self.bench.start(role)
+            self.processes.replace_log(self._logs[-1].path)
+        self.processes.start(role)
         if role != "controller":
-            self.bench.await_role(role)
+            self.processes.await_role(role)
 
     def state(self, role: str) -> str | None:
         """What `plant`, `controller` or `recorder` is doing, as it last said; None if it has said nothing."""
@@ -297,7 +297,7 @@ class Hil:
         """Stop all processes; the log is whole then."""
         if self._running:
             self._running = False
-            self.bench.__exit__(None, None, None)
+            self.processes.__exit__(None, None, None)
 
     @property
     def log(self) -> HilLog:
@@ -309,7 +309,7 @@ class Hil:
 
     def _ask(self, topic: str, message: Message) -> None:
         key = topics.key(topic, self.settings.vehicle)
-        for reply in self.bench.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
+        for reply in self.processes.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
             if reply.ok is not None:
                 answer = Answer.model_validate_json(reply.ok.payload.to_bytes())
                 if not answer.done:
@@ -317,12 +317,12 @@ class Hil:
                 return
         raise HilError(f"nobody answers {topic!r}")
 
-    def _hear_event(self, sample: zenoh.Sample) -> None:
+    def _receive_event(self, sample: zenoh.Sample) -> None:
         with self._changed:
             self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
             self._changed.notify_all()
 
-    def _hear_status(self, sample: zenoh.Sample) -> None:
+    def _receive_status(self, sample: zenoh.Sample) -> None:
         status = Status.model_validate_json(sample.payload.to_bytes())
         with self._changed:
             self._statuses[status.role] = status

@@ -36,7 +36,7 @@ START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
 
 
-class BenchError(AeroloopError):
+class ProcessGroupError(AeroloopError):
     """A process did not start or ended early; one line with what it said last."""
 
 
@@ -57,7 +57,7 @@ def private_bus(can: CanSettings) -> CanSettings:
     return can.model_copy(update={"options": {"hop_limit": 0, "port": port, **can.options}})
 
 
-class Bench:
+class ProcessGroup:
     """Processes of one network on this machine. A context: leaving it stops them all.
 
     Args:
@@ -102,7 +102,7 @@ class Bench:
         """Start a role; it is not yet on the network when this returns.
 
         Args:
-            role: Which.
+            role: SessionKey.
             arguments: For its command line, besides the configuration of all.
             environment: For its environment, besides this process's. A process with one is started from nothing, since
                 the dynamic linker reads it, too; any other is a fork (see `fork_server`).
@@ -132,14 +132,14 @@ class Bench:
         """Wait until a role's liveliness token is there.
 
         Raises:
-            BenchError: It ended, or the time is over.
+            ProcessGroupError: It ended, or the time is over.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while role not in self._alive:
                 self._check(role)
                 if time.monotonic() > deadline:
-                    raise BenchError(f"the {role} did not join the network within {timeout_s:g} s")
+                    raise ProcessGroupError(f"the {role} did not join the network within {timeout_s:g} s")
                 self._changed.wait(0.1)
 
     def running(self, role: RoleName) -> bool:
@@ -178,7 +178,7 @@ class Bench:
         """Raise if any process has failed.
 
         Raises:
-            BenchError: With what it said last.
+            ProcessGroupError: With what it said last.
         """
         for role in self._children:
             self._check(role)
@@ -187,7 +187,7 @@ class Bench:
         code = self._children[role].poll()
         if code and role not in self._killed:
             said = self._log(role).read_text(errors="replace").strip().splitlines()
-            raise BenchError(f"the {role} ended with exit code {code}" + (f": {said[-1]}" if said else ""))
+            raise ProcessGroupError(f"the {role} ended with exit code {code}" + (f": {said[-1]}" if said else ""))
 
     def _log(self, role: str) -> Path:
         return Path(self._folder.name) / f"{role}.stderr"

@@ -2,7 +2,7 @@
 
 Sans-I/O. Topics stand under `/<vehicle>/`; poses, transforms, the scene and the log are in Foxglove's schemas, the rest
 are the models of views.py. Of traces, the plant's rows give the measurements that it sent and the controller's the
-commands that it sent, at the times of sending on their own wall clocks; they are read by the wire spec in a contract,
+commands that it sent, at the times of sending on their own wall clocks. The wire spec in a description decodes them,
 so they give nothing before it. Time is cut into slots, and the first row or message in a slot passes; at a bounded rate
 no other is looked at. What happens once always passes, and so do statuses, which come once a second.
 """
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import operator as verbs
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Contract, Event, Loss, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import Description, Event, Loss, Status, Telemetry, Truth
 from aeroloop.protocol.messages.trace import Batch, Sent, read_batch
 from aeroloop.protocol.wire import attitude
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -62,7 +62,7 @@ SHAPES: Final = {
     "desired_pose": _POSE,
     "desired_tf": _TRANSFORM,
     "truth": _ATTITUDE,
-    "setpoint": json_shape("aeroloop.Setpoint", views.Setpoint),
+    "setpoint": json_shape("aeroloop.Setpoint", views.SetpointView),
     "scene": protobuf_shape(SceneUpdate.get_schema()),
     "log": protobuf_shape(Log.get_schema()),
     **{f"status/{role}": _STATUS for role in ROLES},
@@ -92,15 +92,15 @@ class Decoded(NamedTuple):
 
 
 class _Wire:
-    """How a vehicle's frames are read, as its contract says. Raises as pydantic does, KeyError or TypeError."""
+    """How a vehicle's frames are read, as its description says. Raises as pydantic does, KeyError or TypeError."""
 
-    def __init__(self, contract: Contract) -> None:
-        spec = WireSpec.model_validate(contract.config["wire"])
+    def __init__(self, description: Description) -> None:
+        spec = WireSpec.model_validate(description.config["wire"])
         voltage = spec.voltage.quantizer()
         self.silent = {name for name in ("measurement", "command") if getattr(spec.transmit, name) == "on_change"}
-        self.role = contract.role
-        self.kind = str(contract.config["plant"]["kind"])
-        self.period = LoopSettings.model_validate(contract.config["loop"]).period
+        self.role = description.role
+        self.kind = str(description.config["plant"]["kind"])
+        self.period = LoopSettings.model_validate(description.config["loop"]).period
         self.measurement, self.command = spec.measurement.unpack, spec.command.unpack
         self.attitude: Callable[[float], float] = spec.attitude.quantizer().level
         self.rate: Callable[[float], float] = spec.rate.quantizer().level
@@ -115,7 +115,7 @@ class Decoder:
         rate_hz: At most so many messages a second of each topic that streams, by time of publication; None: all.
 
     Attributes:
-        malformed: Messages, rows and contracts so far that could not be read.
+        malformed: Messages, rows and descriptions so far that could not be read.
     """
 
     def __init__(self, rate_hz: float | None) -> None:
@@ -137,16 +137,18 @@ class Decoder:
             "command": self._command,
         }
 
-    def configure(self, contract: Contract) -> None:
-        """Read a vehicle's frames by this contract from now on.
+    def configure(self, description: Description) -> None:
+        """Read a vehicle's frames by this description from now on.
 
         A controller's counts while there is none of a plant: the plant decides whose frames it takes. Other roles' do
         not: what a recorder was configured with need not be what is on the wire.
         """
-        known = self._wires.get(contract.vehicle)
-        if contract.role == "plant" or (contract.role == "controller" and (known is None or known.role != "plant")):
+        known = self._wires.get(description.vehicle)
+        if description.role == "plant" or (
+            description.role == "controller" and (known is None or known.role != "plant")
+        ):
             try:
-                self._wires[contract.vehicle] = _Wire(contract)
+                self._wires[description.vehicle] = _Wire(description)
             except (ValidationError, KeyError, TypeError):
                 self.malformed += 1
 
@@ -245,7 +247,7 @@ class Decoder:
 
     def _reference(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         told = verbs.Setpoint.model_validate_json(payload)
-        return [_shown(address.vehicle, "setpoint", views.Setpoint.of(told.attitude), at_ns)]
+        return [_shown(address.vehicle, "setpoint", views.SetpointView.of(told.attitude), at_ns)]
 
     def _status(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         told = Status.model_validate_json(payload)

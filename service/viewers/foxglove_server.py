@@ -20,7 +20,7 @@ from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Contract
+from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.protocol.transport.publication import Delivery, RecoveringSubscriber, read_sample
 from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder, topic_of
@@ -34,11 +34,11 @@ BACKLOG: Final = 256
 """Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
 
 
-class LiveError(AeroloopError):
+class FoxgloveServerError(AeroloopError):
     """The server cannot be started; one line that says why and what to do."""
 
 
-class Feed:
+class LiveDecoder:
     """What is published about a vehicle, decoded.
 
     Args:
@@ -48,7 +48,7 @@ class Feed:
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
         self._decoder = Decoder(None)  # the pace at which it is asked bounds the rate
-        self._contracts = RecoveringSubscriber(session, topics.key("contract", vehicle), KEPT)
+        self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle), KEPT)
         self._subscribers = {
             session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
             for names, room in ((UNLIMITED, KEPT), (LIMITED.union(topics.FRAMES), 1))
@@ -57,11 +57,11 @@ class Feed:
 
     def take(self) -> Iterator[Decoded]:
         """What came since the last time: the newest of what streams, and all of what happens once. Never waits."""
-        for contract in self._contracts.take():
+        for description in self._descriptions.take():
             try:
-                self._decoder.configure(Contract.model_validate_json(contract.payload))
+                self._decoder.configure(Description.model_validate_json(description.payload))
             except ValidationError:
-                log.warning("live: %s carries no contract of this version", contract.key)
+                log.warning("live: %s carries no description of this version", description.key)
         for subscriber, room in self._subscribers.items():
             for _ in range(room):
                 if (sample := subscriber.try_recv()) is None:
@@ -77,7 +77,7 @@ class Feed:
         return read(address, received.payload, at_ns)
 
 
-class Outlet:
+class FoxgloveServer:
     """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
 
     Args:
@@ -89,7 +89,7 @@ class Outlet:
         url: Where clients find it.
 
     Raises:
-        LiveError: It cannot listen there.
+        FoxgloveServerError: It cannot listen there.
     """
 
     def __init__(self, vehicle: str, address: str, port: int) -> None:
@@ -109,10 +109,12 @@ class Outlet:
         except RuntimeError as error:
             reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
             where = f"{_host(address)}:{port}"
-            raise LiveError(f"cannot listen on {where}: {reason.lower()}; choose by --address and --port") from None
+            raise FoxgloveServerError(
+                f"cannot listen on {where}: {reason.lower()}; choose by --address and --port"
+            ) from None
         self.url = f"ws://{_host(address)}:{self._server.port}"
 
-    def __enter__(self) -> Outlet:
+    def __enter__(self) -> FoxgloveServer:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -154,11 +156,11 @@ def serve(
         ready: Called with the URL once clients can connect.
 
     Raises:
-        LiveError: The address or port cannot be listened on.
+        FoxgloveServerError: The address or port cannot be listened on.
         NetworkError: The network cannot be joined.
     """
-    with Outlet(vehicle, address, port) as outlet, join(network) as session:
-        feed = Feed(session, vehicle)
+    with FoxgloveServer(vehicle, address, port) as outlet, join(network) as session:
+        feed = LiveDecoder(session, vehicle)
         ready(outlet.url)
         while not stop.wait(1 / rate_hz):
             for message in feed.take():

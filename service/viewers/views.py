@@ -47,7 +47,7 @@ class Attitude(View):
         return cls(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, p_deg_s=p, q_deg_s=q, r_deg_s=r)
 
 
-class Setpoint(View):
+class SetpointView(View):
     """An operator's set-point."""
 
     roll_deg: float = Field(description=f"{ANGLES} [deg]")

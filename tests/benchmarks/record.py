@@ -25,8 +25,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.service.config import Settings, load
-from aeroloop.service.testing.process_group import Bench, free_rendezvous
-from tests.service.recording.ends import VEHICLE, Ends, contract_of
+from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
+from tests.service.recording.ends import VEHICLE, Ends, description_of
 
 LOOP_S = 20.0
 FLOOD_PER_S = 20_000
@@ -53,8 +53,8 @@ def publish(rendezvous: str, name: str, seconds: float) -> None:
             publishers[key].put(payload)
 
         if name == "ends":
-            contract = contract_of(settings, "plant").encode()
-            put(topics.key("contract", VEHICLE, role="plant"), contract, 1)
+            description = description_of(settings, "plant").encode()
+            put(topics.key("description", VEHICLE, role="plant"), description, 1)
             time.sleep(1.0)
             loop(settings, put, seconds)
         else:
@@ -114,14 +114,14 @@ def measured(names: list[str], seconds: float, *overrides: str) -> tuple[Counter
     """Messages in the log by topic, share of a core, and MB an hour, while publishers run beside a recorder."""
     with tempfile.TemporaryDirectory() as folder:
         settings = settings_for(Path(folder) / "log.mcap", *overrides)
-        with Bench(settings) as bench:
-            bench.start("recorder")
-            bench.await_role("recorder")
-            pid = bench.pid("recorder")
+        with ProcessGroup(settings) as processes:
+            processes.start("recorder")
+            processes.await_role("recorder")
+            pid = processes.pid("recorder")
             before = cpu_s(pid)
             run_publishers(settings.network.rendezvous, names, seconds)
             used = cpu_s(pid) - before
-            bench.stop("recorder")
+            processes.stop("recorder")
         size = sum(path.stat().st_size for path in Path(folder).glob("*.mcap"))
         return counted(Path(folder)), used / seconds, size / seconds * 3600 / 1e6
 

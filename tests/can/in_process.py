@@ -88,7 +88,7 @@ class Stranger:
         for base in (PLANT_HEARTBEAT_ID, CONTROLLER_HEARTBEAT_ID):
             self.say(base + self._node, mark.pack())
         for link in links:
-            eventually("the mark", lambda link=link: link.heard is not None and link.heard[:3] == mark[:3])  # type: ignore[misc]
+            eventually("the mark", lambda link=link: link.peer is not None and link.peer[:3] == mark[:3])  # type: ignore[misc]
 
 
 class Flaws:

@@ -113,7 +113,7 @@ class Ends:
 
     def heard_state(self) -> PlantState | None:
         """What the node last heard from the bridge."""
-        return self.node.heard.state if self.node.heard else None
+        return self.node.peer.state if self.node.peer else None
 
     def trip(self) -> str:
         """Why the bridge tripped, once it has; the node has been told to rest then."""
@@ -160,8 +160,8 @@ def test_it_tells_the_node_of_a_session_its_number_and_its_end(ends: Ends) -> No
     eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
     for number in (1, 2):
         ends.hold()
-        assert ends.node.heard is not None
-        assert ends.node.heard[1:3] == (number, OURS)
+        assert ends.node.peer is not None
+        assert ends.node.peer[1:3] == (number, OURS)
         assert ends.release()
         eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
         ends.say(PlantState.IDLE)

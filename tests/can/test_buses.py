@@ -116,7 +116,7 @@ class Loop:
             self.node = self._stack.enter_context(Node(self.hil, self._folder, channel, *of_the_node))
         else:
             self.hil.start(settings=settings, drive=False)
-        self.hil.bench.start("controller")
+        self.hil.processes.start("controller")
 
     def driven(self) -> bool:
         """Whether the plant is driven, as its bridge last said."""
@@ -139,7 +139,7 @@ def test_in_lockstep_the_figures_are_those_of_the_experiment_to_the_last_bit(
 ) -> None:
     with Loop(tmp_path, interface, lockstep=True) as loop:
         loop.start({"controller.duration_s": 0.5, **settings})
-        loop.hil.eventually("the end", lambda: not loop.hil.bench.running("controller"))
+        loop.hil.eventually("the end", lambda: not loop.hil.processes.running("controller"))
         wire = loop.hil.settings.wire
         log = loop.hil.log
     figures = review(log.path)
@@ -155,7 +155,7 @@ def test_in_real_time_it_tracks(tmp_path: Path, interface: str, settings: dict[s
 
     Commands come a tick or two later than in lockstep, some ticks go unanswered where other work keeps a process
     waiting, and most of the error is that of the start, which no command can mend sooner. On the first of the buses
-    service/contract proves the same.
+    service/description proves the same.
     """
     with Loop(tmp_path, interface) as loop:
         loop.start({**MORE_PATIENT, **settings})
@@ -253,7 +253,7 @@ def test_a_node_that_dies_is_missed_within_half_a_second_and_driven_again_when_i
     hil.kill("can-node")
     hil.eventually("the trip", lambda: hil.happened("tripped"))
     hil.eventually("a refusal", lambda: hil.happened("refused", "silent"))
-    hil.bench.start("can-node")
+    hil.processes.start("can-node")
     hil.eventually("the latch", lambda: hil.happened("refused", "aeroloop op arm"))
     hil.arm()
     hil.eventually("driving again", lambda: hil.state("plant") == "driven" and hil.state("controller") == "running")

@@ -145,7 +145,7 @@ def test_two_nodes_on_one_bus_do_not_hear_each_other() -> None:
         plant_1.beat(Heartbeat(PlantState.DRIVEN, 0, MARK))
         controller_1.beat(Heartbeat(PlantState.GRANTED, 5, MARK))
         near_1.settle(plant_1, controller_1)
-        assert plant_2.heard is controller_2.heard is None
+        assert plant_2.peer is controller_2.peer is None
         assert isinf(plant_2.silent_s())
         assert isinf(controller_2.silent_s())
         near_2.settle(plant_2, controller_2)
@@ -254,7 +254,7 @@ def test_what_is_not_for_this_end_is_ignored(identifiers: list[int], how: dict[s
                 stranger.say(identifier, **{"data": bytes(size), "dlc": size, **how})
         stranger.say(FRAME, b"")
         eventually("what came after them", lambda: controller.refused == 1)
-        assert controller.heard is None
+        assert controller.peer is None
         assert controller.take() is None
         assert controller.fault is None
         assert isinf(controller.silent_s())
@@ -266,8 +266,8 @@ def test_what_is_not_for_this_end_is_ignored(identifiers: list[int], how: dict[s
 
 def next_heartbeat(link: CanLink) -> Heartbeat:
     """The one that comes next, taken away so that another can be waited for."""
-    eventually("a heartbeat", lambda: link.heard is not None)
-    heard, link.heard = link.heard, None
+    eventually("a heartbeat", lambda: link.peer is not None)
+    heard, link.peer = link.peer, None
     assert heard is not None
     return heard
 
@@ -328,11 +328,11 @@ def test_a_malformed_heartbeat_is_refused_and_the_last_one_stands() -> None:
     malformed = [b"", bytes(7), bytes(12), *(bytes([state]) + bytes(7) for state in range(4, 16))]
     with both_ends(virtual()) as (_, controller, stranger):
         stranger.settle(controller)
-        before = controller.heard
+        before = controller.peer
         for data in malformed:
             stranger.say(PLANT_HEARTBEAT_ID + 1, data)
         eventually("the refusals", lambda: controller.refused == len(malformed))
-        assert controller.heard is before
+        assert controller.peer is before
 
 
 # ── what both ends must agree on ──

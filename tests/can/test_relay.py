@@ -411,7 +411,7 @@ class Bus:
         self.side.close()
         self.stranger.__exit__(None, None, None)
 
-    def tell(self, state: PlantState, number: int = 1, mark: bytes = OURS) -> None:
+    def send_heartbeat(self, state: PlantState, number: int = 1, mark: bytes = OURS) -> None:
         """Let the controller's side say this from now on, ten times a second."""
         self.say, self.said_at = Heartbeat(state, number, mark), 0.0
 
@@ -445,11 +445,11 @@ class Bus:
     def hears(self, state: PlantState, number: int = 0) -> None:
         """Turn until the controller's side has heard this from the node."""
         wanted = (state, number, OURS)
-        self.until(f"heartbeat {wanted}", lambda: self.side.heard is not None and self.side.heard[:3] == wanted)
+        self.until(f"heartbeat {wanted}", lambda: self.side.peer is not None and self.side.peer[:3] == wanted)
 
     def begin(self, number: int = 1) -> None:
         """Turn until a session has begun."""
-        self.tell(PlantState.GRANTED, number)
+        self.send_heartbeat(PlantState.GRANTED, number)
         self.until("the session", lambda: self.endpoint.session == f"can-{number}")
 
     def drive(self, code: int = 5) -> None:
@@ -536,7 +536,7 @@ def test_heartbeats_come_ten_times_a_second_and_at_once_on_a_change(bus: Bus) ->
     ],
 )
 def test_another_fingerprint_is_never_followed(bus: Bus, mark: bytes, caplog: pytest.LogCaptureFixture) -> None:
-    bus.tell(PlantState.GRANTED, 1, mark)
+    bus.send_heartbeat(PlantState.GRANTED, 1, mark)
     bus.until("the refusal", lambda: "another wire spec" in caplog.text)
     for echo in range(40):
         bus.side.send(command(echo))
@@ -552,7 +552,7 @@ def test_another_fingerprint_is_never_followed(bus: Bus, mark: bytes, caplog: py
 def test_another_fingerprint_ends_a_session_that_runs(bus: Bus) -> None:
     bus.begin()
     bus.drive()
-    bus.tell(PlantState.GRANTED, 2, bytes(7))
+    bus.send_heartbeat(PlantState.GRANTED, 2, bytes(7))
     bus.hears(PlantState.IDLE)
     bus.turn_for(0.15)
     assert bus.plant.voltages == OFF
@@ -562,7 +562,7 @@ def test_another_fingerprint_ends_a_session_that_runs(bus: Bus) -> None:
 def test_idle_from_the_other_side_releases_it(bus: Bus) -> None:
     bus.begin()
     bus.drive()
-    bus.tell(PlantState.IDLE)
+    bus.send_heartbeat(PlantState.IDLE)
     bus.hears(PlantState.IDLE)
     bus.turn()
     assert bus.plant.voltages == OFF
@@ -617,7 +617,7 @@ def test_a_session_begins_afresh_with_counter_0_whatever_the_last_one_came_to(bu
         bus.begin(number)
         assert bus.counters(1)[0] == 0
         bus.turn_for(0.01 * number)
-        bus.tell(PlantState.IDLE)
+        bus.send_heartbeat(PlantState.IDLE)
         bus.until("the release", lambda: bus.endpoint.session is None)
         bus.stranger.everything()
 
@@ -641,7 +641,7 @@ def test_a_trip_stands_until_there_is_another_session_and_says_its_cause(bus: Bu
     bus.turn_for(0.05)
     assert bus.endpoint.state is PlantState.TRIPPED
     assert bus.plant.voltages == OFF
-    bus.tell(PlantState.IDLE, 1)
+    bus.send_heartbeat(PlantState.IDLE, 1)
     bus.turn_for(0.05)
     assert bus.endpoint.state is PlantState.TRIPPED, "a release is not an arming"
     bus.begin(number=2)
@@ -654,9 +654,9 @@ def test_a_node_that_leaves_says_idle_and_is_at_rest(bus: Bus) -> None:
     bus.front.leave()
     bus.stranger.heartbeat(PlantState.IDLE)
     assert bus.endpoint.session is None
-    sent = bus.side.heard
+    sent = bus.side.peer
     bus.front.leave()
-    assert bus.side.heard is sent
+    assert bus.side.peer is sent
 
 
 # ── the node's bus fails ──
@@ -673,7 +673,7 @@ def test_a_bus_that_fails_for_a_moment_is_opened_again_and_the_session_goes_on(
     assert bus.side.reopen()
     assert flaws.opened == opened + 2
     bus.stranger.everything()
-    bus.side.heard = None
+    bus.side.peer = None
     bus.hears(PlantState.DRIVEN)
     assert bus.counters(1)
     bus.turn_for(0.2)
@@ -698,7 +698,7 @@ def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
     assert sum("trying again" in record.getMessage() for record in caplog.records) == 1
     flaws.lost = flaws.gone = False
     assert bus.side.reopen()
-    bus.tell(PlantState.IDLE)
+    bus.send_heartbeat(PlantState.IDLE)
     bus.hears(PlantState.TRIPPED, 7)  # mended, it says what happened
     bus.begin(number=2)
     bus.hears(PlantState.GRANTED)

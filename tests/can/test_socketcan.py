@@ -98,11 +98,11 @@ class TestInside:
                     assert arrival is not None
                     assert arrival.frame == frame
             plant.beat(Heartbeat(PlantState.TRIPPED, 9, b"fingers"))
-            eventually("the heartbeat", lambda: controller.heard is not None)
-            assert controller.heard is not None
-            assert controller.heard.cause is TripCause.BUS
-            assert controller.heard[:3] == (PlantState.TRIPPED, 9, b"fingers")
-            assert plant.heard is None
+            eventually("the heartbeat", lambda: controller.peer is not None)
+            assert controller.peer is not None
+            assert controller.peer.cause is TripCause.BUS
+            assert controller.peer[:3] == (PlantState.TRIPPED, 9, b"fingers")
+            assert plant.peer is None
             assert plant.errors == plant.refused == controller.errors == controller.refused == 0
             assert plant.fault is controller.fault is None
         finally:

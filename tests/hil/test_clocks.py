@@ -18,7 +18,7 @@ import pytest
 from aeroloop.protocol.messages.trace import End
 from aeroloop.service.config import load
 from aeroloop.service.testing.hil import HilLog
-from aeroloop.service.testing.process_group import Bench, free_rendezvous
+from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
 from tests.hil.test_processes import eventually
 from tests.hil.test_recorder import PATIENT, RATE, Statuses, assert_whole
 
@@ -68,17 +68,17 @@ def run(
         f"network.rendezvous={free_rendezvous()}", f"recorder.path={tmp_path / 'a.mcap'}", "controller.auto_arm=true",
         "controller.require_recorder=true",
     ])  # fmt: skip
-    with Bench(settings) as bench:
-        statuses = Statuses(bench, settings)
+    with ProcessGroup(settings) as processes:
+        statuses = Statuses(processes, settings)
         for role in ("recorder", "plant", "controller"):
-            bench.start(role, environment=environments.get(role))
+            processes.start(role, environment=environments.get(role))
         eventually("driving", lambda: statuses.state("plant") == "driven")
         time.sleep(RUN_S / 2)
         during()
         time.sleep(RUN_S / 2)
         assert statuses.state("plant") == "driven"
         for role in ("controller", "plant"):
-            bench.stop(role)  # type: ignore[arg-type]  # a role
+            processes.stop(role)  # type: ignore[arg-type]  # a role
     judged = assert_whole(tmp_path, round(0.5 * RUN_S * RATE))
     assert judged.sessions == 1
     assert judged.trips == []
@@ -131,10 +131,10 @@ def assert_stepped(tmp_path: Path, end: End) -> None:
 def test_the_watchdog_trips_as_soon_whatever_the_plants_clock_reads() -> None:
     """A killed controller is gone within the watchdog's 100 ms and what two busy cores add."""
     settings = load(overrides=[f"network.rendezvous={free_rendezvous()}", "controller.auto_arm=true"])
-    with Bench(settings) as bench:
-        statuses = Statuses(bench, settings)
-        bench.start("plant", environment=faketime("-10s"))
-        bench.start("controller")
+    with ProcessGroup(settings) as processes:
+        statuses = Statuses(processes, settings)
+        processes.start("plant", environment=faketime("-10s"))
+        processes.start("controller")
         eventually("driving", lambda: statuses.state("plant") == "driven")
-        bench.stop("controller", how=9)  # type: ignore[arg-type]  # SIGKILL
+        processes.stop("controller", how=9)  # type: ignore[arg-type]  # SIGKILL
         eventually("the trip", lambda: statuses.state("plant") == "tripped", 5.0)

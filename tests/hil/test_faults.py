@@ -223,7 +223,7 @@ def test_who_does_not_have_the_session_moves_nothing(hil: Hil) -> None:
     deadline = time.monotonic() + 1.0
     while time.monotonic() < deadline:
         for session in ("stranger", "*", "**", "00000000"):
-            hil.bench.zenoh.put(topics.key("command", vehicle, session=session), full)
+            hil.processes.zenoh.put(topics.key("command", vehicle, session=session), full)
         time.sleep(0.01)
     log = hil.log
     assert not any(any(truth.voltages) for _, truth in log.messages("truth") if isinstance(truth, Truth))

@@ -27,7 +27,7 @@ from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.review.review import review
 from aeroloop.service.testing.hil import HilLog
-from aeroloop.service.testing.process_group import Bench, free_rendezvous
+from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
 
 AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 FIGURES = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command")
@@ -222,18 +222,18 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
             "plant.truth_rate_hz=500",
         ]
     )
-    with Bench(settings) as bench:
-        bench.start("recorder")
-        bench.start("plant")
-        bench.await_role("recorder")
-        bench.await_role("plant")
+    with ProcessGroup(settings) as processes:
+        processes.start("recorder")
+        processes.start("plant")
+        processes.await_role("recorder")
+        processes.await_role("plant")
         commands: list[bytes] = []
-        bench.zenoh.declare_subscriber(
+        processes.zenoh.declare_subscriber(
             topics.key("command", settings.vehicle), lambda sample: commands.append(sample.payload.to_bytes())
         )
-        bench.start("controller")
+        processes.start("controller")
         eventually("driving", lambda: len(commands) > 200)
-        bench.stop("controller", signal.SIGKILL)
+        processes.stop("controller", signal.SIGKILL)
         time.sleep(0.5)  # five watchdogs, and all the time there is for a wrong plant to go on at its last command
     last_command = max(HilLog(log).times("plant", "received"))
     truths = [(at_ns, truth) for at_ns, truth in HilLog(log).messages("truth") if isinstance(truth, Truth)]

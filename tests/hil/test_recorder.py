@@ -25,7 +25,7 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil
-from aeroloop.service.testing.process_group import Bench, free_rendezvous
+from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
 from tests.hil.cable import Cable
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
 from tests.protocol.gathering import free_port
@@ -91,14 +91,14 @@ def test_a_recorder_that_starts_long_after_the_loop_has_it_from_the_first_tick(t
         *(f"{name}={value}" for name, value in PATIENT.items()),
         f"network.rendezvous={free_rendezvous()}", f"recorder.path={tmp_path / 'a.mcap'}", "controller.auto_arm=true",
     ])  # fmt: skip
-    with Bench(settings) as bench:
-        statuses = Statuses(bench, settings)
-        bench.start("plant")
-        bench.start("controller")
+    with ProcessGroup(settings) as processes:
+        statuses = Statuses(processes, settings)
+        processes.start("plant")
+        processes.start("controller")
         eventually("driving", lambda: statuses.state("plant") == "driven")
         time.sleep(20)
-        bench.start("recorder")
-        bench.await_role("recorder")
+        processes.start("recorder")
+        processes.await_role("recorder")
         time.sleep(1)
     assert_whole(tmp_path, round(0.5 * RATE * 20))
 
@@ -112,13 +112,13 @@ def test_a_recorder_whose_links_are_cut_for_ten_seconds_lacks_nothing(tmp_path: 
     ])  # fmt: skip
     with ExitStack() as stack:
         cables = [stack.enter_context(Cable(port)) for port in ports.values()]
-        bench = stack.enter_context(Bench(settings))
-        statuses = Statuses(bench, settings)
+        processes = stack.enter_context(ProcessGroup(settings))
+        statuses = Statuses(processes, settings)
         for role, port in ports.items():
-            bench.start(role, "--set", f'network.listen=["tcp/127.0.0.1:{port}"]')  # type: ignore[arg-type]  # a role
+            processes.start(role, "--set", f'network.listen=["tcp/127.0.0.1:{port}"]')  # type: ignore[arg-type]  # a role
         endpoints = ", ".join(f'"{cable.endpoint}"' for cable in cables)
         alone = ("network.rendezvous=''", "network.listen=[]", "network.gossip=false", f"network.connect=[{endpoints}]")
-        bench.start("recorder", *(word for option in alone for word in ("--set", option)))
+        processes.start("recorder", *(word for option in alone for word in ("--set", option)))
         eventually("driving", lambda: statuses.state("plant") == "driven")
         time.sleep(2)
         for cable in cables:
@@ -127,8 +127,8 @@ def test_a_recorder_whose_links_are_cut_for_ten_seconds_lacks_nothing(tmp_path: 
         for cable in cables:
             cable.mend()
         time.sleep(3)
-        bench.stop("controller")
-        bench.stop("plant")
+        processes.stop("controller")
+        processes.stop("plant")
     assert_whole(tmp_path, round(0.5 * RATE * 10))
 
 
@@ -165,9 +165,9 @@ def test_what_a_killed_end_computed_last_is_named(tmp_path: Path) -> None:
 class Statuses:
     """The last status of every role."""
 
-    def __init__(self, bench: Bench, settings: Settings) -> None:
+    def __init__(self, processes: ProcessGroup, settings: Settings) -> None:
         self._last: dict[str, Status] = {}
-        bench.zenoh.declare_subscriber(key("status", settings.vehicle), self._take)
+        processes.zenoh.declare_subscriber(key("status", settings.vehicle), self._take)
 
     def _take(self, sample: Any) -> None:
         status = Status.model_validate_json(sample.payload.to_bytes())
@@ -257,11 +257,11 @@ def test_a_full_disk_stops_neither_the_loop_nor_for_good_the_recorder_and_costs_
     settings = load(overrides=[*patient, *more, "controller.require_recorder=true"])
     small = SmallDisk(unshare, tmp_path, settings)
     try:
-        with Bench(settings) as bench:
-            statuses = Statuses(bench, settings)
-            bench.start("plant")
-            bench.await_role("plant")
-            bench.start("controller")  # which waits for the recorder by itself
+        with ProcessGroup(settings) as processes:
+            statuses = Statuses(processes, settings)
+            processes.start("plant")
+            processes.await_role("plant")
+            processes.start("controller")  # which waits for the recorder by itself
             eventually("driving", lambda: statuses.state("plant") == "driven")
             small.fill()
             eventually("its word", lambda: statuses.state("recorder") == "waiting for the disk")
@@ -271,8 +271,8 @@ def test_a_full_disk_stops_neither_the_loop_nor_for_good_the_recorder_and_costs_
             eventually("its word", lambda: statuses.state("recorder") == "recording")
             before = statuses.ticks()
             eventually("some more", lambda: statuses.ticks() > before + 2 * RATE)
-            bench.stop("controller")
-            bench.stop("plant")
+            processes.stop("controller")
+            processes.stop("plant")
             assert small.stop() == 0
     finally:
         small.kill()

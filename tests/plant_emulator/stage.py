@@ -1,7 +1,7 @@
 """A driver's loop without a network or a clock: a grid, a link and a front that do what a test says.
 
 A test says what is done between ticks, how measurements are answered, and which ticks are skipped; the trace is what
-a Presence would have published.
+a ZenohFront would have published.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ class Stage(Front):
             self._answer(self, frame)
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """As a Presence does."""
+        """As a ZenohFront does."""
         self.trace.row(self.endpoint, measurement, arrival, sent_ns)
         self.wires.tick = self.endpoint.ticked
         self.follow_session()
@@ -182,18 +182,18 @@ class Stage(Front):
             self.stop.set()
 
     def follow_session(self) -> None:
-        """As a Presence does."""
+        """As a ZenohFront does."""
         self.trace.follow(self.endpoint)
         if self.endpoint.session is None:
             self.wires.close()
 
-    def tell_when_due(self) -> None:
+    def publish_when_due(self) -> None:
         """Nothing to tell."""
 
-    def tell(self) -> None:
+    def publish_status(self) -> None:
         """Nothing to tell."""
 
     def leave(self) -> None:
-        """As a Presence does."""
+        """As a ZenohFront does."""
         self.follow_session()
         self.trace.finish()

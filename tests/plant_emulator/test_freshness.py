@@ -1,4 +1,4 @@
-"""Which commands count: judged by ticks alone, against a model that knows the tick of every measurement.
+"""SessionKey commands count: judged by ticks alone, against a model that knows the tick of every measurement.
 
 A short counter of 16 ticks and a watchdog of 5, so that counters come round often.
 """

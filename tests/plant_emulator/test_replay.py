@@ -242,7 +242,9 @@ def test_another_process_and_another_wire_are_not_followed() -> None:
     batches.append(batches[0]._replace(header=batches[0].header._replace(run=1)))
     assert replayed(loop, wire, PLANT, batches).stopped == "the plant was started again"
     wider = WireSpec().with_bits(10, 10)
-    assert replayed(loop, wider, PLANT, batches).stopped == "the rows are not of the wire that the contract describes"
+    assert (
+        replayed(loop, wider, PLANT, batches).stopped == "the rows are not of the wire that the description describes"
+    )
 
 
 @pytest.mark.parametrize("via", ["can", "quanser", "quanser-fake"])

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.messages.models import (
     PROTOCOL_VERSION,
     Claim,
-    Contract,
+    Description,
     Event,
     Grant,
     Loss,
@@ -59,7 +59,7 @@ MESSAGES: list[Message] = [
     Refusal(reason="held by c2 since 3 s", holder="c2", differences=["rate.bits: 8, not 10"]),
     Refusal(reason="not now"),
     Release(session="5f0c"),
-    Contract(
+    Description(
         protocol=PROTOCOL_VERSION,
         role="plant",
         vehicle="aero",

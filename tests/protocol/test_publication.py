@@ -139,7 +139,7 @@ def test_a_cache_that_is_not_yet_known_is_queried_again_and_what_is_received_mea
     session = network.join(network.settings)
     _publisher, first = sixth(network, session)
     unreachable = Unreachable(session, queries=2)
-    join = publication.Join(unreachable, first)  # type: ignore[arg-type]  # a double
+    join = publication.CacheQuery(unreachable, first)  # type: ignore[arg-type]  # a double
     later = first._replace(sequence=6)
     join.held.append(later)
     eventually("the answer", join.finished)
@@ -155,7 +155,7 @@ def test_a_cache_that_never_answers_holds_messages_back_for_a_while_only(
     session = network.join(network.settings)
     _publisher, first = sixth(network, session)
     unreachable = Unreachable(session, queries=1000)
-    join = publication.Join(unreachable, first)  # type: ignore[arg-type]  # a double
+    join = publication.CacheQuery(unreachable, first)  # type: ignore[arg-type]  # a double
     assert not join.finished()
     eventually("giving up", join.finished)
     assert unreachable.left < 999

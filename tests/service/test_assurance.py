@@ -23,7 +23,7 @@ def of(gains: Gains) -> LawSettings:
 
 
 class Certified(Loop):
-    """A loop whose Live asks for certificates."""
+    """A loop whose OperatorChanges asks for certificates."""
 
     def __init__(self, *, required: bool, reference: Reference | None = None) -> None:
         settings = ControllerSettings(require_certificate=required)
@@ -41,7 +41,7 @@ class Certified(Loop):
 def certified() -> Certified:
     """A session of a controller that must be certified, and is."""
     loop = Certified(required=True)
-    loop.assurance.tell()
+    loop.assurance.publish()
     loop.begin()
     loop.tick()
     return loop
@@ -55,7 +55,7 @@ def wait_for_threads() -> None:
 
 
 def test_the_verdict_is_told_once_and_again_when_it_changes(certified: Certified) -> None:
-    certified.assurance.tell()
+    certified.assurance.publish()
     ((kind, text),) = certified.verdicts
     assert kind == "started"
     assert text.startswith("Theorem 1 holds: c₀/2 = 0.075")
@@ -129,7 +129,7 @@ def test_where_it_comes_to_rest_is_certified_beside_the_loop(certified: Certifie
 
 def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
     loop = Certified(required=True)
-    loop.assurance.tell()
+    loop.assurance.publish()
     for gains in (FAILING, BETTER):
         loop.assurance.weigh(*loop.live.prospect(of(gains), Sinusoid()))
         loop.live.adopt(of(gains), Sinusoid())

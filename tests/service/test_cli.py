@@ -95,9 +95,9 @@ def test_the_shown_configuration_read_back_is_the_same(capfd: pytest.CaptureFixt
     assert run(["show", "config", *overrides]) == 0
     path.write_text(capfd.readouterr().out)
     shown = load(path)
-    assert shown.contract() == load(overrides=[text for text in overrides if text != "--set"]).contract()
+    assert shown.description() == load(overrides=[text for text in overrides if text != "--set"]).description()
     assert shown.wire.attitude.bits is None
-    assert shown.contract() != load().contract()
+    assert shown.description() != load().description()
 
 
 def test_the_environment_overrides_the_file_and_set_overrides_both(

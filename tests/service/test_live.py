@@ -38,8 +38,8 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.daemon import operator_changes as live
-from aeroloop.service.daemon.certificate_gate import Assurance
-from aeroloop.service.daemon.operator_changes import Live
+from aeroloop.service.daemon.certificate_gate import CertificateGate
+from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.settings import ControllerSettings
 
 PERIOD = 0.002
@@ -149,13 +149,13 @@ class FakeTime:
 
 
 class Loop:
-    """What the daemon does around Live, with a log of what a recorder would have kept.
+    """What the daemon does around OperatorChanges, with a log of what a recorder would have kept.
 
     Attributes:
         k: The next tick.
         session: Name of the session, or "".
         log: Of each session, its frames: (tick, measurement, command).
-        assurance: What the theorem promises of it by a wire; Live asks for it if a wire is given.
+        assurance: What the theorem promises of it by a wire; OperatorChanges asks for it if a wire is given.
     """
 
     def __init__(
@@ -166,9 +166,11 @@ class Loop:
             patch.setattr(role, "join", lambda _: self.network)
             self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
-        self.assurance = Assurance(self.role, wire or WIRE, LAW, reference, settings)
+        self.assurance = CertificateGate(self.role, wire or WIRE, LAW, reference, settings)
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
-        self.live = Live(self.role, LAW, reference, settings, self.trace, self.assurance if wire else None, rolls=rolls)
+        self.live = OperatorChanges(
+            self.role, LAW, reference, settings, self.trace, self.assurance if wire else None, rolls=rolls
+        )
         self.live.serve()
         self.controller = self.fresh()
         self.k = 0
@@ -271,7 +273,7 @@ def time(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
 
 
 @pytest.fixture
-def loop(time: FakeTime) -> Iterable[Loop]:  # noqa: ARG001  # the clock must stand still before Live looks at it
+def loop(time: FakeTime) -> Iterable[Loop]:  # noqa: ARG001  # the clock must stand still before OperatorChanges looks at it
     """A session at tick 0, level; whatever a test does to it, its log must run again."""
     loop = Loop(LEVEL, ControllerSettings())
     loop.begin()

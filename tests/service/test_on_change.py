@@ -14,7 +14,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
 from aeroloop.service import examples
 from aeroloop.service.config import ConfigError, Settings, load, with_bits
-from aeroloop.service.control.controller import Controller, ControllerState
+from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
@@ -149,7 +149,7 @@ def test_a_restored_controller_goes_on_with_the_levels_it_held_and_what_it_sent(
 
     law, restored = controller(), controller()
     run(law, range(at))
-    restored.restore(ControllerState.model_validate_json(law.state.model_dump_json()))
+    restored.restore(ControllerSnapshot.model_validate_json(law.state.model_dump_json()))
     assert run(restored, range(at, 60)) == run(law, range(at, 60))
     assert restored.state == law.state
 

@@ -78,7 +78,7 @@ def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str, monkey
         return run_experiment(settings, duration_s / 500)
 
     monkeypatch.setattr("aeroloop.service.lab.cells.run_experiment", instead)
-    run_cell(throughout(kind).contract(), Cell(bits_out=9, bits_in=7))
+    run_cell(throughout(kind).description(), Cell(bits_out=9, bits_in=7))
     wire = seen[0].wire
     assert [(signal.kind, signal.bits) for signal in (wire.attitude, wire.rate, wire.voltage)] == [
         (kind, 9), (kind, 9), (kind, 7)

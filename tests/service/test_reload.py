@@ -125,7 +125,7 @@ def test_several_differences_are_told_a_line_each_in_order_and_each_for_itself()
 @pytest.mark.parametrize("role", ROLES)
 def test_every_key_that_is_said_to_take_effect_at_once_is_there(role: str) -> None:
     for name in LIVE[role]:
-        tree: object = Settings().contract()
+        tree: object = Settings().description()
         for part in name.split("."):
             assert isinstance(tree, dict)
             tree = tree[part]
@@ -138,7 +138,7 @@ class Hangup:
 
     def __init__(self) -> None:
         self.reload: Callable[[], Action] | None = None
-        self.contract: dict[str, Any] = {}
+        self.description: dict[str, Any] = {}
         self.certificate: dict[str, Any] | None = None
         self.told: list[tuple[str, str]] = []
 
@@ -148,7 +148,7 @@ class Hangup:
 
     def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None) -> None:
         """Keep it."""
-        self.contract, self.certificate = config, certificate
+        self.description, self.certificate = config, certificate
 
     def event(self, kind: str, text: str) -> None:
         """Keep it."""
@@ -168,7 +168,7 @@ def test_what_was_read_again_is_taken_over_between_ticks_and_told() -> None:
     assert (taken, role.told) == ([], [])  # reading takes time, so it is done elsewhere
     act()
     assert [settings.law.C1 for settings in taken] == [(1.0, 1.0, 1.0)]
-    assert role.contract["law"]["C1"] == [1.0, 1.0, 1.0]
+    assert role.description["law"]["C1"] == [1.0, 1.0, 1.0]
     role.hang_up()
     assert role.told == [
         ("changed", "configuration read again: law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]"),
@@ -176,12 +176,12 @@ def test_what_was_read_again_is_taken_over_between_ticks_and_told() -> None:
     ]
 
 
-def test_what_needs_a_restart_is_not_in_the_contract_before_it() -> None:
+def test_what_needs_a_restart_is_not_in_the_description_before_it() -> None:
     role = Hangup()
     reload_on_hangup(cast(Role, role), load(), lambda: load(overrides=["law.mass=2"]), lambda _: None)
     role.hang_up()
     assert role.told == [("changed", "configuration read again: law.mass: 1.075 → 2.0, after a restart")]
-    assert role.contract["law"]["mass"] == 1.075
+    assert role.description["law"]["mass"] == 1.075
 
 
 def test_what_the_theorem_promises_is_told_of_the_new_gains_and_computed_before_the_tick() -> None:

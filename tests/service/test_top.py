@@ -6,7 +6,7 @@ from io import StringIO
 
 from rich.console import Console
 
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Message
 from aeroloop.service.config import load
 from aeroloop.service.terminal.monitor import SILENT_S, Top
@@ -27,7 +27,7 @@ def status(role: str, state: str) -> Status:
 def heard(**messages: Message) -> Top:
     top = Top()
     for key, message in messages.items():
-        top.hear(f"aeroloop/aero/{key.replace('__', '/')}", message.encode())
+        top.receive(f"aeroloop/aero/{key.replace('__', '/')}", message.encode())
     return top
 
 
@@ -37,7 +37,7 @@ def test_an_empty_network_is_told_as_such() -> None:
 
 def test_every_role_of_every_vehicle_is_shown_with_its_state() -> None:
     top = heard(status__plant=status("plant", "driven"), status__controller=status("controller", "running"))
-    top.hear("aeroloop/other/status/plant", status("plant", "tripped").encode())
+    top.receive("aeroloop/other/status/plant", status("plant", "tripped").encode())
     shown = text(top)
     for word in ("aero", "other", "driven", "running", "tripped", "500/s", "7"):
         assert word in shown
@@ -52,8 +52,13 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
     shown = text(
         heard(
             status__controller=status("controller", "running"),
-            contract__plant=Contract(
-                protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=load().contract()
+            description__plant=Description(
+                protocol=PROTOCOL_VERSION,
+                role="plant",
+                vehicle="aero",
+                host="h",
+                versions={},
+                config=load().description(),
             ),
             telemetry=telemetry,
             truth=Truth(tick=1, attitude=(half, 0.0, 0.0, half), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0)),
@@ -65,20 +70,20 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
 
 
 def test_where_only_changes_are_sent_the_bits_are_those_of_the_frames_that_were() -> None:
-    config = load(overrides=["wire.transmit.command=on_change"]).contract()
+    config = load(overrides=["wire.transmit.command=on_change"]).description()
     top = heard(
-        contract__plant=Contract(
+        description__plant=Description(
             protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config
         )
     )
     for uptime_s, sent in ((1.0, 40), (3.0, 440), (3.1, 441)):  # the last says nothing of a rate
         told = status("controller", "running").model_copy(update={"uptime_s": uptime_s, "sent": sent, "received": 10})
-        top.hear("aeroloop/aero/status/controller", told.encode())
+        top.receive("aeroloop/aero/status/controller", told.encode())
     assert "28.0 + 4.8 kbit/s" in text(top)  # 500 measurements of 7 bytes, 200 commands of 3
     again = status("controller", "running").model_copy(update={"uptime_s": 0.5, "sent": 3})
     after = again.model_copy(update={"uptime_s": 1.5, "sent": 103})
     for told in (again, after):  # started anew, and so are its counts
-        top.hear("aeroloop/aero/status/controller", told.encode())
+        top.receive("aeroloop/aero/status/controller", told.encode())
     assert "28.0 + 2.4 kbit/s" in text(top)
 
 
@@ -92,6 +97,11 @@ def test_a_role_that_fell_silent_is_shown_so() -> None:
 
 def test_what_is_not_understood_is_left_out() -> None:
     top = heard(status__plant=status("plant", "driven"))
-    for key in ("aeroloop/aero/status/plant", "aeroloop/aero/telemetry", "aeroloop/aero/contract/plant", "elsewhere"):
-        top.hear(key, b'{"not": "a message"}')
+    for key in (
+        "aeroloop/aero/status/plant",
+        "aeroloop/aero/telemetry",
+        "aeroloop/aero/description/plant",
+        "elsewhere",
+    ):
+        top.receive(key, b'{"not": "a message"}')
     assert "driven" in text(top)

@@ -101,7 +101,7 @@ class FakeQuanser:
     Args:
         settings: The Aero. Its joints have the card's encoders, and its IMU the gyro of `settings.sensors`.
         period: Time between samples [s].
-        card_type: Which board is plugged in, a key of BOARDS.
+        card_type: SessionKey board is plugged in, a key of BOARDS.
         realtime: Whether samples come due by the clock, or when they are read.
 
     Raises:

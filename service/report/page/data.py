@@ -23,7 +23,7 @@ SPREADS: Final = {
     "command_delay": "From the controller to the plant",
     "period": "Period between measurements",
 }
-"""Which distributions are drawn, in this order, and what they are called."""
+"""SessionKey distributions are drawn, in this order, and what they are called."""
 
 GRAVE: Final = frozenset({"tripped", "fault", "lost", "refused"})
 """Kinds of events that one looks for first."""

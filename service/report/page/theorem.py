@@ -39,7 +39,7 @@ def theorem(reports: Sequence[Report]) -> Html:
 
 
 def judged(found: TheoremFindings) -> str:
-    """Which true states the inequalities are judged by, in a sentence or two."""
+    """SessionKey true states the inequalities are judged by, in a sentence or two."""
     if not found.samples:
         return ""
     left_out = [f"At {count:,} {UNMET.get(name, name)}." for name, count in found.outside.items() if count]

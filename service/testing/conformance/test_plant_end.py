@@ -49,11 +49,11 @@ def test_it_measures_at_its_rate_and_the_loop_tracks(hil: Hil) -> None:
 def test_the_first_measurement_of_a_session_has_counter_0_and_the_next_ones_count(hil: Hil) -> None:
     hil.start(settings=PATIENT, drive=False)
     frames: list[tuple[int, bytes]] = []
-    hil.bench.zenoh.declare_subscriber(
+    hil.processes.zenoh.declare_subscriber(
         topics.key("measurement", hil.settings.vehicle),
         lambda sample: frames.append((time.monotonic_ns(), sample.payload.to_bytes())),
     )
-    hil.bench.start("controller")
+    hil.processes.start("controller")
     hil.eventually("driving", lambda: hil.state("plant") == PlantState.DRIVEN)
     hil.run(0.5)
     form, period_ns = hil.settings.wire.measurement, hil.settings.loop.period_ns
@@ -110,7 +110,7 @@ def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil) -> None:
         "plant.limits.max_saturated_s": 0.3,
     }
     hil.start(settings={**PATIENT, **step}, drive=False)
-    hil.bench.start("controller")
+    hil.processes.start("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped"))
     assert "voltage" in hil.log.trips[0]
 
@@ -119,13 +119,13 @@ def test_without_a_valid_measurement_it_trips_and_says_so(hil: Hil, hil_plant: s
     if hil_plant not in ("emulator", "can-node"):
         pytest.skip("only an emulated plant's sensors can be told to fail; the board's fake has tests of its own")
     hil.start(settings={**PATIENT, "plant.faults": ["rate:off@0.3"]}, drive=False)
-    hil.bench.start("controller")
+    hil.processes.start("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped"))
     assert "no valid" in hil.log.trips[0]
 
 
 def test_when_it_is_stopped_it_says_so_and_its_controller_looks_for_it_again(hil: Hil) -> None:
     hil.start(settings=PATIENT)
-    assert hil.bench.stop("plant") == 0
+    assert hil.processes.stop("plant") == 0
     hil.eventually("searching", lambda: hil.state("controller") == "searching")
     assert times(hil.log, "stopped", "plant")

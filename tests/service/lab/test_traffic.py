@@ -77,7 +77,7 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
     heard: list[tuple[bytes, bytes]] = []
     figures = run_experiment(_on_change(settings), 3.0, watch=lambda _k, *frames: heard.append(frames))
 
-    seen = observe(settings.contract(), 3.0, counted=False)
+    seen = observe(settings.description(), 3.0, counted=False)
     assert seen.figures is not None
     assert (seen.figures.z_track, seen.figures.u_total) == (figures.z_track, figures.u_total)
     assert list(seen.traffic) == list(POLICIES)

@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from aeroloop.protocol.transport.network import NetworkSettings
-from aeroloop.service.lab.zenoh_bytes import Relay, count_bytes
+from aeroloop.service.lab.zenoh_bytes import CountingRelay, count_bytes
 
 SEVEN, THREE = b"1234567", b"123"
 KEEPALIVES = 60
@@ -31,7 +31,7 @@ def test_a_relay_passes_every_byte_on_and_counts_each_direction() -> None:
 
         thread = threading.Thread(target=answer)
         thread.start()
-        with Relay(server.getsockname()[1]) as relay:
+        with CountingRelay(server.getsockname()[1]) as relay:
             with socket.create_connection(("127.0.0.1", relay.port)) as near, near.makefile("rb") as stream:
                 near.sendall(there)
                 assert stream.read() == back
@@ -41,7 +41,7 @@ def test_a_relay_passes_every_byte_on_and_counts_each_direction() -> None:
 
 
 def test_a_relay_that_nobody_uses_ends() -> None:
-    with Relay(1) as relay:
+    with CountingRelay(1) as relay:
         pass
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", relay.port)).close()

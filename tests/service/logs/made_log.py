@@ -16,7 +16,7 @@ from unittest.mock import patch
 from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
 from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Contract, Grant
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Grant
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
 from aeroloop.protocol.messages.trace import End, Received, Sent, TraceWriter, read_batch
 from aeroloop.protocol.transport.link import Arrival
@@ -86,9 +86,9 @@ class Messages:
         self.all.append(Logged(START_NS + clock.now_ns, key, payload, clock.time_ns()))
 
 
-def contract(settings: Settings, role: str) -> Contract:
-    return Contract(
-        protocol=PROTOCOL_VERSION, role=role, vehicle=VEHICLE, host="h", versions={}, config=settings.contract()
+def description(settings: Settings, role: str) -> Description:
+    return Description(
+        protocol=PROTOCOL_VERSION, role=role, vehicle=VEHICLE, host="h", versions={}, config=settings.description()
     )
 
 
@@ -99,12 +99,12 @@ def write(
     chunk_every: int = 50,
     roles: tuple[str, ...] = ("controller", "plant"),
 ) -> Path:
-    """Write a log with both roles' contracts and these messages."""
+    """Write a log with both roles' descriptions and these messages."""
     path.unlink(missing_ok=True)
     log = LogFile(path)
     for role in roles:
-        key = topics.key("contract", VEHICLE, role=role)
-        log.add_metadata(CONTRACT_METADATA, {"key": key, "json": contract(settings, role).model_dump_json()})
+        key = topics.key("description", VEHICLE, role=role)
+        log.add_metadata(CONTRACT_METADATA, {"key": key, "json": description(settings, role).model_dump_json()})
     numbers: Counter[str] = Counter()
     for i, (at_ns, key, payload, published_ns) in enumerate(messages):
         log.add(Message(key, payload, numbers[key], published_ns, None), at_ns)

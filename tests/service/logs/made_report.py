@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from aeroloop.protocol.messages.models import Percentiles
-from aeroloop.service.figures import Stream
+from aeroloop.service.figures import StreamFigures
 from aeroloop.service.review.report import (
     Check,
     Findings,
@@ -80,8 +80,8 @@ def made_report(
         u_total=8185.2,
         max_error_deg=4.84,
         final_error_deg=0.46,
-        measurement=Stream(frames_per_s=499.1, bits_per_s=27952.0),
-        command=Stream(frames_per_s=498.3, bits_per_s=7972.0),
+        measurement=StreamFigures(frames_per_s=499.1, bits_per_s=27952.0),
+        command=StreamFigures(frames_per_s=498.3, bits_per_s=7972.0),
         skipped_ticks=50,
         latency_us=Percentiles(count=854, p50=640.0, p99=2400.0, p999=5900.0, max=6011.0),
         log=name,

@@ -20,9 +20,9 @@ from aeroloop.protocol.messages.trace import HEADER_BYTES, STEPS, End, read_batc
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
 from aeroloop.service.config import load
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.certificate_cache import Library
+from aeroloop.service.review.certificate_cache import CertificateCache
 from aeroloop.service.review.observe import Observer
-from aeroloop.service.review.theorem_check import Trial
+from aeroloop.service.review.theorem_check import TheoremCheck
 from tests.service.logs.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
 
 PERIOD_NS = 2_000_000
@@ -112,7 +112,7 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
 def observer_of(*overrides: str) -> Observer:
     """An observer of the default configuration."""
     settings = load(overrides=overrides)
-    return Observer(settings, Trial(Library(settings).of(()), settings.loop.period, None))
+    return Observer(settings, TheoremCheck(CertificateCache(settings).of(()), settings.loop.period, None))
 
 
 def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:

@@ -1,7 +1,7 @@
 """A log of a loop in simulated real time in which much goes wrong, and what the generator knows of it.
 
 Hitches at both ends, frames lost, late and twice in both directions, ticks skipped, faults injected and changes by an
-operator, on two clocks that differ and drift. Which of them, the seed says.
+operator, on two clocks that differ and drift. SessionKey of them, the seed says.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from aeroloop.protocol.wire.quantizer import CodedQuantizer, Quantizer
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings, load
-from aeroloop.service.control.controller import Controller, ControllerState
+from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.figures import Score
 from aeroloop.service.logs.batch import BatchController, Commands, Computed
 from aeroloop.service.logs.codes import codes_in, encoded_by, frames_of, levels
@@ -102,15 +102,15 @@ class Run:
             start=(0.0, 3.0, -7.0) if rng.random() < 0.2 else None,
         )
 
-    def controller(self, kind: type[Any], state: ControllerState | None, **more: int) -> Any:
+    def controller(self, kind: type[Any], state: ControllerSnapshot | None, **more: int) -> Any:
         """A controller as at the start, or one restored from a state that has been through JSON."""
         s = self.settings
         controller = kind(s.wire, s.law, s.reference, s.loop.period, **more)
         if state is not None:
-            controller.restore(ControllerState.model_validate_json(state.model_dump_json()))
+            controller.restore(ControllerSnapshot.model_validate_json(state.model_dump_json()))
         return controller
 
-    def loop(self, state: ControllerState | None = None, first: int = 0) -> tuple[list[Any], list[Any], list[Any]]:
+    def loop(self, state: ControllerSnapshot | None = None, first: int = 0) -> tuple[list[Any], list[Any], list[Any]]:
         """Of each tick the state before it, all that `Computed` has, NaN where there is none, and the frame sent."""
         controller, changes = self.controller(Controller, state), deque(self.changes)
         states, computed, sent = [], [], []
@@ -129,8 +129,8 @@ class Run:
         return [*states, controller.state], computed, sent
 
     def batch(
-        self, cuts: Sequence[int], states: Sequence[ControllerState | None]
-    ) -> tuple[list[ControllerState], Any, list[bytes]]:
+        self, cuts: Sequence[int], states: Sequence[ControllerSnapshot | None]
+    ) -> tuple[list[ControllerSnapshot], Any, list[bytes]]:
         """The same by blocks that end before these rows: by the same controller, or one restored where a state is."""
         controller, changes = self.controller(BatchController, None, rows=ROWS), deque(self.changes)
         after, computed, sent = [], [], []

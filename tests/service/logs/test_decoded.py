@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import (
     PROTOCOL_VERSION,
-    Contract,
+    Description,
     Event,
     Loss,
     Percentiles,
@@ -62,14 +62,14 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 ATTITUDE = product(about(3, YAW), product(about(2, PITCH), about(1, ROLL)))
 
 
-def contract(role: str = "plant", *overrides: str, vehicle: str = "aero") -> Contract:
-    return Contract(
+def description(role: str = "plant", *overrides: str, vehicle: str = "aero") -> Description:
+    return Description(
         protocol=PROTOCOL_VERSION,
         role=role,
         vehicle=vehicle,
         host="h",
         versions={},
-        config=load(None, overrides).contract(),
+        config=load(None, overrides).description(),
     )
 
 
@@ -81,7 +81,7 @@ def address(name: str, role: str = "plant", vehicle: str = "aero") -> topics.Add
 
 def configured(rate_hz: float | None = None, *overrides: str) -> Decoder:
     decoder = Decoder(rate_hz)
-    decoder.configure(contract("plant", *overrides))
+    decoder.configure(description("plant", *overrides))
     return decoder
 
 
@@ -294,7 +294,7 @@ def test_a_status_shows_state_and_recent_times_and_a_plants_brings_the_body() ->
 
 @pytest.mark.parametrize(("kind", "rotors", "stands"), [("aero", 2, 1), ("rigid_body", 0, 0)])
 def test_the_body_hangs_in_the_frame_that_its_transform_moves(kind: str, rotors: int, stands: int) -> None:
-    told = contract()
+    told = description()
     told.config["plant"]["kind"] = kind
     decoder = Decoder(None)
     decoder.configure(told)
@@ -327,26 +327,26 @@ def test_what_happens_is_a_line_of_the_log(name: str, message: Message, level: i
     assert line[3][0].startswith(words)
 
 
-# ── contracts ──
+# ── descriptions ──
 
 
-def test_frames_give_nothing_before_a_contract_and_are_read_by_the_plants() -> None:
+def test_frames_give_nothing_before_a_description_and_are_read_by_the_plants() -> None:
     decoder = Decoder(None)
     payload = measurement(*sent_vector(ATTITUDE), 0, 0, 0)
     assert decoder.frame(address("measurement"), payload, NOW) == []
-    decoder.configure(contract("recorder"))
+    decoder.configure(description("recorder"))
     assert decoder.frame(address("measurement"), payload, NOW) == []
     assert decoder.malformed == 0
-    decoder.configure(contract("controller", "wire.attitude.bits=12"))
+    decoder.configure(description("controller", "wire.attitude.bits=12"))
     assert decoder.frame(address("measurement"), payload, NOW) == []
-    decoder.configure(contract("plant"))
-    decoder.configure(contract("controller", "wire.attitude.bits=12"))
+    decoder.configure(description("plant"))
+    decoder.configure(description("controller", "wire.attitude.bits=12"))
     assert len(decoder.frame(address("measurement"), payload, NOW)) == 3
 
 
 def test_silence_in_lockstep_shows_nothing_new_and_takes_no_frames_turn() -> None:
     decoder = Decoder(25.0)
-    decoder.configure(contract("plant", "wire.transmit.measurement=on_change"))
+    decoder.configure(description("plant", "wire.transmit.measurement=on_change"))
     frame = WIRE.measurement.pack(3, (1, 2, 3, 4, 5, 6))
     assert decoder.frame(address("measurement"), b"", NOW) == []
     assert decoder.frame(address("measurement"), frame, NOW + 1)
@@ -355,19 +355,19 @@ def test_silence_in_lockstep_shows_nothing_new_and_takes_no_frames_turn() -> Non
     assert decoder.malformed == 1
 
 
-def test_a_contract_of_another_version_changes_nothing_and_is_counted() -> None:
+def test_a_description_of_another_version_changes_nothing_and_is_counted() -> None:
     decoder = configured()
     decoder.configure(
-        Contract(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config={"wire": {"bits": 3}})
+        Description(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config={"wire": {"bits": 3}})
     )
-    decoder.configure(Contract(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config={}))
+    decoder.configure(Description(protocol=2, role="plant", vehicle="aero", host="h", versions={}, config={}))
     assert decoder.malformed == 2
     assert decoder.frame(address("measurement"), measurement(0, 0, 0, 0, 0, 0), NOW)
 
 
 def test_vehicles_do_not_get_in_each_others_way() -> None:
     decoder = configured(1.0)
-    decoder.configure(contract("plant", vehicle="other"))
+    decoder.configure(description("plant", vehicle="other"))
     payload = measurement(0, 0, 0, 0, 0, 0)
     for vehicle in ("aero", "other"):
         assert {

@@ -49,8 +49,8 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     raw, rng = read(log), random.Random(3)
     files = LogFiles([log])
     decoder = Decoder(rate_hz=10)
-    for contract in files.contracts.values():
-        decoder.configure(contract)
+    for description in files.descriptions.values():
+        decoder.configure(description)
     recorded = [Said(message.topic, message.log_time, message.data) for message in raw]
     for message in raw:
         address = topics.read_key(message.topic)
@@ -58,11 +58,11 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
         recorded += [Said(d.topic, d.at_ns, d.data) for d in decoder.take(address, message.data, message.publish_time)]
     assert len(recorded) > len(raw)
     rng.shuffle(recorded)
-    contracts = [
-        (CONTRACT_METADATA, {"key": topics.key("contract", VEHICLE, role=role), "json": one.model_dump_json()})
-        for (_, role), one in files.contracts.items()
+    descriptions = [
+        (CONTRACT_METADATA, {"key": topics.key("description", VEHICLE, role=role), "json": one.model_dump_json()})
+        for (_, role), one in files.descriptions.items()
     ]
-    tell(tmp_path / "recorded.mcap", recorded, contracts)
+    tell(tmp_path / "recorded.mcap", recorded, descriptions)
     exported = export([tmp_path / "recorded.mcap"], "mcap", tmp_path / "out.mcap")
     found = read(tmp_path / "out.mcap")
     assert exported.rows == len(found)
@@ -71,24 +71,24 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     )
     for name in ("measurement", "pose", "command"):
         assert len([m for m in found if m.topic == f"/{VEHICLE}/{name}"]) == TICKS
-    assert LogFiles([tmp_path / "out.mcap"]).contracts == files.contracts
+    assert LogFiles([tmp_path / "out.mcap"]).descriptions == files.descriptions
     assert review(tmp_path / "out.mcap").z_track == review(log).z_track
     with pytest.raises(ExportError, match="--session"):
         export([log], "mcap", tmp_path / "other.mcap", session=SESSION)
 
 
-def test_what_several_files_repeat_is_written_once_and_the_last_contract_stays_the_last(tmp_path: Path) -> None:
+def test_what_several_files_repeat_is_written_once_and_the_last_description_stays_the_last(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     make_log(log, 50)
-    contract = next(iter(LogFiles([log]).contracts.values()))
-    before, now = (contract.model_copy(update={"host": host}).model_dump_json() for host in ("before", "now"))
+    description = next(iter(LogFiles([log]).descriptions.values()))
+    before, now = (description.model_copy(update={"host": host}).model_dump_json() for host in ("before", "now"))
     (tmp_path / "run").mkdir()
-    for i, contracts in enumerate([(now, before), (before, now), (now,)]):
+    for i, descriptions in enumerate([(now, before), (before, now), (now,)]):
         with (tmp_path / "run" / f"{i}.mcap").open("wb") as file:
             writer = Writer(file)
             writer.start()
             writer.add_attachment(1, 1, "protocol/SPEC.md", "text/markdown", b"the same")
-            for json in contracts:
+            for json in descriptions:
                 writer.add_metadata(CONTRACT_METADATA, {"key": "k", "json": json})
             channel = writer.register_channel("other", "", writer.register_schema("s", "", b""))
             writer.add_message(channel, i + 1, b"", i + 1, i)

@@ -19,11 +19,11 @@ from aeroloop.protocol.messages.models import Telemetry
 from aeroloop.protocol.wire.attitude import to_euler
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
-from aeroloop.service.config import Settings, from_contract, load
+from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.files import LogFiles
 from aeroloop.service.logs.runs import Run
-from aeroloop.service.logs.table import Rows, Truths, euler_deg, groups
+from aeroloop.service.logs.table import Rows, TruthColumns, euler_deg, groups
 from aeroloop.service.logs.table_files import ExportError, ParquetFile
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
@@ -165,7 +165,7 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     volts[0] = top["voltage"], -top["voltage"], 0.0
     k = np.arange(3)
     law = attitude, attitude, rate, zeros, zeros, zeros, volts, volts, one, zeros, zeros
-    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), Truths(one, attitude, zeros, zeros))
+    rows = Rows(VEHICLE, SESSION, Ticks(k, k, k, one, one, one, *law), TruthColumns(one, attitude, zeros, zeros))
     found = {
         column.name: list(values)
         for group in groups(wire, 0.002)
@@ -241,7 +241,7 @@ def test_every_column_tells_its_unit_and_the_file_its_configuration(
         assert "".join(matlab["units"][field.name]) == unit  # of an empty text scipy makes an empty array
         assert matlab["descriptions"][field.name] == description
     facts = {key.decode(): json.loads(value) for key, value in schema.metadata.items() if key.startswith(b"aeroloop.")}
-    assert from_contract(facts["aeroloop.config"]).contract() == settings.contract()
+    assert from_description(facts["aeroloop.config"]).description() == settings.description()
     assert json.loads(matlab["config"]) == facts["aeroloop.config"]
     assert facts["aeroloop.sessions"] == [f"{VEHICLE}/{SESSION}"]
     assert facts["aeroloop.exported_by"]["aeroloop"]

@@ -23,7 +23,7 @@ SEEDS = range(8)
 
 
 def end_of(message: Logged) -> str:
-    """Which end's batch a message is; empty if it is none."""
+    """SessionKey end's batch a message is; empty if it is none."""
     return message.key.rpartition("/")[2] if "/trace/" in message.key else ""
 
 
@@ -176,7 +176,7 @@ def test_one_end_alone_is_read_for_what_it_has(tmp_path: Path) -> None:
 
 def test_a_log_of_the_first_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 100)
-    path = retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=[old_contract()])
+    path = retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=[old_description()])
     says = "is a log of protocol version 1; read it with aeroloop 0.1, which wrote it"
     for reader in (review, lambda path: replay([path])):
         with pytest.raises(ReviewError, match=says) as refused:
@@ -184,9 +184,9 @@ def test_a_log_of_the_first_version_is_refused_with_what_to_do(tmp_path: Path) -
         assert str(refused.value) == f"{path} {says}"
 
 
-def old_contract() -> tuple[str, dict[str, str]]:
+def old_description() -> tuple[str, dict[str, str]]:
     text = '{"role": "plant", "vehicle": "aero", "host": "h", "versions": {}, "config": {}}'
-    return "aeroloop.contract", {"key": "aeroloop/aero/contract/plant", "json": text}
+    return "aeroloop.description", {"key": "aeroloop/aero/description/plant", "json": text}
 
 
 def test_frames_from_the_wire_are_compared_with_the_traces(tmp_path: Path) -> None:

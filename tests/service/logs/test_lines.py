@@ -12,7 +12,7 @@ from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.wire.attitude import Quaternion
 from aeroloop.service.config import load
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.downsample import ThinnedLines
+from aeroloop.service.review.downsample import DownsampledLines
 from aeroloop.service.review.review import read, report
 from tests.service.logs.made_log import SESSION, START_NS, make_log
 from tests.service.logs.retold import LATENCY_NS, PERIOD_NS, observer_of, retell, ticks_of, told
@@ -123,7 +123,7 @@ def test_thinned_lines_keep_every_extreme_at_its_place_and_are_exact_while_short
     rng = np.random.default_rng(rows)
     data = np.column_stack([np.arange(rows, dtype=float), rng.normal(size=(rows, 2))])
     data[rng.random(rows) < 0.3, 2] = nan
-    lines = ThinnedLines(3, max_points=64)
+    lines = DownsampledLines(3, max_points=64)
     for start in range(0, rows, block):
         lines.add(data[start : start + block])
     points = lines.points()
@@ -142,7 +142,7 @@ def test_thinned_lines_keep_every_extreme_at_its_place_and_are_exact_while_short
 
 def test_a_line_that_rises_or_falls_still_does_so_when_it_is_thinned_out() -> None:
     k = np.arange(10_000, dtype=float)
-    lines = ThinnedLines(3, max_points=100)
+    lines = DownsampledLines(3, max_points=100)
     for part in np.array_split(np.column_stack([k, 2 * k, -k]), 30):
         lines.add(part)
     points = lines.points()
@@ -152,7 +152,7 @@ def test_a_line_that_rises_or_falls_still_does_so_when_it_is_thinned_out() -> No
 
 def test_buckets_are_alike_however_long_it_runs() -> None:
     """Old ones must not grow coarser than new ones: each spans the same, but for the last."""
-    lines = ThinnedLines(1, max_points=64)
+    lines = DownsampledLines(1, max_points=64)
     for start in range(0, 64 * 1024, 16):
         lines.add(np.arange(start, start + 16, dtype=float)[:, np.newaxis])
         assert len(lines.points()) <= 64

@@ -30,7 +30,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.telemetry import telemetry_of
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.viewers.channels import SHAPES, Decoded
-from aeroloop.service.viewers.foxglove_server import LiveError, Outlet, serve
+from aeroloop.service.viewers.foxglove_server import FoxgloveServer, FoxgloveServerError, serve
 from tests.service.logs.viewer import PATIENCE_S, Shown, Viewer, orientation
 
 NOW = 1_800_000_000_000_000_000
@@ -72,8 +72,8 @@ class Loop:
         self._settings = settings
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
-        self._plant = Role("plant", "aero", settings.network, settings.contract())
-        self._controller = Role("controller", "aero", settings.network, settings.contract())
+        self._plant = Role("plant", "aero", settings.network, settings.description())
+        self._controller = Role("controller", "aero", settings.network, settings.description())
         self.attitudes: list[Quaternion] = []
         self.errors: dict[float, float] = {}
 
@@ -163,7 +163,7 @@ def test_a_viewer_that_never_reads_keeps_nobody_waiting() -> None:
     """40 MB go to it, far more than sockets and the server's backlog hold."""
     shape = SHAPES["log"]
     with (
-        Outlet("aero", "127.0.0.1", 0) as outlet,
+        FoxgloveServer("aero", "127.0.0.1", 0) as outlet,
         Viewer(outlet.url, max_queue=1) as stuck,
         Viewer(outlet.url) as other,
     ):
@@ -179,7 +179,7 @@ def test_a_viewer_that_never_reads_keeps_nobody_waiting() -> None:
         assert last.at_ns == NOW + 1
 
 
-def await_subscribers(outlet: Outlet, viewer: Viewer) -> None:
+def await_subscribers(outlet: FoxgloveServer, viewer: Viewer) -> None:
     """Send until it arrives: then the server knows the subscription."""
     sent = threading.Event()
 
@@ -200,7 +200,7 @@ def test_a_stopped_server_says_goodbye_and_frees_its_port(settings: Settings) ->
             viewer = stack.enter_context(Viewer(url))
         viewer.await_closed()
     port = int(url.rpartition(":")[2])
-    with Outlet("aero", "127.0.0.1", port) as outlet:
+    with FoxgloveServer("aero", "127.0.0.1", port) as outlet:
         assert outlet.url == url
 
 
@@ -219,8 +219,8 @@ def test_a_port_in_use_is_one_clear_line(settings: Settings, capfd: pytest.Captu
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(LiveError, match=f"cannot listen on 127.0.0.1:{port}: address already in use"):
-            Outlet("aero", "127.0.0.1", port)
+        with pytest.raises(FoxgloveServerError, match=f"cannot listen on 127.0.0.1:{port}: address already in use"):
+            FoxgloveServer("aero", "127.0.0.1", port)
         rendezvous = f"network.rendezvous={settings.network.rendezvous}"
         assert execute(["log", "live", "--port", str(port), "--set", rendezvous]) == 1
     captured = capfd.readouterr()

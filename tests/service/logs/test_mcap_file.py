@@ -197,15 +197,15 @@ def test_an_attachment_with_a_flipped_bit_is_left_out_and_named(tmp_path: Path) 
     assert len(damages) == 1
 
 
-def test_a_contract_with_a_flipped_bit_is_named_and_another_one_is_used(whole: Path, tmp_path: Path) -> None:
+def test_a_description_with_a_flipped_bit_is_named_and_another_one_is_used(whole: Path, tmp_path: Path) -> None:
     """Where there is no other, the log is refused."""
-    contract = next(record for record in records(whole) if isinstance(record, Metadata))
+    description = next(record for record in records(whole) if isinstance(record, Metadata))
     log = tmp_path / "twice.mcap"
     with whole.open("rb") as old, log.open("wb") as new:
         writer, ids = Writer(new, enable_data_crcs=True), {}
         writer.start()
         for _ in range(2):
-            writer.add_metadata(contract.name, contract.metadata)
+            writer.add_metadata(description.name, description.metadata)
         for _, channel, one in make_reader(old).iter_messages():
             if channel.id not in ids:
                 ids[channel.id] = writer.register_channel(channel.topic, "", 0)
@@ -219,7 +219,7 @@ def test_a_contract_with_a_flipped_bit_is_named_and_another_one_is_used(whole: P
         bent[byte] ^= mask
         log.write_bytes(bent)
         files = LogFiles([log])
-        assert list(files.contracts) == [("aero", "controller")]
+        assert list(files.descriptions) == [("aero", "controller")]
         assert len(list(files.routed(lambda address: address))) > TICKS / 10
         assert files.damages[log], f"byte {byte}"
         bent[data.rindex(b'{"protocol":2,"role"')] ^= 0x04  # the other one too
@@ -321,7 +321,7 @@ def is_telemetry(key: str) -> bool:
 
 def told(path: Path) -> tuple[object, object]:
     files = LogFiles([path])
-    return files.contracts, files.metadata
+    return files.descriptions, files.metadata
 
 
 def test_what_the_index_leads_to_is_what_the_whole_file_holds(whole: Path, tmp_path: Path) -> None:
@@ -330,7 +330,7 @@ def test_what_the_index_leads_to_is_what_the_whole_file_holds(whole: Path, tmp_p
     endless.write_bytes(whole.read_bytes()[:-END])
     assert skim(endless, is_telemetry) is None
     assert told(endless) == told(whole)
-    assert len(LogFiles([whole]).contracts) == 2
+    assert len(LogFiles([whole]).descriptions) == 2
 
 
 def test_of_all_messages_only_the_first_and_the_wanted_are_touched(whole: Path) -> None:
@@ -357,7 +357,7 @@ def test_a_damaged_chunk_that_the_index_steps_over_is_still_named_by_who_reads_t
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
     files = LogFiles([path])
-    assert files.contracts == LogFiles([whole]).contracts
+    assert files.descriptions == LogFiles([whole]).descriptions
     assert not files.damages  # nothing of it was needed so far
     list(files.routed(lambda address: address))
     assert [damage.offset for damage in files.damages[path]] == [chunk]

@@ -10,9 +10,9 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.service.config import load
-from aeroloop.service.figures import Figures, Stream
+from aeroloop.service.figures import Figures, StreamFigures
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.files import LogFiles, ReviewError
 from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
@@ -81,27 +81,27 @@ def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
 
 def test_a_real_machine_is_not_replayed_and_the_reason_is_told(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 100)
-    config = {**lockstep().contract(), "plant": {**lockstep().contract()["plant"], "via": "quanser"}}
-    contract = Contract(
+    config = {**lockstep().description(), "plant": {**lockstep().description()["plant"], "via": "quanser"}}
+    description = Description(
         protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config
     ).model_dump_json()
-    key = topics.key("contract", "aero", role="plant")
-    path = tell_with(tmp_path / "a.mcap", tmp_path / "b.mcap", {"key": key, "json": contract})
+    key = topics.key("description", "aero", role="plant")
+    path = tell_with(tmp_path / "a.mcap", tmp_path / "b.mcap", {"key": key, "json": description})
     both = replay([path])
     assert both.plant is None
     assert both.controller == EndReplay(ticks=100, differ=0)
     assert "quanser" in both.reasons["plant"]
 
 
-def tell_with(log: Path, out: Path, contract: dict[str, str]) -> Path:
-    """The log with this contract before any other of its role."""
+def tell_with(log: Path, out: Path, description: dict[str, str]) -> Path:
+    """The log with this description before any other of its role."""
     retell(log, out)
     with out.open("rb") as file:
         reader = make_reader(file)
         messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
         known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
-    others = [(name, entries) for name, entries in known if entries.get("key") != contract["key"]]
-    return tell(out, messages, [(CONTRACT_METADATA, contract), *others])
+    others = [(name, entries) for name, entries in known if entries.get("key") != description["key"]]
+    return tell(out, messages, [(CONTRACT_METADATA, description), *others])
 
 
 def test_with_another_law_it_says_what_would_have_been_commanded(tmp_path: Path) -> None:
@@ -212,8 +212,8 @@ FIGURES = Figures(
     u_total=None,
     max_error_deg=4.0,
     final_error_deg=0.5,
-    measurement=Stream(frames_per_s=500, bits_per_s=1),
-    command=Stream(frames_per_s=500, bits_per_s=1),
+    measurement=StreamFigures(frames_per_s=500, bits_per_s=1),
+    command=StreamFigures(frames_per_s=500, bits_per_s=1),
     skipped_ticks=2,
     latency_us=None,
     log=None,

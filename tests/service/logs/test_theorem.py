@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Truth
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Truth
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Stream
 from aeroloop.service.config import Settings, load
 from aeroloop.service.logs.mcap_file import CONTRACT_METADATA
@@ -20,11 +20,11 @@ from aeroloop.service.logs.runs import BLOCK
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.report.plots import draw_theorem
 from aeroloop.service.review import certificate_cache as grounds
-from aeroloop.service.review.certificate_cache import Library, damping_of
+from aeroloop.service.review.certificate_cache import CertificateCache, damping_of
 from aeroloop.service.review.report import Findings, Line, TheoremFindings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report
-from aeroloop.service.review.theorem_check import Trial
+from aeroloop.service.review.theorem_check import TheoremCheck
 from aeroloop.service.terminal.log_tables import review_account
 from aeroloop.service.theorem.certificate import Evaluated, bounds_of, certify
 from aeroloop.service.theorem.lemma import coordinates
@@ -41,7 +41,7 @@ def lockstep(*overrides: str) -> Settings:
 
 
 def promised(settings: Settings) -> dict[str, Any]:
-    """The certificate as the controller's contract carries it."""
+    """The certificate as the controller's description carries it."""
     certificate = certify(settings.wire, settings.law, settings.reference, settings.controller)
     return certificate.model_dump(mode="json")
 
@@ -221,9 +221,9 @@ def block(first: int, count: int) -> Ticks:
     return Ticks(k, *times, upright, upright, zeros, zeros, zeros, zeros, zeros, zeros, one, zeros + 0.3, zeros)
 
 
-def trial(*changes: Change) -> Trial:
+def trial(*changes: Change) -> TheoremCheck:
     settings = load(overrides=["reference.kind=hold"])
-    one = Trial(Library(settings).of(changes), 0.002, None)
+    one = TheoremCheck(CertificateCache(settings).of(changes), 0.002, None)
     one.changed(changes)
     return one
 
@@ -261,7 +261,7 @@ def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
     settings = load(overrides=["reference.kind=hold"])
     values = []
     for damping in (None, (0.0, 0.0, 0.02)):
-        one = Trial(Library(settings).of(()), 0.002, damping)
+        one = TheoremCheck(CertificateCache(settings).of(()), 0.002, damping)
         one.truth(0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         values.append(float(one.ticks(block(0, 1))[1][0, 3]))
     assert values == pytest.approx([0.0, 0.02**2 / 0.02 / 2])
@@ -323,10 +323,10 @@ def test_before_the_transient_is_over_there_is_no_largest_norm_and_the_reason_is
     assert Limit.parse("z_norm_share=1").broken(findings) == "z_norm_share is not known, so it is not at most 1"
 
 
-def with_contract(path: Path, out: Path, certificate: dict[str, Any]) -> Path:
-    """The log with a certificate in its controller's contract."""
-    config = read(path).session.settings.contract()
-    contract = Contract(
+def with_description(path: Path, out: Path, certificate: dict[str, Any]) -> Path:
+    """The log with a certificate in its controller's description."""
+    config = read(path).session.settings.description()
+    description = Description(
         protocol=PROTOCOL_VERSION,
         role="controller",
         vehicle="aero",
@@ -335,7 +335,7 @@ def with_contract(path: Path, out: Path, certificate: dict[str, Any]) -> Path:
         config=config,
         certificate=certificate,
     )
-    entry = {"key": "aeroloop/aero/contract/controller", "json": contract.model_dump_json()}
+    entry = {"key": "aeroloop/aero/description/controller", "json": description.model_dump_json()}
     return retell(path, out, metadata=[(CONTRACT_METADATA, entry)])
 
 
@@ -343,8 +343,8 @@ def test_the_contracts_certificate_is_what_counts_unless_the_session_began_with_
     ideal: Path, tmp_path: Path
 ) -> None:
     promise = promised(lockstep("plant.ideal=true"))
-    assert found(with_contract(ideal, tmp_path / "a.mcap", {**promise, "radius": 0.5})).radius == 0.5
-    library = Library(lockstep(), {**promise, "radius": 0.5})
+    assert found(with_description(ideal, tmp_path / "a.mcap", {**promise, "radius": 0.5})).radius == 0.5
+    library = CertificateCache(lockstep(), {**promise, "radius": 0.5})
     assert library.of(()).radius == 0.5
     other = Change(session=SESSION, tick=0, gains=Gains(C1=(0.4, 0.3, 0.3)), reference=lockstep().reference)
     assert library.of([other]).radius not in (0.5, promise["radius"], None)

@@ -13,8 +13,8 @@ from aeroloop.protocol.messages.operator import Change, Gains, Hold
 from aeroloop.protocol.transport.publication import Delivery
 from aeroloop.service.config import load
 from aeroloop.service.recording import rolling
-from tests.service.recording.ends import SESSION, VEHICLE, Ends, contract_of
-from tests.service.recording.recording import Arrived, Clock, Disk, Story
+from tests.service.recording.ends import SESSION, VEHICLE, Ends, description_of
+from tests.service.recording.recording import Arrived, Clock, Disk, EventLog
 
 TICKS = 600
 START_NS = 1_800_000_000_000_000_000
@@ -27,7 +27,7 @@ CHANGES = {
 
 
 @pytest.fixture(scope="session")
-def story() -> Story:
+def story() -> EventLog:
     """A session of 1.2 s in batches of one row, in which an operator changes something at 0.24, 0.5 and 0.8 s."""
     settings = load()
     ends = Ends(settings, rows=1, changes=CHANGES)
@@ -40,8 +40,8 @@ def story() -> Story:
             received = Delivery(said.key, said.payload, 5 + numbers[said.key], at_ns, None)
             messages.append(Arrived(received, at_ns + 77))
             numbers[said.key] += 1
-    contract = contract_of(settings, "plant").encode()
-    return Story(topics.key("contract", VEHICLE, role="plant"), contract, messages, list(CHANGES.values()))
+    description = description_of(settings, "plant").encode()
+    return EventLog(topics.key("description", VEHICLE, role="plant"), description, messages, list(CHANGES.values()))
 
 
 @pytest.fixture

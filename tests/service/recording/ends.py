@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Contract, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter
 from aeroloop.protocol.messages.trace import Received as ReceivedAs
@@ -30,9 +30,9 @@ class Published(NamedTuple):
         return topics.key(self.topic, VEHICLE, role=self.role)
 
 
-def contract_of(settings: Settings, role: str, vehicle: str = VEHICLE) -> Contract:
-    return Contract(
-        protocol=PROTOCOL_VERSION, role=role, vehicle=vehicle, host="h", versions={}, config=settings.contract()
+def description_of(settings: Settings, role: str, vehicle: str = VEHICLE) -> Description:
+    return Description(
+        protocol=PROTOCOL_VERSION, role=role, vehicle=vehicle, host="h", versions={}, config=settings.description()
     )
 
 

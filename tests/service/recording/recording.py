@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Contract
+from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.transport.publication import Delivery
@@ -36,11 +36,11 @@ class Arrived(NamedTuple):
     at_ns: int
 
 
-class Story(NamedTuple):
-    """A session's messages as they were received, its contract, and what its controller follows, in order."""
+class EventLog(NamedTuple):
+    """A session's messages as they were received, its description, and what its controller follows, in order."""
 
     key: str
-    contract: bytes
+    description: bytes
     messages: list[Arrived]
     changes: list[Change]
 
@@ -101,15 +101,15 @@ class Recording:
         told: What it told, and whether it was bad news.
     """
 
-    def __init__(self, clock: Clock, story: Story, **settings: object) -> None:
+    def __init__(self, clock: Clock, story: EventLog, **settings: object) -> None:
         self.told: list[tuple[str, bool]] = []
         self._clock = clock
         self.waiting: list[Arrived] = []
         self.log = RollingLog(RecorderSettings.model_validate(settings), lambda *told: self.told.append(told))
         clock.logs.append(self.log)
-        self.log.add_contract(story.key, story.contract)
+        self.log.add_description(story.key, story.description)
         self._decoder = Decoder(25.0)
-        self._decoder.configure(Contract.model_validate_json(story.contract))
+        self._decoder.configure(Description.model_validate_json(story.description))
 
     def take(self, messages: list[Arrived]) -> None:
         for arrived in messages:

@@ -18,8 +18,8 @@ from tests.service.recording.recording import (
     EVERYTHING,
     Clock,
     Disk,
+    EventLog,
     Recording,
-    Story,
     decoded_count,
     every_message,
     in_order,
@@ -28,7 +28,9 @@ from tests.service.recording.recording import (
 )
 
 
-def test_a_full_disk_loses_nothing_wherever_it_was_full(tmp_path: Path, story: Story, clock: Clock, disk: Disk) -> None:
+def test_a_full_disk_loses_nothing_wherever_it_was_full(
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
+) -> None:
     """At every size that the file can come to: within the first chunk's head, its data, its index, between two."""
     messages = story.messages[:120]
     expected = numbered(messages)
@@ -71,7 +73,7 @@ def _header_size(path: Path) -> int:
     return at
 
 
-def test_what_is_on_a_full_disk_can_be_read_as_it_is(tmp_path: Path, story: Story, clock: Clock, disk: Disk) -> None:
+def test_what_is_on_a_full_disk_can_be_read_as_it_is(tmp_path: Path, story: EventLog, clock: Clock, disk: Disk) -> None:
     """No half of a chunk stays behind, and the room that it took is given back."""
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
     disk.room = recording.log.path.stat().st_size + 10_000
@@ -86,7 +88,7 @@ def test_what_is_on_a_full_disk_can_be_read_as_it_is(tmp_path: Path, story: Stor
 
 
 def test_a_disk_that_writes_a_little_at_a_time_is_written_to_the_end(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     disk.at_once = 1000
     recording = Recording(clock, story, path=tmp_path / "a.mcap")
@@ -96,7 +98,7 @@ def test_a_disk_that_writes_a_little_at_a_time_is_written_to_the_end(
 
 
 def test_while_a_disk_is_full_it_is_tried_once_a_second_and_told_of_once(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
     disk.room = 0
@@ -116,7 +118,7 @@ def test_while_a_disk_is_full_it_is_tried_once_a_second_and_told_of_once(
     "first", [None, (errno.EIO, errno.ENOSPC), (errno.EIO, 0, errno.ENOSPC)], ids=["it", "its head", "its messages"]
 )
 def test_a_broken_disk_is_left_for_a_new_file_and_nothing_is_lost_or_doubled(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk, first: tuple[int, ...] | None
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk, first: tuple[int, ...] | None
 ) -> None:
     """Even if at first there is no room for the new file: what came to nothing is removed."""
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
@@ -150,7 +152,7 @@ def _errors(disk: Disk, *errors: int) -> None:
 
 
 def test_a_file_that_is_moved_or_removed_is_told_of_and_another_begun(
-    tmp_path: Path, story: Story, clock: Clock
+    tmp_path: Path, story: EventLog, clock: Clock
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
     recording.take(story.messages[:100])
@@ -170,7 +172,7 @@ def test_a_file_that_is_moved_or_removed_is_told_of_and_another_begun(
 
 
 def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=2.0)
     recording.take(story.messages[:100])
@@ -191,7 +193,7 @@ def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
 
 
 def test_a_new_file_that_finds_the_disk_full_leaves_nothing_behind(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=2.0)
     recording.take(story.messages[:600])
@@ -212,7 +214,7 @@ def test_a_new_file_that_finds_the_disk_full_leaves_nothing_behind(
 
 
 def test_the_end_on_a_full_disk_is_told_in_one_line_and_what_was_written_can_be_recovered(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1)
     recording.take(story.messages[:250])
@@ -234,7 +236,7 @@ def test_the_end_on_a_full_disk_is_told_in_one_line_and_what_was_written_can_be_
 
 
 def test_the_last_messages_are_written_even_where_the_index_has_no_room(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     whole = Recording(clock, story, path=tmp_path / "whole.mcap", chunk_s=0.1)
     whole.take(story.messages[:250])
@@ -250,7 +252,7 @@ def test_the_last_messages_are_written_even_where_the_index_has_no_room(
 
 
 def test_a_disk_that_has_room_again_is_tried_before_the_end(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     """A recorder that is stopped need not wait for the next try."""
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)

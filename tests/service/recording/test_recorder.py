@@ -30,7 +30,7 @@ from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
 from tests.protocol.gathering import Gathering, eventually
 from tests.service.recording.conftest import CHANGES
-from tests.service.recording.ends import Ends, contract_of
+from tests.service.recording.ends import Ends, description_of
 
 KEY = "aeroloop/aero/telemetry"
 ROOM = 50
@@ -166,8 +166,8 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         publishers[key].put(payload)
         published.setdefault(key, []).append(payload)
 
-    contract = topics.key("contract", "aero", role="plant")
-    publish(contract, contract_of(settings, "plant").encode())
+    description = topics.key("description", "aero", role="plant")
+    publish(description, description_of(settings, "plant").encode())
     ends = Ends(settings, changes=CHANGES)
     for k in range(500):
         for said in ends.tick(k, 10**10 + k * 2_000_000, START_NS + k * 2_000_000):
@@ -183,16 +183,16 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         changes = [told for name, told in metadata if name == CHANGE_METADATA]
         assert {told["key"] for told in changes} == {"aeroloop/aero/trace/controller"}
         assert [Change.model_validate_json(told["json"]) for told in changes] == list(CHANGES.values())
-        contracts = {told["key"]: told["json"].encode() for name, told in metadata if name == CONTRACT_METADATA}
-        assert contracts[contract] == published[contract][0]
+        descriptions = {told["key"]: told["json"].encode() for name, told in metadata if name == CONTRACT_METADATA}
+        assert descriptions[description] == published[description][0]
 
 
 def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishers_numbers(
     gathering: Gathering, record: Record
 ) -> None:
     session = gathering.join()
-    contract = CachedPublisher(session, topics.key("contract", "aero", role="plant"), per_s=1)
-    contract.put(contract_of(load(), "plant").encode())
+    description = CachedPublisher(session, topics.key("description", "aero", role="plant"), per_s=1)
+    description.put(description_of(load(), "plant").encode())
     trace = CachedPublisher(session, topics.key("trace", "aero", role="plant"), per_s=10)
     ends = Ends(load())
     batches = [
@@ -202,7 +202,7 @@ def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishe
         if (said.topic, said.role) == ("trace", "plant")
     ]
     running = record(decoded_hz=10_000.0)
-    eventually("the contract", lambda: running.recorder.log.written > 2)
+    eventually("the description", lambda: running.recorder.log.written > 2)
     for batch in batches:
         trace.put(batch)
     eventually("the trace", lambda: running.recorder.log.written > 4)
@@ -261,7 +261,7 @@ def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_mes
 
 def test_what_a_role_publishes_before_it_answers_is_awaited_at_the_end(record: Record, publisher: Publisher) -> None:
     """As a link keeps the order, the answer to a last question follows what was on its way."""
-    running, key = record(), topics.key("contract", "aero", role="plant")
+    running, key = record(), topics.key("description", "aero", role="plant")
     publisher.send(1)
     eventually("the first", lambda: running.recorder.log.written > 2)
 
@@ -285,7 +285,7 @@ def test_the_last_message_in_a_log_is_that_recording_stopped(record: Record, pub
     assert Status.model_validate_json(said).received == len(running.messages()) - 1
 
 
-def test_what_is_no_contract_or_no_batch_is_recorded_as_it_is_and_stops_nothing(
+def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothing(
     gathering: Gathering, record: Record
 ) -> None:
     running = record(decoded_hz=25.0)

@@ -20,8 +20,8 @@ from tests.service.recording.recording import (
     Arrived,
     Clock,
     Disk,
+    EventLog,
     Recording,
-    Story,
     every_message,
     in_order,
     numbered,
@@ -37,7 +37,7 @@ ROTATIONS = {"by size": {"max_file_mb": LARGE / 1e6}, "by time": {"max_file_s": 
 
 @pytest.fixture(params=ROTATIONS)
 def rotated(
-    request: pytest.FixtureRequest, tmp_path: Path, story: Story, clock: Clock, monkeypatch: pytest.MonkeyPatch
+    request: pytest.FixtureRequest, tmp_path: Path, story: EventLog, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
     """A folder with the session in several files."""
     monkeypatch.setattr(rolling, "LOOK_S", 0.01)
@@ -51,7 +51,7 @@ def rotated(
 # Rotation
 
 
-def test_over_all_files_every_message_stands_once_and_their_numbers_go_on(rotated: Path, story: Story) -> None:
+def test_over_all_files_every_message_stands_once_and_their_numbers_go_on(rotated: Path, story: EventLog) -> None:
     files = in_order(rotated)
     assert len(files) >= 3
     assert [path.name for path in files] == ["a.mcap", *(f"a-{part:04}.mcap" for part in range(1, len(files)))]
@@ -60,7 +60,7 @@ def test_over_all_files_every_message_stands_once_and_their_numbers_go_on(rotate
 
 
 def test_no_file_is_larger_or_older_than_told_by_more_than_a_chunk(
-    tmp_path: Path, story: Story, clock: Clock, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, story: EventLog, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rolling, "LOOK_S", 0.01)
     for name, settings in ROTATIONS.items():
@@ -80,7 +80,7 @@ def _without_index(path: Path) -> int:
     return int.from_bytes(path.read_bytes()[-28:-20], "little")  # what the footer says
 
 
-def test_every_file_has_all_that_it_takes_to_read_it_alone(rotated: Path, story: Story) -> None:
+def test_every_file_has_all_that_it_takes_to_read_it_alone(rotated: Path, story: EventLog) -> None:
     """Of what the controller follows, every change since the session began and before the file did."""
     ticks = []
     for path in in_order(rotated):
@@ -96,7 +96,7 @@ def test_every_file_has_all_that_it_takes_to_read_it_alone(rotated: Path, story:
         assert [Change.model_validate_json(entries["json"]) for entries in changes] == before
         ticks.append(len(before))
         assert [entries for name, entries in found if name == CONTRACT_METADATA] == [
-            {"key": story.key, "json": story.contract.decode()}
+            {"key": story.key, "json": story.description.decode()}
         ]
         (said,) = [entries["json"] for name, entries in found if name == RECORDER_METADATA]
         assert f'"run": "a", "part": "{path.stem}"' in said
@@ -104,7 +104,7 @@ def test_every_file_has_all_that_it_takes_to_read_it_alone(rotated: Path, story:
     assert ticks[-1] > 1
 
 
-def test_only_the_last_sessions_changes_are_in_the_next_file(tmp_path: Path, story: Story, clock: Clock) -> None:
+def test_only_the_last_sessions_changes_are_in_the_next_file(tmp_path: Path, story: EventLog, clock: Clock) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.01, max_file_s=1e6)
     first = story.changes[0]
     second = first.model_copy(update={"session": "s2"})
@@ -117,7 +117,7 @@ def test_only_the_last_sessions_changes_are_in_the_next_file(tmp_path: Path, sto
     assert changes == [second.model_dump_json()]
 
 
-def test_no_log_is_written_over(tmp_path: Path, story: Story, clock: Clock) -> None:
+def test_no_log_is_written_over(tmp_path: Path, story: EventLog, clock: Clock) -> None:
     (tmp_path / "a.mcap").write_bytes(b"mine")
     for _ in range(2):
         recording = Recording(clock, story, path=tmp_path / "a.mcap")
@@ -128,7 +128,7 @@ def test_no_log_is_written_over(tmp_path: Path, story: Story, clock: Clock) -> N
     assert every_message([tmp_path / "a-0002.mcap"]) == numbered(story.messages[:50])
 
 
-def test_where_no_log_can_be_made_it_is_told_in_one_line(tmp_path: Path, story: Story, clock: Clock) -> None:
+def test_where_no_log_can_be_made_it_is_told_in_one_line(tmp_path: Path, story: EventLog, clock: Clock) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(RecorderError) as refused:
         Recording(clock, story, path=tmp_path / "file" / "a.mcap")
@@ -139,7 +139,7 @@ def test_where_no_log_can_be_made_it_is_told_in_one_line(tmp_path: Path, story: 
 # What a crash costs
 
 
-def test_a_crash_costs_what_came_since_the_last_chunk_was_closed(tmp_path: Path, story: Story, clock: Clock) -> None:
+def test_a_crash_costs_what_came_since_the_last_chunk_was_closed(tmp_path: Path, story: EventLog, clock: Clock) -> None:
     """Whatever stands in the file at any moment is older than `chunk_s`: nothing was closed here."""
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.25)
     for i in range(0, 1000, 50):
@@ -151,7 +151,7 @@ def test_a_crash_costs_what_came_since_the_last_chunk_was_closed(tmp_path: Path,
 
 
 def test_a_chunk_is_closed_when_it_is_large_though_it_is_not_yet_due(
-    tmp_path: Path, story: Story, clock: Clock, disk: Disk
+    tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=60)
     small = story.messages[0]
@@ -179,7 +179,7 @@ def _topics_of_messages(path: Path) -> list[str]:
 
 
 def test_the_oldest_of_ones_own_go_and_nobody_elses(
-    tmp_path: Path, story: Story, clock: Clock, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, story: EventLog, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rolling, "LOOK_S", 0.01)
     others = {
@@ -222,7 +222,9 @@ def test_the_oldest_of_ones_own_go_and_nobody_elses(
     assert kept == numbered(story.messages)[-len(kept) :]
 
 
-def test_the_file_that_is_written_stays_however_little_may_be_kept(tmp_path: Path, story: Story, clock: Clock) -> None:
+def test_the_file_that_is_written_stays_however_little_may_be_kept(
+    tmp_path: Path, story: EventLog, clock: Clock
+) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05, max_file_s=2.0, keep_gb=1e-9)
     recording.take(story.messages[:100])
     recording.wait(3.0)
@@ -232,7 +234,7 @@ def test_the_file_that_is_written_stays_however_little_may_be_kept(tmp_path: Pat
     assert every_message(in_order(tmp_path)) == numbered(story.messages[:200])[100:]
 
 
-def test_logs_named_by_the_time_are_kept_together_over_runs(tmp_path: Path, story: Story, clock: Clock) -> None:
+def test_logs_named_by_the_time_are_kept_together_over_runs(tmp_path: Path, story: EventLog, clock: Clock) -> None:
     for name in ("aeroloop-20200101-000000", "demo-1"):
         recording = Recording(clock, story, path=tmp_path / f"{name}.mcap")
         recording.log.close()

@@ -28,7 +28,7 @@ from aeroloop.protocol.wire.transmit import SILENCE
 STATUS_PERIOD_NS: Final = 1_000_000_000
 
 
-class Presence(Front):
+class ZenohFront(Front):
     """A plant end on the network.
 
     Args:
@@ -101,7 +101,7 @@ class Presence(Front):
         if arrival is not None:
             self._received += arrival.frame != SILENCE
         self.follow_session()
-        self.tell_when_due()
+        self.publish_when_due()
 
     def follow_session(self) -> None:
         """Publish what happened, and close the link of a session that ended."""
@@ -125,17 +125,17 @@ class Presence(Front):
         endpoint.notices.clear()
         self._status_due = 0
 
-    def tell_when_due(self) -> None:
+    def publish_when_due(self) -> None:
         """Tell the status if a second is over, or something has happened."""
         if time.monotonic_ns() >= self._status_due:
-            self.tell()
+            self.publish_status()
 
     def leave(self) -> None:
         """Tell that the plant is at 0 V and goes."""
         self.follow_session()
         self._trace.finish()
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
-        self.tell()
+        self.publish_status()
 
     # ── what came from Zenoh's threads, taken between ticks ──
 
@@ -178,7 +178,7 @@ class Presence(Front):
             mailbox=Mailbox(self._changed),
         )
 
-    def tell(self) -> None:
+    def publish_status(self) -> None:
         """Tell the status."""
         now = time.monotonic()
         endpoint = self._endpoint
