@@ -1,1 +1,1 @@
-"""Everything that can stand at the plant end of the loop."""
+"""Plant end of the loop: the endpoint, the plant models, faults, and the processes that run them."""

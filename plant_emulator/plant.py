@@ -1,7 +1,7 @@
-"""What a plant is to the loop: something to measure and to actuate, in fixed steps.
+"""Plant interface: actuate, advance, measure and close.
 
-The emulator, a USB board and the doubles in tests all implement these four methods. The endpoint calls them in turn,
-once a tick: actuate → advance → measure.
+The emulated plant, the USB board and the doubles in tests implement it. The endpoint calls actuate → advance → measure
+once a tick.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
 
 class Measurement(NamedTuple):
-    """What the sensors say, unquantized. A failed sensor says NaN, never its last value.
+    """Sensor values, unquantized. A failed sensor yields NaN, never its last value.
 
     Attributes:
         attitude: q, body relative to inertial [1].
@@ -26,7 +26,7 @@ class Measurement(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is true of an emulated plant, which sensors need not say.
+    """True state of an emulated plant, free of sensor errors.
 
     Attributes:
         attitude: q, body relative to inertial [1].
@@ -40,13 +40,13 @@ class State(NamedTuple):
 
 
 class Plant(ABC):
-    """A plant, advanced by its owner.
+    """A plant that its caller advances period by period.
 
     Attributes:
-        actuators: Number of its motors, 2 or 3.
-        paces: Whether `advance` returns when the next sample is there, and so paces the loop.
-        passed: How many periods the last `advance` let pass; more than one where its owner was late, who then raises
-            his tick by so many, and `advance` returns at once for those that are over.
+        actuators: Number of motors, 2 or 3.
+        paces: Whether `advance` blocks until the next sample, and so paces the loop.
+        passed: Periods that passed in the last `advance`; more than one if the call came late. The caller then raises
+            its tick index by `passed`, and `advance` returns at once for the periods already over.
     """
 
     actuators: int
@@ -55,7 +55,7 @@ class Plant(ABC):
 
     @abstractmethod
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Put voltages [V] on the motors until told otherwise; the plant clips to its limits. Shape (actuators,)."""
+        """Hold voltages [V] on the motors until the next call; the plant clips to its limits. Shape (actuators,)."""
 
     @abstractmethod
     def advance(self) -> None:
@@ -63,8 +63,8 @@ class Plant(ABC):
 
     @abstractmethod
     def measure(self) -> Measurement:
-        """What the sensors say now."""
+        """Return the sensors' present values."""
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the plant safe: 0 V, nothing held. Closing twice does no harm."""
+        """Set 0 V and release all resources. A second call does nothing."""

@@ -1,4 +1,4 @@
-"""Settings of Quanser's board: which one, its channels, signs and scales."""
+"""Settings of Quanser's board: card, channels, signs and scales."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ PITCH_COUNTS: Final[Mapping[str, int]] = {"quanser_aero2_usb": 2880, "quanser_ae
 
 
 class QuanserSettings(BaseModel):
-    """The board, and how its channels lie to the body. Signs and the gyro's axes are to be tried on the bench."""
+    """The board, and how its channels map to the body. Verify the signs and the gyro's axes on the bench."""
 
     model_config = ConfigDict(extra="forbid")
 
-    card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, as the interface names them")
+    card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name")
     card_identifier: str = Field(
         default="0", min_length=1, description="which board; a virtual one is '0@tcpip://localhost:18950'"
     )
@@ -27,7 +27,7 @@ class QuanserSettings(BaseModel):
         default="derivative", description="derivative: of the encoders' angles, filtered"
     )
     pitch_counts: int | None = Field(
-        default=None, gt=0, description="pitch encoder's counts a turn; as the card type has if left out (2880, 2048)"
+        default=None, gt=0, description="pitch encoder's counts a turn; if left out, the card type's (2880, 2048)"
     )
     yaw_counts: int = Field(default=4096, gt=0, description="yaw encoder's counts a turn")
     encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
@@ -37,14 +37,14 @@ class QuanserSettings(BaseModel):
         default=(0, 1, 2), description="which of the gyro's channels 0, 1, 2 measures the body's x, y, z"
     )
     gyro_signs: tuple[Sign, Sign, Sign] = Field(default=(1, 1, 1), description="of the body's x, y, z")
-    gyro_scale: float = Field(default=1.0, gt=0, description="rate that the gyro calls 1 [rad/s]")
+    gyro_scale: float = Field(default=1.0, gt=0, description="angular velocity at a gyro reading of 1 [rad/s]")
     motor_channels: tuple[int, int] = Field(default=(0, 1), description="analog outputs of u2 and u3")
     motor_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of u2 and u3")
     voltage_limit: float = Field(
-        default=18.0, gt=0, le=24, description="largest voltage of a motor [V]; 18 is recommended, 24 the most"
+        default=18.0, gt=0, le=24, description="largest voltage of a motor [V]; 18 recommended, 24 maximum"
     )
     board_watchdog_s: float = Field(
-        default=0.1, gt=0, le=10, description="the board itself goes to 0 V after this long without a good sample [s]"
+        default=0.1, gt=0, le=10, description="the board's watchdog sets 0 V after this long without a good sample [s]"
     )
 
     @field_validator("gyro_axes", "motor_channels")

@@ -1,4 +1,7 @@
-"""What the plant end can be told, and the plant that follows from it: the one place where the pieces are chosen."""
+"""Settings of the plant end, and the plant, faults and limits built from them.
+
+This is the only module that selects the parts of a plant.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +26,14 @@ from aeroloop.protocol.wire.loop import WATCHDOG_S
 
 
 class PlantSettings(BaseModel):
-    """The plant end: which plant, what acts on it and looks at it, and how it looks after itself."""
+    """The plant end: the plant, its disturbances, sensors and faults, the watchdog and the limits."""
 
     model_config = ConfigDict(extra="forbid")
 
     via: Literal["emulator", "can", "quanser", "quanser-fake"] = Field(
         default="emulator",
-        description="what stands at the plant end: an emulated plant, a node on the CAN bus of [can], Quanser's USB "
-        "board, or the fake of it with an emulated Aero behind",
+        description="the plant: emulated, a node on the CAN bus of [can], Quanser's USB board, or a fake of that board "
+        "with an emulated Aero",
     )
     kind: Literal["aero", "rigid_body"] = Field(
         default="aero", description="the body; rotor, friction, wind and sensors act on either"
@@ -41,7 +44,7 @@ class PlantSettings(BaseModel):
         "axes, no rotor lag, no friction, no wind, perfect sensors",
     )
     armed_at_start: bool = Field(
-        default=True, description="whether the first claim is granted without `op arm`; after a trip it never is"
+        default=True, description="grant the first claim without `op arm`; after a trip, `op arm` is always needed"
     )
     watchdog_s: float = Field(
         default=WATCHDOG_S, gt=0, le=10, description="0 V after this long without a fresh command [s]"
@@ -54,11 +57,11 @@ class PlantSettings(BaseModel):
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
     faults: list[str] = Field(
         default=[],
-        description="what shall go wrong: signal:kind[=value][@start[..end]], in s since the first claim was granted",
+        description="faults: signal:kind[=value][@start[..end]], in s since the first claim was granted",
     )
     fault_seed: int = Field(default=0, ge=0, description="of the faults' random numbers")
     steps_on_request: bool = Field(
-        default=False, description="lockstep only: step only as far as it is asked to over the network, for tests"
+        default=False, description="lockstep only: step only when an `advance` query requests it, for tests"
     )
     limits: LimitSettings = LimitSettings()
     aero: AeroSettings = AeroSettings()
@@ -76,7 +79,7 @@ class PlantSettings(BaseModel):
 
     @property
     def parsed_faults(self) -> list[Fault]:
-        """What shall go wrong."""
+        """The configured faults."""
         return [Fault.parse(text) for text in self.faults]
 
     @model_validator(mode="after")
@@ -90,7 +93,7 @@ class PlantSettings(BaseModel):
         return self
 
     def build(self, period: float) -> EmulatedPlant:
-        """The plant, to be advanced in steps of `period` [s]."""
+        """Build the emulated plant; `advance` integrates one `period` [s]."""
         mechanism: Mechanism
         if self.kind == "rigid_body":
             mechanism = RigidBody(self.rigid_body)
@@ -109,12 +112,12 @@ class PlantSettings(BaseModel):
         )
 
     def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
-        """The plant, with the faults of its sensors and motors. Raises ValueError for a motor that is not there."""
+        """Wrap a plant in the configured faults. Raises ValueError if a fault names a motor the plant does not have."""
         limit = self.voltage_limit
         return FaultyPlant(plant, self.parsed_faults, period, voltage_limit=limit, seed=self.fault_seed)
 
     def guard(self, period_ns: int, commanded_limit: float) -> Guard:
-        """The plant's limits; a motor is saturated at the supply's limit or at the outermost level commanded [V]."""
+        """Build the guard. A motor is saturated at the supply's limit or at the outermost quantizer level [V]."""
         return Guard(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
 
 

@@ -1,4 +1,4 @@
-"""What a user is told when something cannot be done: one line that says what is wrong and what to do."""
+"""Errors for people: one line that states what is wrong and what to do."""
 
 from __future__ import annotations
 

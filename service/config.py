@@ -1,7 +1,7 @@
-"""The configuration: every section's model, put together from defaults, a TOML file, the environment and `--set`.
+"""Configuration: all sections' models, filled from defaults, a TOML file, the environment and `--set`.
 
-Each package owns the models of its own settings; this is the one place that knows them all. With no file at all, the
-result is the paper's experiment.
+Each package owns the models of its own settings; only this module combines them. The defaults are the paper's
+experiment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
-from aeroloop.protocol.transport.can_link import CanSettings
+from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.transport.network import NetworkSettings
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -38,7 +38,7 @@ ENV_PREFIX = "AEROLOOP_"
 
 
 class ConfigError(AeroloopError):
-    """The configuration is wrong; one line that names the key and says what it takes."""
+    """The configuration is wrong; one line with the key and its allowed values."""
 
 
 class Settings(BaseSettings):
@@ -67,7 +67,7 @@ class Settings(BaseSettings):
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
         env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the library names the arguments
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the library's argument names
         file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the same
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """`--set` over environment over file."""
@@ -75,7 +75,7 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _heartbeat_keeps_both_ends_alive(self) -> Settings:
-        """One frame may be lost. A loop so slow that every tick has a frame is as it is without `on_change`."""
+        """Check that one lost frame trips neither end. A loop so slow that every tick has a frame is exempt."""
         transmit, loop = self.wire.transmit, self.loop
         ticks = transmit.heartbeat_ticks(loop.period_ns, self.wire.measurement.counters)
         every_s = ticks * loop.period
@@ -92,8 +92,8 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _counter_tells_late_frames_from_fresh_ones(self) -> Settings:
-        """Its range is twice the time after which an end acts on missing frames, so that a late one is seen as late."""
+    def _counter_separates_late_frames_from_fresh_ones(self) -> Settings:
+        """Check that its range is at least twice the time after which an end acts on missing frames."""
         wire, period_ns, on_can = self.wire, self.loop.period_ns, self.plant.via == "can"
         patience_s, name = max(
             (self.plant.watchdog_s, "plant.watchdog_s"), (self.controller.stale_s, "controller.stale_s")
@@ -119,7 +119,7 @@ class Settings(BaseSettings):
         return self.model_dump(mode="json")
 
     def toml(self) -> str:
-        """The effective configuration as a TOML file that gives it again."""
+        """The effective configuration as a TOML file that loads to the same."""
         return tomli_w.dumps(_for_toml(self.description()))
 
 
@@ -131,7 +131,7 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         overrides: `section.key=value`, values as TOML writes them (quotes may be left out).
 
     Raises:
-        ConfigError: What is wrong and where.
+        ConfigError: The configuration is wrong.
     """
     if file is not None and not file.is_file():
         raise ConfigError(f"no configuration file at {file}")
@@ -150,10 +150,10 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
 
 
 def from_description(config: dict[str, Any]) -> Settings:
-    """The configuration that a role told in its description.
+    """The configuration in a role's description.
 
     Raises:
-        ConfigError: It is not one that this version understands.
+        ConfigError: This version cannot read it.
     """
     try:
         return Settings.model_validate(config)
@@ -205,14 +205,14 @@ def _explain(error: dict[str, Any]) -> str:
     if error["type"] == "extra_forbidden":
         return f"unknown configuration key {where}; `aeroloop show config` lists the known ones"
     message = str(error["msg"]).removeprefix("Value error, ")
-    told = f"{where}: {message[0].lower()}{message[1:]}"
-    if error["type"] == "value_error" and isinstance(error["input"], dict):  # of a whole section, and names its values
-        return told
-    return f"{told}, not {error['input']!r}"
+    text = f"{where}: {message[0].lower()}{message[1:]}"
+    if error["type"] == "value_error" and isinstance(error["input"], dict):  # of a section; names its values
+        return text
+    return f"{text}, not {error['input']!r}"
 
 
 def _for_toml(tree: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no null: bits say "cont", and anything else that is not set is left out."""
+    """Replace null, which TOML lacks: bits become "cont", other unset values are left out."""
     out: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, dict):
@@ -225,7 +225,7 @@ def _for_toml(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
-    """The settings with other bits: `bits_out` for ε and ω, `bits_in` for u; None leaves them as they are.
+    """The settings with other bits: `bits_out` for ε and ω, `bits_in` for u; None leaves them unchanged.
 
     Raises:
         ConfigError: Not a number of bits, and not "cont".
@@ -239,5 +239,5 @@ def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> 
                 wire[signal]["bits"] = bits if bits == "cont" else int(bits)
     try:
         return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
-    except ValidationError as error:  # a kind of quantizer may take other numbers of bits
+    except ValidationError as error:  # some kinds of quantizer allow other numbers of bits
         raise ConfigError("; ".join(f"wire.{_explain(dict(e))}" for e in error.errors(include_url=False))) from None

@@ -1,7 +1,7 @@
-"""Figures of merit: one set of names, one way to compute them, whoever asks.
+"""Figures of merit: one set of names and one way to compute them, for the demo, the experiment and the review of a log.
 
-The demo, the experiment and the review of a log all feed the same `Score`, tick by tick, so that their figures can be
-compared to the last bit. `z_track` and `u_total` are (C.81), summed as the rectangles that a sampled loop holds.
+All feed the same `Score`, tick by tick, so that their figures can be compared to the last bit. `z_track` and `u_total`
+are (C.81), summed as rectangles, because a sampled loop holds its values for a period.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Integers = npt.NDArray[np.int64]
 
 
 class StreamFigures(BaseModel):
-    """Traffic in one direction, over the time that was judged."""
+    """Traffic in one direction, over `duration_s`."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -33,22 +33,22 @@ class StreamFigures(BaseModel):
 
 
 class Figures(BaseModel):
-    """How well it tracked and what it cost. What could not be had is null, with the reason in `reasons`."""
+    """Tracking, control effort and traffic of a run. A figure not available is null, with its reason in `reasons`."""
 
     model_config = ConfigDict(frozen=True)
 
-    duration_s: float = Field(description="time that was judged, on the law's clock [s]")
+    duration_s: float = Field(description="time evaluated, on the law's clock [s]")
     z_track: float | None = Field(description="∫ ε̃ᵀε̃ dt of the attitude as measured [s]; 0.0049 is 49 in Table C.2")
     u_total: float | None = Field(description="∫ uᵀu dt of the commands as sent [V²·s]")
     max_error_deg: float | None = Field(description="largest attitude error as measured [deg]")
     final_error_deg: float | None = Field(description="attitude error at the last tick as measured [deg]")
     measurement: StreamFigures
     command: StreamFigures
-    skipped_ticks: int | None = Field(description="ticks that no command answered, whatever the reason")
+    skipped_ticks: int | None = Field(description="ticks without a command, whatever the reason")
     latency_us: Percentiles | None
     log: str | None
-    trips: list[str] = Field(default_factory=list, description="why the plant went to 0 V by itself, each time it did")
-    damages: list[str] = Field(default_factory=list, description="what of the log could not be read")
+    trips: list[str] = Field(default_factory=list, description="why the plant went to 0 V by itself, each time")
+    damages: list[str] = Field(default_factory=list, description="unreadable parts of the log")
     reasons: dict[str, str] = Field(default_factory=dict, description="why a figure is null")
 
 
@@ -58,7 +58,7 @@ class Score:
     Args:
         wire: Sizes of the frames.
         period: Time between ticks [s].
-        watchdog_s: How long a plant holds a command that no other follows [s].
+        watchdog_s: Longest time for which a plant holds a command [s].
     """
 
     def __init__(self, wire: WireSpec, period: float, watchdog_s: float = WATCHDOG_S) -> None:
@@ -76,9 +76,9 @@ class Score:
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def error(self, k: int, error: Sequence[float], *, sent: bool = True) -> None:
-        """The attitude error ε̃ at tick k; it stands until the next. Shape (3,).
+        """Add the attitude error ε̃ at tick k; it holds until the next. Shape (3,).
 
-        It counts as a measurement frame if that was sent, and not if silence stood for it.
+        It counts as a measurement frame only if one was sent.
         """
         self._unsent_errors += not sent
         if self._first is None:
@@ -94,9 +94,9 @@ class Score:
         self._errors += 1
 
     def command(self, k: int, voltages: Sequence[float], *, sent: bool = True) -> None:
-        """The voltages [V] commanded at tick k; held until the next, or the watchdog. Shape (actuators,).
+        """Add the voltages [V] commanded at tick k; held until the next, or the watchdog. Shape (actuators,).
 
-        A command without a valid value puts the plant at 0 V. It counts as a frame if that was sent.
+        A command without a valid value sets the plant to 0 V. It counts as a frame only if one was sent.
         """
         self._unsent_commands += not sent
         if self._commands:
@@ -108,20 +108,20 @@ class Score:
         self._commands += 1
 
     def unsent(self, measurements: int, commands: int) -> None:
-        """So many of the ticks that were told had no frame, because it would have said what the last one said."""
+        """Subtract this many of the ticks added: they had no frame, because it would have repeated the last one."""
         self._unsent_errors += measurements
         self._unsent_commands += commands
 
     def errors(self, k: Integers, errors: Floats) -> None:
-        """`error` of one tick after another: the same sums, in the same order. Shapes (n,) and (n, 3)."""
+        """`error` for consecutive ticks: the same sums, in the same order. Shapes (n,) and (n, 3)."""
         if self._first is None and len(k):
             self.error(int(k[0]), errors[0].tolist())
             k, errors = k[1:], errors[1:]
         if not len(k):
             return
         square = squares(errors)
-        stood = np.append(self._error_square, square[:-1])
-        self._z_track = added(self._z_track, stood * (np.diff(k, prepend=self._error_tick) * self._period))
+        before = np.append(self._error_square, square[:-1])
+        self._z_track = added(self._z_track, before * (np.diff(k, prepend=self._error_tick) * self._period))
         largest = int(np.argmax(np.where(np.isnan(square), -1.0, square)))
         if square[largest] > self._largest_square:
             self._largest, self._largest_square = tuple(errors[largest].tolist()), float(square[largest])
@@ -129,7 +129,7 @@ class Score:
         self._errors += len(k)
 
     def commands(self, k: Integers, voltages: Floats) -> None:
-        """`command` of one tick after another, likewise. Shapes (n,) and (n, actuators)."""
+        """`command` for consecutive ticks, likewise. Shapes (n,) and (n, actuators)."""
         if not self._commands and len(k):
             self.command(int(k[0]), voltages[0].tolist())
             k, voltages = k[1:], voltages[1:]
@@ -137,9 +137,9 @@ class Score:
             return
         square = squares(voltages)
         square[np.isnan(square)] = 0.0
-        stood = np.append(self._command_square, square[:-1])
+        before = np.append(self._command_square, square[:-1])
         held = np.minimum(np.diff(k, prepend=self._command_tick), self._longest_hold)
-        self._u_total = added(self._u_total, stood * (held * self._period))
+        self._u_total = added(self._u_total, before * (held * self._period))
         self._command_tick, self._command_square = int(k[-1]), float(square[-1])
         self._commands += len(k)
 
@@ -157,7 +157,7 @@ class Score:
         reasons: dict[str, str] | None = None,
         damages: Sequence[str] = (),
     ) -> Figures:
-        """The figures so far; the last error and the last command stand for one period."""
+        """The figures so far; the last error and the last command count for one period."""
         reasons = dict(reasons or {})
         duration = self.ticks * self._period
         if not self._errors:
@@ -191,7 +191,7 @@ def squares(rows: Floats) -> Floats:
 
 
 def added(start: float, terms: Floats) -> float:
-    """A sum and terms, added one after the other; `np.sum` adds pairs of pairs, which rounds otherwise."""
+    """`start` plus the terms, added in order; `np.sum` adds pairwise, which rounds differently."""
     return float(np.add.accumulate(np.append(start, terms))[-1])
 
 

@@ -1,4 +1,4 @@
-"""What the controller daemon and the recorder can be told. Light to import: every command reads the configuration."""
+"""Settings of the controller daemon and of the recorder. Light to import, because every command reads them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class ControllerSettings(BaseModel):
-    """How the controller daemon behaves."""
+    """Settings of the controller daemon."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -18,8 +18,8 @@ class ControllerSettings(BaseModel):
     )
     pace: Literal["measurement", "clock"] = Field(
         default="measurement",
-        description="tick when a measurement arrives, so that the plant's clock leads, or on a grid of one's own, "
-        "which takes the newest measurement; lockstep always goes by measurements",
+        description="tick when a measurement arrives, so that the plant's clock leads, or on a grid of its own, "
+        "which takes the newest measurement; lockstep always ticks by measurements",
     )
     duration_s: float | None = Field(default=None, gt=0, description="end after this much of the law's time [s]")
     auto_arm: bool = Field(
@@ -27,18 +27,18 @@ class ControllerSettings(BaseModel):
     )
     telemetry_rate_hz: float = Field(default=10.0, gt=0, le=10_000, description="publish telemetry this often [Hz]")
     max_reference_rate: float = Field(
-        default=1.0, gt=0, le=100, description="fastest turn that an operator's reference may ask for [rad/s]"
+        default=1.0, gt=0, le=100, description="largest angular velocity of an operator's reference [rad/s]"
     )
     max_reference_tilt_deg: float = Field(
-        default=60.0, gt=0, le=180, description="largest tilt that an operator's reference may ask for [deg]"
+        default=60.0, gt=0, le=180, description="largest tilt of an operator's reference [deg]"
     )
     start_within_deg: float = Field(
         default=20.0,
         ge=0,
         le=360,
-        description="a session that begins further than this from its reference first goes there smoothly [deg]",
+        description="a session that begins further than this from its reference first approaches it smoothly [deg]",
     )
-    require_recorder: bool = Field(default=False, description="do not claim before a recorder is there to see it")
+    require_recorder: bool = Field(default=False, description="do not claim before a recorder is on the network")
     require_certificate: bool = Field(
         default=False,
         description="do not claim unless the theorem holds of this configuration (`aeroloop lab certify`), and refuse "
@@ -47,25 +47,25 @@ class ControllerSettings(BaseModel):
 
 
 class RecorderSettings(BaseModel):
-    """Where the log goes, and how much of it a crash may cost."""
+    """Settings of the recorder."""
 
     model_config = ConfigDict(extra="forbid")
 
-    directory: Path = Field(default=Path("logs"), description="folder for logs that are not given a name")
-    path: Path | None = Field(default=None, description="the log's first file; a new one named by the time if left out")
+    directory: Path = Field(default=Path("logs"), description="folder of logs without a given path")
+    path: Path | None = Field(default=None, description="the log's first file; named by the time if left out")
     chunk_s: float = Field(
-        default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut costs [s]"
+        default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut loses [s]"
     )
     frames: bool = Field(
-        default=False, description="record the frames as they crossed the network, too, beside the ends' own traces"
+        default=False, description="also record the frames on the network, beside the ends' own traces"
     )
     decoded_hz: float = Field(
         default=10.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"
     )
-    max_file_mb: float = Field(default=256.0, gt=0, description="go on in a new file after this size [MB]")
-    max_file_s: float = Field(default=3600.0, gt=0, description="go on in a new file after this time [s]")
+    max_file_mb: float = Field(default=256.0, gt=0, description="begin a new file after this size [MB]")
+    max_file_s: float = Field(default=3600.0, gt=0, description="begin a new file after this time [s]")
     keep_gb: float | None = Field(
         default=None,
         gt=0,
-        description="remove the oldest logs of the recorder's when all are larger than this; none if left out [GB]",
+        description="remove the recorder's oldest logs when all together are larger than this; none if left out [GB]",
     )

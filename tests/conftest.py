@@ -1,8 +1,19 @@
-"""What holds for every test: an example takes as long as it takes, because machines are busy; no time is asserted."""
+"""Hypothesis settings of all tests: no deadline per example, because machines are busy."""
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("untimed", parent=settings(), deadline=None)  # else as ever: in CI not random
 settings.load_profile("untimed")
+
+PROCESSES = ("tests/hil/", "tests/can/test_buses.py", "tests/can/test_socketcan.py", "testing/conformance/")
+"""Where every test starts processes; elsewhere a test says so by itself."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what starts processes: `-m "not processes"` is the fast loop."""
+    for item in items:
+        if any(part in item.path.as_posix() for part in PROCESSES):
+            item.add_marker(pytest.mark.processes)

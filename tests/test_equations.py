@@ -1,4 +1,4 @@
-"""Every equation of the paper, (C.1)–(C.81), is in the code under its number, or left out for a reason given here."""
+"""Equations (C.1)–(C.81) of the paper: each is in the code under its number, or left out for a reason given here."""
 
 from __future__ import annotations
 

@@ -1,14 +1,19 @@
-"""The house is kept: lint, format, types and who may import whom, in the same command as the tests."""
+"""Lint, format, types and import rules, in the same command as the tests."""
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
+PACKAGES = ("protocol", "plant_emulator", "service")
 
 
 @pytest.mark.parametrize(
@@ -26,3 +31,50 @@ def test_the_house_is_kept(check: tuple[str, ...]) -> None:
     command = [str(Path(sys.executable).parent / check[0]), *check[1:]]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_folder_of_code_is_in_the_wheel() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {path.parent.relative_to(ROOT) for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
+    names = {".".join(("aeroloop", *folder.parts)) for folder in folders}
+    assert set(listed) == names - {"aeroloop.service.api"} | {"aeroloop"}
+
+
+BANNED = re.compile(
+    r"\b(told|tells?|telling|who|whom|whoever|hears?|heard|hearing|nobody|believes?|thinks?|comes by|gives back|"
+    r"at home|looks after)\b",
+    re.IGNORECASE,
+)
+"""Code is not a person: it publishes, receives, reports and computes."""
+
+
+def docstrings(path: Path) -> Iterator[tuple[str, str]]:
+    """Names and docstrings of a module and of what is public in it."""
+
+    def of(node: ast.Module | ast.ClassDef | ast.FunctionDef, name: str) -> Iterator[tuple[str, str]]:
+        if text := ast.get_docstring(node):
+            yield name, text
+        for child in node.body:
+            if isinstance(child, ast.ClassDef | ast.FunctionDef) and not child.name.startswith("_"):
+                yield from of(child, f"{name}.{child.name}")
+
+    yield from of(ast.parse(path.read_text(encoding="utf-8")), path.relative_to(ROOT).as_posix())
+
+
+def test_docstrings_use_the_words_of_the_field() -> None:
+    found = [
+        f"{name}: {word.group()}"
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for name, text in docstrings(path)
+        for word in BANNED.finditer(text)
+    ]
+    assert found == []
+
+
+def test_every_room_has_a_readme() -> None:
+    rooms = {path.parent for name in PACKAGES for path in (ROOT / name).rglob("__init__.py")}
+    small = {"service/api", "service/examples", "service/report/page", "service/testing/conformance"}
+    small |= {"plant_emulator/hosts/quanser"}  # described by the README above each
+    lacking = {room.relative_to(ROOT).as_posix() for room in rooms if not (room / "README.md").exists()}
+    assert lacking == small

@@ -1,4 +1,4 @@
-"""What the README shows works as it stands there."""
+"""README: its examples and commands run as printed."""
 
 from __future__ import annotations
 
@@ -16,10 +16,21 @@ from aeroloop.service.lab.experiment import run_experiment
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None:
+def python_blocks() -> list[str]:
+    """Python in the README: the experiment in three lines, and the test with `hil`."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    example = text.split("```python\n")[1].split("```")[0]
-    assert "def test_" in example
+    return [block.split("```")[0] for block in text.split("```python\n")[1:]]
+
+
+def test_the_python_example_prints_what_the_experiment_gives(capfd: pytest.CaptureFixture[str]) -> None:
+    (example, _) = python_blocks()
+    exec(compile(example, "README.md", "exec"), {})  # noqa: S102  # our own text
+    settings = load(overrides=["wire.voltage.bits=8"])
+    assert capfd.readouterr().out == f"{run_experiment(settings, 10).z_track}\n"
+
+
+def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None:
+    (_, example) = python_blocks()
     (tmp_path / "test_example.py").write_text(example)
     command = [sys.executable, "-m", "pytest", "-q", "test_example.py", "--hil-lockstep"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)

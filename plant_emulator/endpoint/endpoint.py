@@ -1,11 +1,12 @@
-"""The plant end of the loop, sans-I/O: measure → frame; frame → actuate; and the watchdog.
+"""Plant endpoint, sans-I/O: measures into frames, actuates from frames, runs the watchdog.
 
-It knows no socket and no clock: time is the tick index. Its owner feeds it the newest command frame, once a tick, and
-sends what it returns. A command acts from the start of the period in which it arrived, and until another says something
-else; when none has come in time the watchdog trips: the session ends, and the motors have 0 V until the plant is armed
-and a controller claims it.
+It uses no socket and no clock; time is the tick index. Once a tick its owner passes in the newest command frame and
+sends the measurement frame that it returns. A command acts from the start of the period in which it was received until
+another replaces it.
+Without a fresh command the watchdog trips: the session ends, and the motors stay at 0 V until the plant is armed and
+claimed.
 
-A command is fresh by ticks alone: its echo tells how many ticks ago the measurement was made that it answers.
+Freshness is counted in ticks: a command echoes the counter of the measurement that it answers, which gives its age.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ class Endpoint(Tenancy):
     """One plant, one controller at a time.
 
     Args:
-        plant: What to measure and to actuate.
-        wire: How frames are read and written here.
+        plant: The plant to measure and to actuate.
+        wire: Format of the frames.
         period_ns: Period of a tick [ns].
-        lockstep: Whether each answer is waited for; a claim must say the same.
+        lockstep: Whether the loop waits for each command; a claim must have the same value.
         watchdog_s: 0 V after this long without a fresh command [s].
-        guard: What else makes it trip; None for nothing.
-        armed: Whether the first claim is granted without anybody arming it.
+        guard: Limits that trip the plant; None for no limits.
+        armed: Whether the first claim is granted without `arm`.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
 
     Attributes:
-        accepted: Commands acted upon so far.
+        accepted: Commands applied so far.
     """
 
     def __init__(
@@ -66,8 +67,9 @@ class Endpoint(Tenancy):
         self._counters = wire.measurement.counters
         heartbeat = transmit.heartbeat_ticks(period_ns, self._counters)
         self._sender = Sender(transmit.measurement, heartbeat, self._counters)
-        self._hears_silence = lockstep and transmit.command == "on_change"
-        # Who hears silence on a clock learns that values are valid again from the next frame that reaches it in time.
+        self._silence_commands = lockstep and transmit.command == "on_change"
+        # On change and without lockstep, a controller learns that values are valid again only from the next frame that
+        # it receives in time, a heartbeat later at most: until then its commands may still have no valid value.
         clocked = transmit.measurement == "on_change" and not lockstep
         self._forgiven = heartbeat if clocked else 0
         self.protect(watchdog_s, guard)
@@ -75,12 +77,12 @@ class Endpoint(Tenancy):
         self._unmeasured_yet = False
         self._fresh_tick = 0  # tick of the last fresh command, or of the session's first measurement
         self._unmeasured = [False] * self._counters  # whether the last measurement of each counter had no valid value
-        self._said: tuple[float, ...] = ()  # codes of the last fresh command
-        self._echo = -1  # its echo
-        self._answered = -1  # and the tick of the measurement that it answered; before the session's first for none
+        self._codes: tuple[float, ...] = ()  # of the last fresh command
+        self._echo = -1  # of the last fresh command
+        self._answered = -1  # tick of the measurement that it answers; before the session's first for none
 
     def protect(self, watchdog_s: float, guard: Guard | None) -> None:
-        """Use another watchdog time [s] and other limits from now on."""
+        """Set the watchdog's time [s] and the limits."""
         watchdog_ns = round(watchdog_s * 1e9)
         self._watchdog = max(1, round(watchdog_ns / self.period_ns))
         self._first_command = max(1, self.first_command_ns(watchdog_ns) // self.period_ns)
@@ -92,17 +94,16 @@ class Endpoint(Tenancy):
         return sum(quantizer.saturated for quantizer in self._quantizers)
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Let the time since the last tick pass under the newest command, and measure.
+        """Apply the newest command, advance the plant to tick k, and measure.
 
         Args:
-            frame: The newest command frame that came since the last tick, or None; in lockstep SILENCE, if the
-                controller has nothing new to say.
-            k: Tick index, from 0, rising; where it skips, the plant's time passes all the same. The very first call
-                takes no command: nothing was measured before it.
+            frame: The newest command frame received since the last tick, or None; in lockstep SILENCE if the command
+                has not changed.
+            k: Tick index, from 0, rising. If it skips, the plant advances by all skipped periods. The first call
+                ignores the frame: nothing was measured before it.
 
         Returns:
-            The measurement frame; SILENCE if there is none to send, because it would say what the last one said; None
-            while no session runs.
+            The measurement frame; SILENCE if it would repeat the last one and need not be sent; None without a session.
         """
         if self.ticked < 0:
             self.ticked, self.outcome = 0, Outcome.NONE
@@ -152,17 +153,17 @@ class Endpoint(Tenancy):
         return [encode(value) for encode, value in zip(self._encode, values, strict=True)]
 
     def _command(self, frame: bytes) -> Outcome:
-        """Act on a command frame if it is well-formed, fresh and valid."""
-        if frame == SILENCE and self._hears_silence and self._said:
-            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._said)
+        """Apply a command frame if it is well-formed, fresh and valid."""
+        if frame == SILENCE and self._silence_commands and self._codes:
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
         else:
             read = self.wire.command.unpack(frame)
         if read is None:
             self.refused += 1
             return Outcome.MALFORMED
         echo, codes = read
-        # The echo is a tick modulo `counters`: the latest measurement with that counter. An echo that never changes is
-        # a sender that repeats itself, however long ago it began.
+        # The echo is a tick modulo `counters` and means the latest measurement with that counter. A repeated echo is
+        # refused: after a whole round of the counter it would look fresh again.
         age = (self.ticked - self._start - echo) % self._counters
         answered = self.ticked - age
         if echo == self._echo or answered <= self._answered:
@@ -173,19 +174,19 @@ class Endpoint(Tenancy):
         voltages = tuple(self._level(code) for code in codes)
         if not isfinite(sum(voltages)):
             if any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1)):
-                voltages = self.off  # the right answer; how long it may go on is the guard's to say
+                voltages = self.off  # the right answer to an invalid measurement; the guard limits how long it lasts
             else:
                 self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
                 return Outcome.INVALID
         self.voltages = voltages
-        self._said, self._echo, self._answered = codes, echo, answered
+        self._codes, self._echo, self._answered = codes, echo, answered
         self._fresh_tick = self.ticked
         self._machine.fire(PlantTrigger.COMMAND)
         self.accepted += 1
         return Outcome.ACTED
 
     def _watch(self, tick: int) -> None:
-        """End the session when no fresh command came in time."""
+        """Trip if no fresh command was received in time."""
         if self.session is None or self._unmeasured_yet:
             return
         waited = tick - 1 - self._fresh_tick
@@ -205,7 +206,7 @@ class Endpoint(Tenancy):
         self._start = self._fresh_tick = self.ticked + 1
         self._unmeasured = [False] * self._counters
         self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
-        self._said, self._echo, self._answered = (), -1, self.ticked
+        self._codes, self._echo, self._answered = (), -1, self.ticked
         self._sender.forget()
 
     def _rest(self) -> None:

@@ -1,7 +1,7 @@
-"""Limits of the plant end: what it does not let any controller do to it, for whatever reason.
+"""Limits of the plant: tilt, rate, time at full voltage, time without valid sensor values.
 
-A Guard sees what the sensors say and what is commanded, once a tick, and gives a reason to trip or None. It trusts
-nothing but its own sensors and keeps no clock: durations are counted in ticks.
+Once a tick a Guard checks the measurement and the commanded voltages and returns a reason to trip or None. It uses only
+the plant's own sensors, and counts durations in ticks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.states import TripCause
 
 
 class LimitSettings(BaseModel):
-    """Beyond any of these the plant goes to 0 V and stays there."""
+    """Limits; beyond any of them the plant trips."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -34,7 +34,7 @@ class LimitSettings(BaseModel):
 
 
 class Guard:
-    """Watches one plant.
+    """Checks one plant against its limits.
 
     Args:
         settings: The limits.
@@ -50,15 +50,15 @@ class Guard:
         self._saturated = self._invalid = 0
 
     def reset(self) -> None:
-        """Forget what was counted, for a new session."""
+        """Reset the counts for a new session."""
         self._saturated = self._invalid = 0
 
     def check(self, seen: Measurement, voltages: Sequence[float]) -> Trip | None:
-        """A reason to trip, or None.
+        """Return a reason to trip, or None.
 
         Args:
-            seen: What the sensors say at this tick.
-            voltages: What is commanded [V]. Shape (actuators,).
+            seen: Measurement of this tick.
+            voltages: Commanded voltages [V]. Shape (actuators,).
         """
         limits = self._settings
         (w, x, y, z), (wx, wy, wz) = seen

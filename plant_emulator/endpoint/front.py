@@ -1,7 +1,7 @@
-"""How a plant end is seen: the side of it that controllers, bridges and operators are on.
+"""Network interface of a plant end.
 
-A Driver runs a plant; a Front connects it to the network: a ZenohFront on Zenoh, a CanFront on a CAN bus.
-Everything here is called by the driver's thread, between ticks.
+A Driver runs a plant; a Front connects it to the network: ZenohFront to Zenoh, CanFront to a CAN bus. Only the driver's
+thread calls it.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from aeroloop.protocol.transport.link import Arrival, Link
 
 
 class Front(ABC):
-    """What a driver asks of the network.
+    """Network side of a driver.
 
     Attributes:
-        timing: How well the driver's loop keeps time, if it keeps any.
+        timing: Timing of the driver's loop; None in lockstep.
         skipped: Ticks of sessions that the driver missed.
-        notes: What the machine refused.
+        notes: Real-time settings that the machine refused.
     """
 
     def __init__(self) -> None:
@@ -29,42 +29,42 @@ class Front(ABC):
     @property
     @abstractmethod
     def link(self) -> Link | None:
-        """The session's frames; None while there is no session."""
+        """Link of the session's frames; None without a session."""
 
     @abstractmethod
     def serve(self) -> None:
-        """Be there from now on."""
+        """Start serving the network."""
 
     @abstractmethod
     def take_inbox(self) -> None:
-        """Do what has come for the time between two ticks: claims, releases, an operator's words."""
+        """Between two ticks, process what was received: claims, releases, operator commands."""
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame of the session; SILENCE only where it could not be heard, in lockstep."""
+        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
 
     @abstractmethod
     def follow_session(self) -> None:
-        """Tell what happened, and close the link of a session that ended."""
+        """Publish events, and close the link of a session that ended."""
 
     @abstractmethod
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Account for a tick once its measurement is out: its row of the trace, what happened, a status that is due.
+        """After the measurement was sent: write the tick's trace row, publish events and a status that is due.
 
         Args:
-            measurement: As the endpoint made it; SILENCE where it has nothing new, None where there is none.
-            arrival: What was received since the last tick, before any injected fault; None for nothing.
+            measurement: The endpoint's frame; SILENCE if it is not to be sent, None if there is none.
+            arrival: The command received since the last tick, before any injected fault; None for none.
             sent_ns: When the measurement was sent, on `time.monotonic_ns()`.
         """
 
     @abstractmethod
     def publish_when_due(self) -> None:
-        """Tell how things are, if it is time to."""
+        """Publish the status if it is due."""
 
     @abstractmethod
     def publish_status(self) -> None:
-        """Tell how things are."""
+        """Publish the status."""
 
     @abstractmethod
     def leave(self) -> None:
-        """Tell that the plant is at 0 V and goes."""
+        """Publish that the plant stopped at 0 V, and leave the network."""

@@ -1,7 +1,6 @@
-"""Who may drive a plant: claims, sessions and the latch that a trip leaves behind, sans-I/O.
+"""Claims, sessions and the trip latch of a plant, sans-I/O.
 
-One controller at a time, by name. Whoever stands at the plant end of a wire builds on this: the endpoint of a plant,
-and the bridge to one that is elsewhere.
+One controller at a time holds the plant, by name. Base of the plant's Endpoint and of the CAN bridge's Relay.
 
               claim                first command
   idle ────────────────► granted ───────────────► driven
@@ -10,8 +9,8 @@ and the bridge to one that is elsewhere.
    │ arm                                             │ watchdog, holder gone, invalid command, limit, operator's stop
    └────────────────────────────────── tripped ◄─────┘
 
-A tripped plant, and one that starts unarmed, refuse claims and say why. A claim may carry its own arming
-(`auto_arm`), which clears anything but an operator's stop.
+A plant that tripped or started unarmed refuses claims with the reason. A claim with `auto_arm` arms the plant itself,
+except after an operator's stop.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 
 
 class Notice(NamedTuple):
-    """Something for the `event` topic; `tick` is the session's, None before its first measurement."""
+    """An event to publish; `tick` is the session's, None before its first measurement."""
 
     kind: EventKind
     text: str
@@ -35,7 +34,7 @@ class Notice(NamedTuple):
 
 
 class Trip(NamedTuple):
-    """A reason to go to 0 V: its kind, and what exactly."""
+    """Cause of a trip, and the reason in words."""
 
     cause: TripCause
     reason: str
@@ -45,23 +44,23 @@ class Tenancy:
     """A plant that one controller at a time may drive.
 
     Args:
-        wire: How frames are read and written here.
+        wire: Format of the frames.
         period_ns: Period of a tick [ns].
-        lockstep: Whether each answer is waited for; a claim must say the same.
-        armed: Whether the first claim is granted without anybody arming it.
+        lockstep: Whether the loop waits for each command; a claim must have the same value.
+        armed: Whether the first claim is granted without `arm`.
 
     Attributes:
-        session: Name of the session it is in, or None.
-        holder: Controller that holds it, or None.
-        trip: The cause of the last trip, until it is cleared.
-        notices: What happened since the owner last emptied this list.
-        operations: What changed this end between its ticks since the owner last emptied this list.
+        session: Name of the session, or None.
+        holder: Controller that holds the plant, or None.
+        trip: Cause of the last trip, until it is cleared.
+        notices: Events since the owner last emptied this list.
+        operations: Changes of this end between ticks since the owner last emptied this list.
         ticked: Index of the last tick; −1 before the first.
-        outcome: What was done at the last tick with the command received before it.
+        outcome: How the last tick judged the command received before it.
         voltages: In force from the last tick to the next command [V]. Shape (actuators,).
         refused: Malformed frames so far.
         stale: Commands so far that answered a measurement older than the watchdog's time.
-        unavailable: Why no claim can be granted now, for a reason that only the owner can see; None if there is none.
+        unavailable: Reason set by the owner to refuse every claim, such as a bus fault; None for none.
     """
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool = False, armed: bool = False) -> None:
@@ -85,12 +84,12 @@ class Tenancy:
 
     @property
     def state(self) -> PlantState:
-        """What it is doing."""
+        """State of the plant: idle, granted, driven or tripped."""
         return self._machine.state
 
     @property
     def cause(self) -> str | None:
-        """Why claims are held back, or None."""
+        """Why the latch refuses claims, or None."""
         return self._latch
 
     @property
@@ -105,16 +104,16 @@ class Tenancy:
 
     @property
     def event_tick(self) -> int | None:
-        """The session tick of what happens now; None without a session and before its first measurement."""
+        """Session tick for an event now; None without a session and before its first measurement."""
         return self.session_tick if self.session is not None and self.session_tick >= 0 else None
 
     @property
     def saturated(self) -> int:
-        """Values beyond their quantizer's range so far, where they are quantized here."""
+        """Measured values beyond their quantizer's range so far; 0 where nothing is quantized."""
         return 0
 
     def claim(self, claim: Claim) -> Grant | Refusal:
-        """Grant a claim, or say which field differs or who holds the plant. The next tick measures first."""
+        """Grant a claim, or refuse it with the fields that differ, the holder or the latch's reason."""
         differences = self.wire.differences(claim.wire)
         if claim.protocol != PROTOCOL_VERSION:
             differences.append(f"protocol: {PROTOCOL_VERSION}, not {claim.protocol}")
@@ -140,7 +139,7 @@ class Tenancy:
         return Grant(session=claim.session)
 
     def release(self, session: str) -> bool:
-        """End a session at its holder's wish: 0 V. False if it is not the session that runs."""
+        """End the session on its holder's request: 0 V. False if another session or none runs."""
         if session != self.session:
             return False
         self.operated("release", name=session)
@@ -148,7 +147,7 @@ class Tenancy:
         return True
 
     def arm(self) -> bool:
-        """Clear what holds claims back; the next one is granted. False while a controller holds the plant."""
+        """Clear the latch, so that the next claim is granted. False while a controller holds the plant."""
         if self.session is not None:
             return False
         self.operated("arm")
@@ -158,33 +157,33 @@ class Tenancy:
         return True
 
     def stop(self) -> None:
-        """An operator's stop, from any state: 0 V, and no claim is granted before `arm`."""
+        """Trip on an operator's stop, in any state: 0 V, and no claim is granted before `arm`."""
         self.operated("stop")
         self._trip(TripCause.OPERATOR, "stopped by an operator")
         self._operator_stop = True
 
     def lost(self, controller: str) -> None:
-        """A controller's liveliness token went; if it held the plant, its session ends: 0 V."""
+        """Trip if this controller, having lost its liveliness token, holds the plant."""
         if controller == self.holder:
             self.operated("lost", name=controller)
             self._trip(TripCause.HOLDER_GONE, f"{controller} is gone")
 
     def expire(self, cause: TripCause, reason: str) -> None:
-        """End a session for a reason that only its owner can see, such as no answer in lockstep: 0 V."""
+        """Trip for a cause that the owner detects, such as no answer in lockstep. Nothing without a session."""
         if self.session is not None:
             self.operated("expire", cause=cause, reason=reason)
             self._trip(cause, reason)
 
     def operated(self, kind: OperationKind, **what: Any) -> None:
-        """Note something that changed this end after its last tick; fields as in Operation."""
+        """Record a change of this end after its last tick; fields as in Operation."""
         self.operations.append(Operation(tick=self.ticked, kind=kind, **what))
 
     def first_command_ns(self, watchdog_ns: int) -> int:
-        """How long a granted claim may wait for its first command [ns].
+        """Time within which the first command of a session must be received [ns].
 
-        An echo counts as fresh by its age modulo the counter. A stream that is late by a whole round of it would look
-        fresh from its first command on, so that has to come before the counter is back at 0. A counter that is short
-        by configuration cannot tell, and gets the usual time.
+        Why: the age of an echo is known modulo the counter. Commands late by a whole round of the counter would look
+        fresh, so the first one must be received before the counter is back at 0. A counter shorter than twice the
+        watchdog's time cannot detect this, and gets the usual time.
 
         Args:
             watchdog_ns: The watchdog's time [ns].
@@ -195,10 +194,10 @@ class Tenancy:
         return min(usual, (counters - 1) * self.period_ns)
 
     def _begin(self) -> None:
-        """A session begins."""
+        """Reset the subclass's state when a session begins."""
 
     def _rest(self) -> None:
-        """A session has ended: 0 V."""
+        """Set 0 V when a session has ended."""
 
     def _trip(self, cause: TripCause, reason: str) -> None:
         self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V")

@@ -1,7 +1,7 @@
-"""The plant end's trace: a row for every tick of a session, and what was done between ticks.
+"""Trace of the plant end: a row for every tick of a session, and the operations between ticks.
 
-The owner adds rows once a tick's measurement is out, and calls `follow` whenever a session may have begun or ended. A
-session's rows are published to the last when it ends; operations outside of sessions at once, without rows.
+The owner adds a row after each measurement was sent, and calls `follow` whenever a session may have begun or ended. All
+waiting rows are published when a session ends; operations outside of sessions are published at once, without rows.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from aeroloop.protocol.wire.transmit import SILENCE
 
 
 class PlantTrace:
-    """Writes one plant end's trace.
+    """Writer of one plant end's trace.
 
     Args:
-        loop: The grid, and how often a batch is published.
-        wire: Sizes of the frames.
+        loop: Loop settings, with the time between batches.
+        wire: Format of the frames.
         publish: Called with every batch.
-        run: A random number of this process; drawn if None.
+        run: Random number that identifies this process; drawn if None.
     """
 
     def __init__(
@@ -37,12 +37,12 @@ class PlantTrace:
         self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
 
     def row(self, end: Tenancy, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Add the row of the last tick, and publish what is due. Nothing without a session.
+        """Add the row of the last tick, and publish a batch that is due. Nothing without a session.
 
         Args:
-            end: After the tick.
-            measurement: As the endpoint made it; SILENCE where it has nothing new, None where it tripped.
-            arrival: What was received since the last tick; None for nothing.
+            end: The plant end after the tick.
+            measurement: The endpoint's frame; SILENCE if it is not to be sent, None if the tick tripped.
+            arrival: The command received since the last tick; None for none.
             sent_ns: When the measurement was sent, on the monotonic clock [ns].
         """
         writer = self._writer
@@ -71,26 +71,26 @@ class PlantTrace:
             end.voltages,
         )
         if writer.due(sent_ns):
-            self._take(final=False)
+            self._publish_batch(final=False)
 
     def follow(self, end: Tenancy) -> None:
-        """Take over the end's operations; publish all that waits where its session ended or there is none."""
+        """Move the end's operations into the trace; publish everything waiting if its session ended or none runs."""
         writer = self._writer
         if end.operations:
             writer.operations += end.operations
             end.operations.clear()
         session = end.session or ""
         if session != writer.session:
-            if writer.session or not writer.empty:  # a session's last batch says so, with or without rows
-                self._take(final=bool(writer.session))
+            if writer.session or not writer.empty:  # the last batch is marked final, with or without rows
+                self._publish_batch(final=bool(writer.session))
             writer.session = session
         elif not session and not writer.empty:
-            self._take(final=False)
+            self._publish_batch(final=False)
 
     def finish(self) -> None:
-        """The process ends: publish all that waits."""
+        """Publish everything waiting, before the process ends."""
         if self._writer.session or not self._writer.empty:
-            self._take(final=bool(self._writer.session))
+            self._publish_batch(final=bool(self._writer.session))
 
-    def _take(self, *, final: bool) -> None:
+    def _publish_batch(self, *, final: bool) -> None:
         self._publish(self._writer.take(time.monotonic_ns(), time.time_ns(), final=final))

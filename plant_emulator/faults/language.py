@@ -1,4 +1,4 @@
-"""What can go wrong, on purpose: the vocabulary. `faulty` and `faulty_stream` apply it.
+"""Notation of faults; `signals` and `streams` apply them.
 
 A fault is written `signal:kind[=value][@start[..end]]`, in seconds of the plant's time. Without a start it acts at
 once, without an end for ever:
@@ -10,15 +10,15 @@ off         no valid value                       0 V                           n
 stuck       the last value before the fault      the last voltage before it    the last frame before, for each new one
 bias=v      v is added [rad], [rad/s]            v is added [V]
 noise=σ     Gaussian noise [rad], [rad/s]        Gaussian noise [V]
-delay=s     what was true s seconds ago          what was commanded then       frames come s seconds later, in order
+delay=s     the values of s seconds ago          the voltage of s seconds ago  frames pass s seconds later, in order
 drop=p      no valid value                       0 V for a period              a frame is lost
 garble=p    a random value                       a random voltage              one random bit of a frame is flipped
 duplicate=p                                                                    a frame passes again a tick later
 reorder=p                                                                      a frame passes after the next one
 
-p is the probability that it happens to a sample, a period or a frame. `attitude` and `rate` take an axis of the body,
-`.x .y .z`; bias and noise of the attitude are rotations about the body's axes. Motors are counted from 1 in the order
-in which they are commanded, and `motors` are all of them at the same times.
+p is the probability per sample, period or frame. `attitude` and `rate` take an axis of the body, `.x .y .z`; bias and
+noise of the attitude are rotations about the body's axes. Motors are numbered from 1 in the order of the commanded
+voltages; `motors` fails all of them at the same times.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ MAX_MOTORS: Final = 3
 
 
 class Signal(NamedTuple):
-    """Something that a fault can act on.
+    """A signal that a fault can act on.
 
     Attributes:
-        whole: What it is, or is a part of.
-        part: SessionKey part of it: axis 0…2, or motor from 0; None for all of it.
-        kinds: What can go wrong with it.
+        whole: Sensor, motors or stream that it is, or is a part of.
+        part: Axis 0…2, or motor from 0; None for all of it.
+        kinds: Kinds of faults that it takes.
     """
 
     whole: Whole
@@ -52,7 +52,7 @@ class Signal(NamedTuple):
 _ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
 _OF_VALUES = _ALL_KINDS[:7]
 _OF_FRAMES: tuple[Kind, ...] = ("off", "stuck", "delay", "drop", "garble", "duplicate", "reorder")
-# A unit quaternion has no one axis that could be old or random while the others are right.
+# In a unit quaternion no single axis can be old or random while the others are right.
 _OF_ROTATIONS: tuple[Kind, ...] = ("off", "bias", "noise", "drop")
 
 SIGNALS: Final[dict[str, Signal]] = {
@@ -65,7 +65,7 @@ SIGNALS: Final[dict[str, Signal]] = {
     "measurement": Signal("measurement", None, _OF_FRAMES),
     "command": Signal("command", None, _OF_FRAMES),
 }
-"""Every signal by the name it has in a fault."""
+"""Every signal by its name in a fault."""
 
 _PROBABILITY = (ulp(0.0), 1.0, "a probability above 0 and up to 1")
 _VALUES: Final[dict[Kind, tuple[float, float, str]]] = {
@@ -77,11 +77,11 @@ _VALUES: Final[dict[Kind, tuple[float, float, str]]] = {
     "duplicate": _PROBABILITY,
     "reorder": _PROBABILITY,
 }
-"""The range of each kind's value, in numbers and in words. What is not here takes none."""
+"""Range of each kind's value, in numbers and in words. Other kinds take no value."""
 
 
 class Fault(BaseModel):
-    """One thing that goes wrong with one signal for a while.
+    """One kind of failure of one signal for a span of time.
 
     Raises:
         ValidationError: A ValueError; each of its messages is one line. `parse` raises a ValueError of one line.
@@ -89,18 +89,18 @@ class Fault(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    signal: str = Field(description="what it acts on: a sensor, a motor or a stream")
-    kind: Kind = Field(description="what goes wrong")
-    value: float | None = Field(default=None, validate_default=True, description="how much [signal's unit, s or 1]")
-    start_s: float = Field(default=0.0, description="when it begins, in the plant's time [s]")
-    end_s: float | None = Field(default=None, description="when it is over [s]; never if left out")
+    signal: str = Field(description="sensor, motor or stream that fails")
+    kind: Kind = Field(description="kind of failure")
+    value: float | None = Field(default=None, validate_default=True, description="size [signal's unit, s or 1]")
+    start_s: float = Field(default=0.0, description="start, in the plant's time [s]")
+    end_s: float | None = Field(default=None, description="end [s]; none if left out")
 
     @classmethod
     def parse(cls, text: str) -> Fault:
-        """The fault that is written `signal:kind[=value][@start[..end]]`.
+        """Parse `signal:kind[=value][@start[..end]]`.
 
         Raises:
-            ValueError: In one line, the text and what is wrong with it.
+            ValueError: One line with the text and the error in it.
         """
         try:
             return cls._parse(text.strip())
@@ -113,10 +113,10 @@ class Fault(BaseModel):
     @classmethod
     def _parse(cls, text: str) -> Fault:
         what, at, when = text.partition("@")
-        signal, colon, doing = what.partition(":")
+        signal, colon, failure = what.partition(":")
         if not colon:
             raise ValueError("it is written signal:kind[=value][@start[..end]], such as attitude:off@5")
-        kind, equals, value = doing.partition("=")
+        kind, equals, value = failure.partition("=")
         start, dots, end = when.partition("..")
         return cls(
             signal=signal,
@@ -134,7 +134,7 @@ class Fault(BaseModel):
 
     @property
     def target(self) -> Signal:
-        """What it acts on."""
+        """Signal that the fault acts on."""
         return SIGNALS[self.signal]
 
     def active(self, t: float) -> bool:
@@ -146,7 +146,7 @@ class Fault(BaseModel):
         return self.end_s is not None and t >= self.end_s
 
     def later(self, by: float) -> Fault:
-        """The same fault, `by` [s] later; on whole nanoseconds, as ticks are."""
+        """The same fault, `by` [s] later, rounded to the nanosecond as ticks are."""
         end = None if self.end_s is None else round(self.end_s + by, 9)
         return self.model_copy(update={"start_s": round(self.start_s + by, 9), "end_s": end})
 

@@ -1,11 +1,10 @@
-"""Faults at work on a plant: its sensors and motors fail as they are told, and repeat from a seed.
+"""Faults of a plant's sensors and motors, repeatable from a seed.
 
-A FaultyPlant stands between the endpoint and any plant. Voltages pass its motor faults on their way in, as of the
-period's beginning; samples pass its sensor faults on their way out, as of the period's end. Faults on one signal act
-one after another, in the order in which they came, each with its own random numbers: one more fault leaves the noise of
-the others as it was. Those that have ended are forgotten.
+A FaultyPlant wraps any plant for the endpoint. Motor faults change the voltages at the start of a period; sensor faults
+change the sample at its end. Faults on one signal act one after another, in the order of injection. Each has its own
+random numbers, so that another fault leaves their noise unchanged. Faults that have ended are removed.
 
-Instants are rounded to the nanosecond, so that a fault begins at the tick that a person means.
+Times are rounded to the nanosecond, so that a fault starts at exactly the tick of its start time.
 """
 
 from __future__ import annotations
@@ -24,20 +23,20 @@ from aeroloop.plant_emulator.plant import Measurement, Plant
 Values: TypeAlias = tuple[float, ...]
 
 GARBLED_RATE: Final = 10.0
-"""A garbled angular velocity lies within ± this about each axis [rad/s]."""
+"""Bound of a garbled angular velocity about each axis, ± [rad/s]."""
 
 
 class ValueFault(ABC):
-    """A fault at work on what is sampled once a period.
+    """A fault of values sampled once a period.
 
     Args:
-        fault: What goes wrong and when.
-        random: Where its random numbers come from.
-        size: Components that can be in error.
-        last: The values just before, if they are known.
+        fault: The fault to apply.
+        random: Its random numbers.
+        size: Number of components of an error.
+        last: The values just before, if there are any.
 
     Attributes:
-        fault: What goes wrong and when.
+        fault: The fault to apply.
     """
 
     def __init__(self, fault: Fault, random: np.random.Generator, size: int, last: Values | None) -> None:
@@ -49,7 +48,7 @@ class ValueFault(ABC):
         self._history: deque[tuple[float, Values]] = deque() if last is None else deque([(-inf, last)])
 
     def apply(self, values: Values, t: float) -> Values:
-        """What becomes of the values of time t [s]. Call it at every sample: before it begins, a fault looks on."""
+        """Apply the fault to the values of time t [s]. Call it at every sample: before it starts, it keeps history."""
         kind = self.fault.kind
         delayed = self._delayed(values, t) if kind == "delay" else values
         if not self.fault.active(t):
@@ -73,7 +72,7 @@ class ValueFault(ABC):
 
     @abstractmethod
     def missing(self, values: Values) -> Values:
-        """What there is instead of values that are not there."""
+        """Values that stand for missing ones."""
 
     @abstractmethod
     def garbled(self) -> Values:
@@ -99,20 +98,20 @@ class ValueFault(ABC):
 
 
 class AttitudeFault(ValueFault):
-    """A fault at work on a quaternion. Errors are rotation vectors in the body frame [rad]."""
+    """A fault of a quaternion. Errors are rotation vectors in the body frame [rad]."""
 
     def missing(self, values: Values) -> Values:
         """No valid value."""
         return (nan,) * len(values)
 
     def garbled(self) -> Values:
-        """Any attitude, each as likely as the others."""
+        """A uniformly distributed attitude."""
         w, x, y, z = self._random.standard_normal(4).tolist()
         length = hypot(w, x, y, z)
         return w / length, x / length, y / length, z / length
 
     def shifted(self, values: Values, error: Sequence[float]) -> Values:
-        """`q ⊗ exp(error / 2)`: the body, turned further about its own axes."""
+        """`q ⊗ exp(error / 2)`: a further rotation about the body's axes."""
         angle = hypot(*error)
         if angle == 0.0:
             return values
@@ -126,30 +125,30 @@ class AttitudeFault(ValueFault):
         )
 
     def replaced(self, values: Values, by: Values) -> Values:
-        """The other attitude, whole: a fault that replaces it has no axis."""
+        """The other attitude as a whole: a fault that replaces it has no axis."""
         del values
         return by
 
 
 class RateFault(ValueFault):
-    """A fault at work on an angular velocity [rad/s]."""
+    """A fault of an angular velocity [rad/s]."""
 
     def missing(self, values: Values) -> Values:
-        """No valid value: without one axis, the rate is not known."""
+        """No valid value, on all axes: a rate with one axis missing is invalid."""
         return (nan,) * len(values)
 
     def garbled(self) -> Values:
-        """Any rate within the range of a gyro gone mad."""
+        """A uniformly distributed rate within ±GARBLED_RATE."""
         return tuple(self._random.uniform(-GARBLED_RATE, GARBLED_RATE, self._size).tolist())
 
 
 class MotorFault(ValueFault):
-    """A fault at work on the motors' voltages [V], all of which pass through it.
+    """A fault of the motors' voltages [V].
 
     Args:
-        fault: What goes wrong and when.
-        random: Where its random numbers come from.
-        last: The motors' voltages now [V]. Shape (actuators,).
+        fault: The fault to apply.
+        random: Its random numbers.
+        last: The motors' present voltages [V]. Shape (actuators,).
         limit: Largest voltage of a garbled one [V].
 
     Raises:
@@ -168,26 +167,26 @@ class MotorFault(ValueFault):
         return self.replaced(values, (0.0,) * len(values))
 
     def garbled(self) -> Values:
-        """Any voltages the supply can give."""
+        """Uniformly distributed voltages within the limit."""
         return tuple(self._random.uniform(-self._limit, self._limit, self._size).tolist())
 
 
 class FaultyPlant(Plant):
-    """A plant with faults. Until `start` is called nothing fails, and time stands still.
+    """A plant with faults. Before `start` its time is 0 and no fault acts.
 
     Args:
-        plant: The plant that is meant to fail.
-        faults: What goes wrong; those of streams are left to FaultyStream.
-        period: Time that `advance` lets pass [s].
+        plant: The plant.
+        faults: Faults to apply; those of streams are ignored here, FaultyStream applies them.
+        period: Time of one `advance` [s].
         voltage_limit: Largest voltage of a garbled command [V].
-        seed: Of all random numbers, from 0 up.
+        seed: Seed of all random numbers, 0 or more.
 
     Raises:
         ValueError: A fault of a motor that the plant does not have.
 
     Attributes:
-        plant: The plant itself.
-        actuators: Number of its motors.
+        plant: The plant without its faults.
+        actuators: Number of motors.
     """
 
     def __init__(
@@ -210,17 +209,17 @@ class FaultyPlant(Plant):
 
     @property
     def time(self) -> float:
-        """Seconds of plant time since `start`; 0 before."""
+        """Plant time since `start` [s]; 0 before."""
         return round(self._ticks * self._period, 9)
 
     def start(self) -> None:
-        """Time begins, at 0. Once is enough."""
+        """Start the time at 0. A second call does nothing."""
         if not self._started:
             self._started = True
             self._seen = None
 
     def inject(self, fault: Fault) -> None:
-        """Add a fault whose start and end are counted from now. A sample that was measured already stays as it is.
+        """Add a fault with start and end counted from now. The current sample stays unchanged.
 
         Raises:
             ValueError: A fault of a motor that the plant does not have.
@@ -228,7 +227,7 @@ class FaultyPlant(Plant):
         self._attach(fault.later(self.time))
 
     def clear(self) -> None:
-        """No faults any more; the motors have what is commanded."""
+        """Remove all faults and put the commanded voltages on the motors."""
         self._sensors = []
         if self._motors:
             self._motors = []
@@ -236,7 +235,7 @@ class FaultyPlant(Plant):
             self._applied = self._commanded
 
     def actuate(self, voltages: Sequence[float]) -> None:
-        """Put voltages [V] on the motors, as far as these do as they are told. Shape (actuators,)."""
+        """Put voltages [V] through the motor faults on the motors. Shape (actuators,)."""
         self._commanded = self._applied = tuple(voltages)
         self._actuated = True
         if self._motors:
@@ -249,16 +248,16 @@ class FaultyPlant(Plant):
     def advance(self) -> None:
         """Let one period pass."""
         if self._motors and not self._actuated:
-            self.actuate(self._commanded)  # a motor fails, and recovers, under a voltage that is merely held
+            self.actuate(self._commanded)  # a motor also fails and recovers while a voltage is held
         self._actuated = False
         self.plant.advance()
         self._ticks += self._started
         self._seen = None
         if self._sensors:
-            self.measure()  # what holds and delays values needs every sample, also those nobody asks for
+            self.measure()  # faults that hold or delay values need every sample
 
     def measure(self) -> Measurement:
-        """What the sensors say, right or wrong: the same until the next period is over."""
+        """Sensor values with their faults; the same until the next `advance`."""
         if self._seen is None:
             self._seen = self.plant.measure()
             if self._sensors:
@@ -266,7 +265,7 @@ class FaultyPlant(Plant):
         return self._seen
 
     def close(self) -> None:
-        """0 V, whatever is faulty: no fault acts from here on."""
+        """Remove all faults and set 0 V."""
         self._motors, self._sensors = [], []
         self._commanded = self._applied = (0.0,) * self.actuators
         self.plant.close()
@@ -301,5 +300,5 @@ class FaultyPlant(Plant):
 
 
 def generator(seed: int, number: int, fault: Fault) -> np.random.Generator:
-    """Random numbers of one fault: others for each signal, or both streams would lose the same ticks."""
+    """Random numbers of one fault; they differ by signal, so that the two streams do not lose the same ticks."""
     return np.random.default_rng([seed, number, *fault.signal.encode()])

@@ -1,6 +1,6 @@
-"""Faults at work on frames: a stream in one direction that loses, delays, repeats and garbles them as it is told.
+"""Faults of frames in one direction: lost, delayed, repeated, reordered and garbled frames.
 
-Faults act one after another, in the order in which they came, each with its own random numbers.
+Faults act one after another, in the order of injection, each with its own random numbers.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from aeroloop.plant_emulator.faults.signals import generator
 
 
 class StreamFault:
-    """A fault at work on frames.
+    """A fault of frames.
 
     Args:
-        fault: What goes wrong and when.
-        random: Where its random numbers come from.
+        fault: The fault to apply.
+        random: Its random numbers.
         last: The frame that passed last, if there was one.
 
     Attributes:
-        fault: What goes wrong and when.
+        fault: The fault to apply.
     """
 
     def __init__(self, fault: Fault, random: np.random.Generator, last: bytes | None) -> None:
         self.fault = fault
         self._value = 0.0 if fault.value is None else fault.value
         self._random, self._last = random, last
-        self._held: deque[tuple[float, bytes]] = deque()  # when each is due, and what
+        self._held: deque[tuple[float, bytes]] = deque()  # due time [s] and frame
 
     def apply(self, frames: list[bytes], t: float) -> list[bytes]:
-        """What passes at time t [s], of these frames and of those held back. Call it once a tick."""
+        """Return the frames that pass at time t [s], of these and of those held back. Call it once a tick."""
         match self.fault.kind:
             case "delay":
                 return self._delayed(frames, t)
@@ -56,14 +56,14 @@ class StreamFault:
         return self.fault.over(t) and not self._held
 
     def forget(self) -> None:
-        """Hold nothing back any more."""
+        """Drop the frames held back."""
         self._held.clear()
 
     def _happens(self, t: float) -> bool:
         return self.fault.active(t) and bool(self._random.random() < self._value)
 
     def _delayed(self, frames: list[bytes], t: float) -> list[bytes]:
-        """When the fault ends, what is on its way comes at once, ahead of what is not late any more."""
+        """When the fault ends, all held frames pass at once, ahead of the newer ones."""
         active = self.fault.active(t)
         self._held.extend((round(t + self._value, 9), frame) for frame in frames)
         passed = []
@@ -108,9 +108,9 @@ class FaultyStream:
     """Frames of one direction, with faults.
 
     Args:
-        signal: SessionKey direction it is.
-        faults: What goes wrong; those of other signals are left to others.
-        seed: Of all random numbers, from 0 up.
+        signal: Direction of the frames.
+        faults: Faults to apply; those of other signals are ignored here.
+        seed: Seed of all random numbers, 0 or more.
     """
 
     def __init__(self, signal: Literal["measurement", "command"], faults: Sequence[Fault], seed: int = 0) -> None:
@@ -122,14 +122,14 @@ class FaultyStream:
             self.inject(fault, 0.0)
 
     def passes(self, frame: bytes | None, t: float) -> list[bytes]:
-        """Take in the frame of a tick, and say what comes out.
+        """Pass the frame of a tick through the faults.
 
         Args:
             frame: The frame, or None.
             t: The plant's time [s], rising.
 
         Returns:
-            What passes at this tick, in the order in which it does.
+            The frames that pass at this tick, in order.
         """
         frames = [] if frame is None else [frame]
         if self._faults:
@@ -142,17 +142,17 @@ class FaultyStream:
         return frames
 
     def inject(self, fault: Fault, now: float) -> None:
-        """Add a fault whose start and end are counted from `now` [s], if it is one of this signal."""
+        """Add a fault with start and end counted from `now` [s], if it is of this signal."""
         if fault.signal == self._signal:
             random = generator(self._seed, self._attached, fault)
             self._faults.append(StreamFault(fault.later(now), random, self._last))
             self._attached += 1
 
     def forget(self) -> None:
-        """Frames that are held back are lost: another session's key is not theirs."""
+        """Drop the frames held back: they belong to the last session's keys."""
         for fault in self._faults:
             fault.forget()
 
     def clear(self) -> None:
-        """No faults any more; a frame that one held back is lost."""
+        """Remove all faults; frames held back are lost."""
         self._faults = []

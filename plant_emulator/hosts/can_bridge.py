@@ -1,11 +1,11 @@
-"""The bridge: a plant on a CAN bus, as controllers on Zenoh see it.
+"""Bridge between Zenoh and a plant on a CAN bus.
 
 On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace. On
-the bus it is the controller's side. Frames pass as they are, byte for byte. It keeps a watchdog of its own, besides the
-node's, and trips when the bus fails or the node falls silent, has another wire spec or trips itself; when the bus is
-back it takes it up again by itself, and the plant is driven again once it is armed.
+the bus it is the controller's side. Frames pass unchanged, byte for byte. It runs its own watchdog besides the node's
+and trips when the bus fails or the node is silent, has another wire spec or trips. It reopens a failed bus by itself;
+the plant is driven again once it is armed.
 
-A tick of the bridge is a measurement that passes. Commands count as fresh by the same rule as at the node.
+A tick of the bridge is a forwarded measurement. Commands are judged fresh or stale by the node's rule.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCaus
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.can_link import HEARTBEAT_S, CanLink, CanSettings, Heartbeat, fingerprint
+from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
+from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -34,18 +35,18 @@ SESSIONS: Final = 16
 
 
 class Relay(Tenancy):
-    """Who may drive a plant that is elsewhere, and the watchdog on this side of the wire; sans-I/O.
+    """Claims, sessions and watchdog for a plant on a bus, sans-I/O.
 
     Args:
-        wire: What the frames are.
+        wire: Format of the frames.
         period_ns: Period of a tick [ns].
-        lockstep: Whether each answer is waited for.
+        lockstep: Whether the loop waits for each command.
         watchdog_s: The session ends after this long without a fresh command [s].
-        armed: Whether the first claim is granted without anybody arming it.
+        armed: Whether the first claim is granted without `arm`.
 
     Attributes:
-        number: Of the session, as the bus knows it.
-        counter: Of the last measurement that passed.
+        number: Number of the session on the bus.
+        counter: Counter of the last forwarded measurement.
     """
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
@@ -55,16 +56,16 @@ class Relay(Tenancy):
         self._counters = wire.measurement.counters
         self._level = wire.voltage.quantizer().level
         self.protect(watchdog_s)
-        self._begun = False  # the first measurement of a session has counter 0; what comes before is of another
+        self._begun = False  # from the first measurement with counter 0; frames before it are of another session
         self._session_tick = -1
-        self._fresh_ns: int | None = None  # when the last fresh command passed, or the session began
+        self._fresh_ns: int | None = None  # time of the last fresh command or of the session's start
         self._judged = Outcome.NONE  # of the last command since the last tick
-        self._said: tuple[float, ...] = ()  # codes of the last fresh command
+        self._codes: tuple[float, ...] = ()  # of the last fresh command
         self._echo = self._answered = -1
 
     @property
     def session_tick(self) -> int:
-        """Tick of the last measurement since the session's first, by its counter: a whole round lost is not seen."""
+        """Tick of the last measurement since the session's first, by its counter; a lost round goes unnoticed."""
         return self._session_tick
 
     @property
@@ -73,13 +74,13 @@ class Relay(Tenancy):
         return self._answered
 
     def protect(self, watchdog_s: float) -> None:
-        """Use another watchdog time from now on [s]."""
+        """Set the watchdog's time [s]."""
         self._watchdog_ns = round(watchdog_s * 1e9)
         self._watchdog = max(1, round(self._watchdog_ns / self.period_ns))
         self._first_command_ns = self.first_command_ns(self._watchdog_ns)
 
     def measurement(self, frame: bytes) -> bytes | None:
-        """A frame from the bus; returned if it may pass, and then it is a tick."""
+        """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick."""
         if self.session is None:
             return None
         if self._is_silence(frame, "measurement"):
@@ -101,14 +102,14 @@ class Relay(Tenancy):
         return frame if self._begun else None
 
     def command(self, frame: bytes, now_ns: int) -> bytes | None:
-        """A frame from the controller that has the session; returned if it may pass.
+        """Take a frame from the session's controller. Returns it if it is to be forwarded.
 
-        The node judges again what passes; what is not fresh here does not feed the watchdog.
+        A stale command is forwarded, too, but does not reset the watchdog; the node judges it again.
         """
         if self.session is None:
             return None
         if self._is_silence(frame, "command") and self.state is PlantState.DRIVEN:
-            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._said)
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
         else:
             read = self.wire.command.unpack(frame)
         if read is None:
@@ -122,10 +123,10 @@ class Relay(Tenancy):
         return frame
 
     def watch(self, now_ns: int) -> bool:
-        """End the session when no fresh command came in time. In lockstep the node waits as long as it likes.
+        """Trip if no fresh command was received in time. In lockstep only the first command has a deadline.
 
         Returns:
-            Whether it ended the session, which is a tick without a measurement.
+            Whether it tripped, which is a tick without a measurement.
         """
         if self.session is None:
             return False
@@ -147,13 +148,13 @@ class Relay(Tenancy):
         return self._first_command_ns if self._begun else round(FIRST_COMMAND_S * 1e9)
 
     def _count(self, ticks: int) -> None:
-        """A tick, so many periods after the last one of the session."""
+        """Count a tick, this many periods after the session's last one."""
         self.ticked += 1
         self._session_tick += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
 
     def _judge(self, echo: int, codes: tuple[float, ...]) -> Outcome:
-        """As the endpoint does."""
+        """Judge a command by the endpoint's rule."""
         age = (self.counter - echo) % self._counters
         answered = self._session_tick - age
         if not self._begun or echo == self._echo or answered <= self._answered:
@@ -161,7 +162,7 @@ class Relay(Tenancy):
         if age > self._watchdog:
             self.stale += 1
             return Outcome.STALE
-        self._said, self._echo, self._answered = codes, echo, answered
+        self._codes, self._echo, self._answered = codes, echo, answered
         voltages = tuple(self._level(code) for code in codes)
         self.voltages = voltages if isfinite(sum(voltages)) else self.off
         return Outcome.ACTED
@@ -172,21 +173,21 @@ class Relay(Tenancy):
     def _begin(self) -> None:
         self.number = (self.number + 1) % SESSIONS
         self._begun, self._session_tick, self._fresh_ns = False, -1, None
-        self._judged, self._said, self._echo, self._answered = Outcome.NONE, (), -1, -1
+        self._judged, self._codes, self._echo, self._answered = Outcome.NONE, (), -1, -1
 
     def _rest(self) -> None:
         self.voltages, self._answered = self.off, -1
 
 
 class Bridge:
-    """The bridge as a process.
+    """The bridge's loop.
 
     Args:
-        role: Its name on Zenoh.
-        loop: The grid.
-        wire: What the frames are.
-        settings: How the plant end looks after itself.
-        bus: The CAN bus, and which node of it the plant is.
+        role: Its role on Zenoh.
+        loop: Loop settings.
+        wire: Format of the frames.
+        settings: Watchdog and arming of the plant end.
+        bus: The CAN bus and the plant's node number.
 
     Raises:
         CanError: The bus cannot be opened, or a frame does not fit it.
@@ -207,27 +208,27 @@ class Bridge:
         )
         self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
-        self._presence = ZenohFront(role, loop, self._relay, self._changed)
+        self._front = ZenohFront(role, loop, self._relay, self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._beat_due = 0.0
         self._reopen_due = 0.0
-        self._told = self._relay.state
+        self._sent_state = self._relay.state  # by heartbeat
         self._arrival: Arrival | None = None  # the last command since the last tick
         self._machine_notes: list[str] = []
         self._granted_ns = 0
 
     def run(self) -> None:
-        """Run until the role is told to stop; then the node is released, and a last status told."""
-        presence, relay = self._presence, self._relay
+        """Run until the role stops; then release the node and publish a last status."""
+        front, relay = self._front, self._relay
         if not self._loop.lockstep:
-            presence.notes = self._machine_notes = prepare_process(self._loop)
-        presence.serve()
+            front.notes = self._machine_notes = prepare_process(self._loop)
+        front.serve()
         try:
             while not self._role.stop.is_set():
                 with self._changed:
-                    self._changed.wait_for(self._frame_came, WAIT_S)
+                    self._changed.wait_for(self._frame_pending, WAIT_S)
                 relay.unavailable = self._unavailable()
-                presence.take_inbox()
+                front.take_inbox()
                 self._follow()
                 self._pass_frames()
                 if relay.watch(now_ns := time.monotonic_ns()):
@@ -236,32 +237,32 @@ class Bridge:
                 self._follow()
                 if self._bus.errors or self._bus.refused:
                     count = f"the bus: {self._bus.errors} errors, {self._bus.refused} malformed frames"
-                    presence.notes = [*self._machine_notes, count]
-                presence.follow_session()
-                presence.publish_when_due()
+                    front.notes = [*self._machine_notes, count]
+                front.follow_session()
+                front.publish_when_due()
         finally:
             if relay.session is not None:
                 relay.release(relay.session)
             self._beat()
             self._bus.close()
-            presence.leave()
+            front.leave()
 
     def reconfigure(self, settings: PlantSettings) -> None:
-        """Take over what can change between two ticks: the watchdog."""
+        """Apply the settings that can change between two ticks: the watchdog's time."""
         self._relay.operated("reconfigure", settings={"watchdog_s": settings.watchdog_s})
         self._relay.protect(settings.watchdog_s)
 
-    def _frame_came(self) -> bool:
-        link = self._presence.link
+    def _frame_pending(self) -> bool:
+        link = self._front.link
         return self._bus.pending or (link is not None and link.pending)
 
     def _pass_frames(self) -> None:
         arrival = self._bus.take()
         if arrival is not None and self._relay.measurement(arrival.frame) is not None:
             sent_ns = time.monotonic_ns()
-            self._presence.send(arrival.frame)
+            self._front.send(arrival.frame)
             self._account(arrival.frame, sent_ns)
-        arrival = self._presence.link.take() if self._presence.link else None
+        arrival = self._front.link.take() if self._front.link else None
         if arrival is not None:
             self._arrival = arrival
             frame = self._relay.command(arrival.frame, time.monotonic_ns())
@@ -270,28 +271,29 @@ class Bridge:
 
     def _account(self, measurement: bytes | None, sent_ns: int) -> None:
         arrival, self._arrival = self._arrival, None
-        self._presence.after_tick(measurement, arrival, sent_ns)
+        self._front.after_tick(measurement, arrival, sent_ns)
 
     def _watch_node(self) -> None:
-        """Trip when the bus or the node cannot be relied on any more."""
+        """Trip when the bus fails, or the node is silent, tripped, restarted or of another wire spec."""
         relay, bus = self._relay, self._bus
         if bus.fault is not None:
             relay.expire(TripCause.BUS, bus.fault)
             self._mend(bus.fault)
             return
-        heard = bus.peer
-        if relay.session is None or heard is None:
+        peer = bus.peer
+        if relay.session is None or peer is None:
             return
         if bus.silent:
             relay.expire(TripCause.NODE, f"node {self._node} has been silent for {bus.silent_s() * 1e3:.0f} ms")
-        elif heard.at_ns < self._granted_ns:
-            return  # it speaks of what was before this session
-        elif heard.fingerprint != self._fingerprint:
+        elif peer.at_ns < self._granted_ns:
+            return  # this heartbeat may be from before the session
+        elif peer.fingerprint != self._fingerprint:
             relay.expire(TripCause.NODE, f"node {self._node} has another wire spec now")
-        elif heard.state is PlantState.IDLE:
+        elif peer.state is PlantState.IDLE:
             relay.expire(TripCause.NODE, f"node {self._node} was started again")
-        elif heard.state is PlantState.TRIPPED:
-            relay.expire(heard.cause or TripCause.NODE, f"node {self._node} tripped: {heard.cause or 'no cause told'}")
+        elif peer.state is PlantState.TRIPPED:
+            cause = peer.cause or "no cause reported"
+            relay.expire(peer.cause or TripCause.NODE, f"node {self._node} tripped: {cause}")
 
     def _unavailable(self) -> str | None:
         bus = self._bus
@@ -304,16 +306,16 @@ class Bridge:
         return None
 
     def _follow(self) -> None:
-        """Beat when it is due, and at once when the state has changed: the node follows it."""
+        """Send a heartbeat when it is due, and at once when the state has changed: the node follows it."""
         relay = self._relay
-        if relay.state is not self._told:
+        if relay.state is not self._sent_state:
             if relay.state is PlantState.GRANTED:
-                self._bus.take()  # what came before the session is not of it
+                self._bus.take()  # drop a frame from before the session
                 self._arrival = None
-                # The node's state is told ten times a second, and at once when it changes: what it says from here on
-                # may still be of before for as long as the first of our heartbeats takes.
+                # The node sends its state ten times a second and at every change. Until it has received the first
+                # heartbeat of this session, it may still send its state of before.
                 self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
-            self._told = relay.state
+            self._sent_state = relay.state
             self._beat()
         elif time.monotonic() >= self._beat_due:
             self._beat()

@@ -1,8 +1,8 @@
-"""A plant behind an Endpoint, driven in time: the process at the plant end, whatever the plant and the network.
+"""Loop of the plant end, for any plant and any network.
 
-The loop is wait → receive → tick → send → account. Who leads depends on the plant: on an emulated one the loop waits
-for the grid; hardware lets `advance` return when its next sample is there; in lockstep the loop waits for the answer to
-its last measurement, so that a run repeats bit for bit.
+The loop is wait → receive → tick → send → account. An emulated plant waits for the tick grid; with hardware `advance`
+blocks until the next sample; in lockstep the loop waits for the answer to its last measurement, so that a run repeats
+bit for bit.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from aeroloop.protocol.wire.transmit import SILENCE
 
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6
-"""Hardware's sample is answered within this share of the period, or in the next one."""
+"""With hardware, the loop waits for the answer to a sample for this share of the period."""
 
 
 class Driver:
-    """Drives a plant.
+    """Runs the plant end's loop.
 
     Args:
         plant: The plant.
-        loop: The grid.
-        wire: How frames are read and written.
-        settings: How it looks after itself.
-        stop: Set when it is to end.
+        loop: Loop settings.
+        wire: Format of the frames.
+        settings: Watchdog, limits and arming.
+        stop: Set to end the loop.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
 
     Attributes:
-        endpoint: Who grants, refuses and trips.
+        endpoint: The plant's endpoint.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Driver:
         )
 
     def run(self, front: Front) -> None:
-        """Run until told to stop; then 0 V, and a last word."""
+        """Run until `stop` is set; then close the plant at 0 V and leave the network."""
         self._front = front
         front.serve()
         try:
@@ -81,7 +81,7 @@ class Driver:
             front.leave()
 
     def reconfigure(self, settings: PlantSettings) -> None:
-        """Take over what can change between two ticks: limits and watchdog."""
+        """Apply the settings that can change between two ticks: limits and watchdog."""
         self._settings = settings
         changed = {"watchdog_s": settings.watchdog_s, "limits": settings.limits.model_dump()}
         self.endpoint.operated("reconfigure", settings=changed)
@@ -100,7 +100,7 @@ class Driver:
             before = self.endpoint.session
             front.take_inbox()
             if grid and self.endpoint.session not in (None, before):
-                # To grant took its time, and a session's first measurement tells the controller where the grid is.
+                # Granting took time, and the controller takes its grid from the session's first measurement.
                 k, skipped = grid.wait(), grid.skipped
             self._tick(self._command(), k)
             if self.endpoint.session:
@@ -108,7 +108,7 @@ class Driver:
             timing.done()
 
     def _command(self) -> Arrival | None:
-        """The command for this period. Hardware lets it act as soon as it is there, so it is worth a wait."""
+        """Return the command for this period. Hardware applies it at once, so the loop waits for it."""
         link = self._front.link
         if link is None:
             return None
@@ -126,7 +126,7 @@ class Driver:
             arrival = None if echo is None else self._await_answer(echo)
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """One tick of the plant end, without the network: as `Endpoint.tick`, with what stands in between.
+        """Tick the plant end without the network: `Endpoint.tick` with the frames' hooks before and after it.
 
         Args:
             frame: The newest command frame received since the last tick, or None.
@@ -141,7 +141,7 @@ class Driver:
         return measurement
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        """One tick on the network. Returns the counter that an answer to its measurement will echo, if one will."""
+        """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
         front, measured = self._front, self.endpoint.wire.measurement
         measurement = self.tick(arrival.frame if arrival is not None else None, k)
         sent_ns = time.monotonic_ns()
@@ -149,7 +149,7 @@ class Driver:
         for sent in self._outgoing(measurement):
             front.send(sent)
             if self._loop.lockstep:
-                # The controller reads what has no counter as the tick after its last.
+                # The controller takes a frame without a counter for the tick after its last.
                 echo = measured.counter(sent)
                 self._counter = (self._counter + 1) % measured.counters if echo is None else echo
                 if sent == SILENCE:
@@ -158,7 +158,7 @@ class Driver:
         return echo
 
     def _await_answer(self, echo: int) -> Arrival | None:
-        """The command that echoes a counter, or None when the session ends before it comes."""
+        """Wait for the command that echoes a counter. Returns None if the session ends first."""
         deadline = time.monotonic() + self._settings.answer_timeout_s
         while self._front.link and not self._stop.is_set():
             arrival = self._front.link.wait(IDLE_WAIT_S)
@@ -171,18 +171,18 @@ class Driver:
             self._front.publish_when_due()
         return None
 
-    # ── where somebody may stand in between ──
+    # ── hooks of subclasses ──
 
     def _may_step(self) -> bool:
-        """Whether the next step in lockstep may be taken now."""
+        """Whether lockstep may take its next step."""
         return True
 
     def _incoming(self, frame: bytes | None) -> bytes | None:
-        """A command as it comes from the network; returned as the endpoint is to have it."""
+        """Change or drop a received command before the endpoint gets it."""
         return frame
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
-        """A measurement as the endpoint gives it; returned as what goes to the network."""
+        """Return the frames to send for the endpoint's measurement."""
         return [] if frame is None else [frame]
 
 

@@ -1,7 +1,7 @@
-"""The emulated plant as a process: a driver whose plant is computed, and can be told to fail.
+"""Emulator: a driver with a computed plant and injectable faults.
 
-Faults act on the plant's sensors and motors, on the measurements before they are sent and on the commands after they
-have come. On Zenoh it also tells the truth, takes faults while it runs, and steps on request in lockstep.
+Faults act on the plant's sensors and motors, on measurements before they are sent and on commands after they were
+received. On Zenoh it also publishes the true state, accepts faults while it runs, and steps on request in lockstep.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from aeroloop.protocol.wire.transmit import SILENCE
 
 
 def truth_of(plant: EmulatedPlant, endpoint: Endpoint) -> Truth:
-    """The state now, and which measurement was taken of it."""
+    """The present true state, with the tick of the measurement taken of it."""
     state, session = plant.truth(), endpoint.session
     return Truth(
         tick=endpoint.ticked,
@@ -45,13 +45,13 @@ class FaultError(AeroloopError):
 
 
 class Emulator(Driver):
-    """An emulated plant, whatever network it is on.
+    """The emulator, for any network.
 
     Args:
-        loop: The grid.
-        wire: How frames are read and written.
+        loop: Loop settings.
+        wire: Format of the frames.
         settings: The plant.
-        stop: Set when it is to end.
+        stop: Set to end the loop.
 
     Raises:
         ValueError: A fault of a motor that the plant does not have.
@@ -67,7 +67,7 @@ class Emulator(Driver):
         self._session: str | None = None
 
     def inject(self, fault: Fault | None) -> None:
-        """Add a fault whose start and end are counted from now; None clears all.
+        """Add a fault with start and end counted from now; None removes all faults.
 
         Raises:
             ValueError: A fault of a motor that the plant does not have.
@@ -94,18 +94,18 @@ class Emulator(Driver):
         return passed[-1] if passed else None
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
-        if frame == SILENCE and not self._loop.lockstep:  # then it is no frame, and nothing befalls it
+        if frame == SILENCE and not self._loop.lockstep:  # not a frame, so no fault acts on it
             return self._measurements.passes(None, self._faulty.time) or [SILENCE]
         return self._measurements.passes(frame, self._faulty.time)
 
 
 class EmulatorOnZenoh(Emulator):
-    """The emulator as it stands on Zenoh.
+    """The emulator on Zenoh.
 
     Args:
-        role: Its name on the network.
-        loop: The grid.
-        wire: How frames are read and written.
+        role: Its role on the network.
+        loop: Loop settings.
+        wire: Format of the frames.
         settings: The plant.
 
     Raises:
@@ -115,17 +115,17 @@ class EmulatorOnZenoh(Emulator):
     def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
         super().__init__(loop, wire, settings, role.stop)
         self._role = role
-        self._steps: int | None = 0 if settings.steps_on_request else None  # that may still be taken; None: any number
+        self._steps: int | None = 0 if settings.steps_on_request else None  # steps left; None: no limit
         self._truth_every = self._ticks_between_truths()
 
     def run(self, front: Front | None = None) -> None:
-        """Run until the role is told to stop; then 0 V and a last status."""
+        """Run until the role stops; then set 0 V and publish a last status."""
         self._role.serve("inject", Inject, lambda inject: self._inject(inject.fault))
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
         super().run(front or ZenohFront(self._role, self._loop, self.endpoint))
 
     def reconfigure(self, settings: PlantSettings) -> None:
-        """Take over limits, watchdog, and how often the truth is told."""
+        """Apply limits, watchdog and the rate of true states."""
         super().reconfigure(settings)
         self._truth_every = self._ticks_between_truths()
 
@@ -143,14 +143,14 @@ class EmulatorOnZenoh(Emulator):
     def _await_answer(self, echo: int) -> Arrival | None:
         arrival = super()._await_answer(echo)
         if self._steps == 0:
-            self._front.publish_status()  # whoever asked for the steps waits for this
+            self._front.publish_status()  # ends the wait of the `advance` query's sender
         return arrival
 
     def _ticks_between_truths(self) -> int:
         rate = self._settings.truth_rate_hz
         return max(1, round(self._loop.rate_hz / rate)) if rate else 0
 
-    # ── for tests: what goes wrong, and when ──
+    # ── queries `inject` and `advance`, for tests ──
 
     def _inject(self, text: str | None) -> Callable[[], Answer]:
         try:

@@ -1,8 +1,8 @@
 """Replay of an emulated plant: the plant end computed again from its own rows, and compared byte for byte.
 
-The emulator is sans-I/O below its driver: its settings, seeds and faults, what was received at each tick, and what was
-done between ticks determine everything that it measures. A replay starts at the first row of the plant's process, where
-the plant's state is known, and goes on as long as no row is missing.
+`Emulator.tick` uses no clock and no network: settings, seeds, faults, the frames received at each tick and the
+operations between ticks determine every measurement. A replay starts at the first row of the plant's process, where the
+plant's state is known, and stops at the first missing row.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 _FIELDS: Final = ("session", "session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
-"""What is compared of a row, in the order in which a difference is looked for."""
+"""Compared columns of a row; the first that differs is reported."""
 
 
 class PlantDifference(BaseModel):
-    """The first row that was computed otherwise than it was logged."""
+    """The first row with computed values that differ from the logged ones."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -43,18 +43,18 @@ class PlantDifference(BaseModel):
 
 
 class PlantReplayed(BaseModel):
-    """What the replay of one process of the plant has shown."""
+    """Result of the replay of one process of the plant."""
 
     model_config = ConfigDict(frozen=True)
 
     ticks: int = Field(description="rows compared")
-    differ: int = Field(description="of them, rows that were computed otherwise")
+    differ: int = Field(description="rows that differ from the logged ones")
     first_difference: PlantDifference | None
     stopped: str | None = Field(description="why it ends before the log does; null if it does not")
 
 
 def why_not(plant: PlantSettings) -> str | None:
-    """Why a plant cannot be computed again; None if it can."""
+    """Why a plant cannot be replayed; None if it can."""
     return None if plant.via == "emulator" else f"plant.via is {plant.via!r}: only an emulated plant is computed again"
 
 
@@ -62,12 +62,12 @@ class PlantReplay:
     """Replays one process of an emulated plant.
 
     Args:
-        loop: The grid, as the process began with it.
-        wire: How frames were read and written.
-        plant: The plant, as the process began with it: what was reconfigured later is in the trace.
+        loop: Loop settings at the start of the process.
+        wire: Format of the frames.
+        plant: The plant's settings at the start of the process; later changes are in the trace.
 
     Raises:
-        ValueError: `why_not` says why.
+        ValueError: The plant cannot be replayed, with the reason of `why_not`.
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
@@ -85,35 +85,35 @@ class PlantReplay:
         self._empty_at: set[int] = set()  # bases of batches without rows since the last row
 
     def feed(self, batch: Batch) -> bool:
-        """Replay a batch of the run, in order; one that was fed before is passed over.
+        """Replay the next batch of the run; a repeated batch is ignored.
 
         Returns:
-            Whether the replay goes on; after a gap it does not.
+            Whether the replay goes on; it stops at a gap.
         """
         if self._run is None:
             self._run = batch.header.run
-        if self._stopped is None and not self._known(batch):
+        if self._stopped is None and not self._repeated(batch):
             self._stopped = self._cannot_follow(batch)
             if self._stopped is None:
                 self._replay(batch)
         return self._stopped is None
 
     def result(self) -> PlantReplayed:
-        """What has been found so far."""
+        """Result so far."""
         stopped = self._stopped
         if self._run is None and stopped is None:
             stopped = "the log has no trace of the plant"
         return PlantReplayed(ticks=self._ticks, differ=self._differ, first_difference=self._first, stopped=stopped)
 
-    def _known(self, batch: Batch) -> bool:
-        """Whether a batch was fed before: a recorder that starts again gets the last minute again."""
+    def _repeated(self, batch: Batch) -> bool:
+        """Whether a batch was fed before: a restarted recorder receives the last minute again."""
         header = batch.header
         if header.run != self._run:
             return False
         if header.rows == 0:
-            known = header.first_row < self._rows or header.monotonic_ns in self._empty_at
+            repeated = header.first_row < self._rows or header.monotonic_ns in self._empty_at
             self._empty_at.add(header.monotonic_ns)
-            return known
+            return repeated
         return header.first_row < self._rows
 
     def _cannot_follow(self, batch: Batch) -> str | None:
@@ -153,7 +153,7 @@ class PlantReplay:
             self._empty_at.clear()
 
     def _inputs(self, batch: Batch) -> Iterator[tuple[int, bytes | None, tuple[object, ...]]]:
-        """Tick, command and what is to be compared of each row."""
+        """Tick, command and compared columns of each row."""
         rows = batch.columns
         session = batch.header.session
         answered = rows["answered"].astype(np.int64)
@@ -214,7 +214,7 @@ class PlantReplay:
     # ── between ticks ──
 
     def _operate(self, operation: Operation) -> bool:
-        """Let the plant come to an operation's tick, and do it. Whether it could be done."""
+        """Advance the plant to an operation's tick and apply it. Returns whether that was possible."""
         emulator, endpoint = self._emulator, self._emulator.endpoint
         if operation.tick > endpoint.ticked:
             if endpoint.session is not None:

@@ -1,8 +1,8 @@
-"""What controllers and operators see of a plant: whoever stands at the plant end stands on the network through this.
+"""Plant end on Zenoh.
 
-It answers claims and operators' verbs, opens and closes the session's link, publishes status, events and the trace, and
-counts the frames. Claims, verbs and lost peers come from Zenoh's threads and wait for the owner to take them between
-ticks: the endpoint is only ever touched by one thread.
+Answers claims and operator commands, opens and closes the session's link, publishes status, events and the trace, and
+counts the frames. Claims, operator commands and lost peers arrive in Zenoh's threads and are queued until the owner
+takes them between ticks, so that only one thread uses the endpoint.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class ZenohFront(Front):
     """A plant end on the network.
 
     Args:
-        role: Its name there.
-        loop: The grid.
-        endpoint: Who grants, refuses and trips.
+        role: Its role on Zenoh.
+        loop: Loop settings.
+        endpoint: The plant's endpoint, or the bridge's relay.
         changed: Notified when a command arrives, for an owner that waits for more than one thing.
     """
 
@@ -48,9 +48,9 @@ class ZenohFront(Front):
         self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
         self._latency = RollingHistogram()
         self._counters = endpoint.wire.measurement.counters
-        self._sent_at: list[tuple[int, int]] = []  # session tick of each counter's last frame, and when it was sent
+        self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
         self._sent = self._received = 0
-        self._told_state = endpoint.state
+        self._published_state = endpoint.state
         self._since = _now() if endpoint.cause else None
         self._status_tick = -1
         self._status_due = 0
@@ -58,11 +58,11 @@ class ZenohFront(Front):
 
     @property
     def link(self) -> ZenohLink | None:
-        """The session's frames; None while there is no session."""
+        """Link of the session's frames; None without a session."""
         return self._link
 
     def serve(self) -> None:
-        """Answer claims and operators from now on."""
+        """Declare the topics, and answer claims and operator commands from now on."""
         role = self._role
         role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
@@ -74,18 +74,18 @@ class ZenohFront(Front):
         role.event("started", f"{role.vehicle} waits for a claim")
 
     def take_inbox(self) -> None:
-        """Between ticks: do what has come from controllers and operators."""
+        """Process queued claims, releases and operator commands."""
         if self._role.take_inbox():
             self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame of the session; silence is sent only where it could not be heard, in lockstep."""
+        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
         if self._link is not None and (frame or self._loop.lockstep):
             self._link.send(frame)
             self._sent += frame != SILENCE
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Account for a tick once its measurement is out: latency, the trace's row, events, a status that is due."""
+        """After the measurement was sent: write the trace row, measure latency, publish events and a due status."""
         endpoint = self._endpoint
         self._trace.row(endpoint, measurement, arrival, sent_ns)
         if endpoint.outcome is Outcome.ACTED:
@@ -104,11 +104,11 @@ class ZenohFront(Front):
         self.publish_when_due()
 
     def follow_session(self) -> None:
-        """Publish what happened, and close the link of a session that ended."""
+        """Publish events, and close the link of a session that ended."""
         self._trace.follow(self._endpoint)
         endpoint = self._endpoint
-        if endpoint.state is not self._told_state:
-            self._told_state = endpoint.state
+        if endpoint.state is not self._published_state:
+            self._published_state = endpoint.state
             self._status_due = 0
         if endpoint.session is None and self._link is not None:
             self._link.close()
@@ -118,7 +118,7 @@ class ZenohFront(Front):
         if endpoint.cause is None:
             self._since = None
         elif any(notice.kind == "tripped" for notice in endpoint.notices):
-            self._told_state = endpoint.state
+            self._published_state = endpoint.state
         self._since = _now()
         for notice in endpoint.notices:
             self._role.event(*notice)
@@ -126,21 +126,21 @@ class ZenohFront(Front):
         self._status_due = 0
 
     def publish_when_due(self) -> None:
-        """Tell the status if a second is over, or something has happened."""
+        """Publish the status once a second, and at once after an event or a change of state."""
         if time.monotonic_ns() >= self._status_due:
             self.publish_status()
 
     def leave(self) -> None:
-        """Tell that the plant is at 0 V and goes."""
+        """Publish the end of the trace, the stop and a last status."""
         self.follow_session()
         self._trace.finish()
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
         self.publish_status()
 
-    # ── what came from Zenoh's threads, taken between ticks ──
+    # ── queries and tokens from Zenoh's threads, processed between ticks ──
 
-    def _token(self, name: str, came: bool) -> None:
-        if not came:
+    def _token(self, name: str, appeared: bool) -> None:
+        if not appeared:
             self._role.later(lambda: self._endpoint.lost(name))
 
     def _claim(self, claim: Claim) -> Grant | Refusal:
@@ -167,7 +167,7 @@ class ZenohFront(Front):
         return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
 
     def _open_link(self, session: str) -> None:
-        """Listen for commands before the grant goes out, so that the first one finds somebody."""
+        """Subscribe to commands before the grant is sent, so that the first one is not lost."""
         vehicle = self._role.vehicle
         self._sent_at = [(-1, 0)] * self._counters
         self._link = ZenohLink(
@@ -179,7 +179,7 @@ class ZenohFront(Front):
         )
 
     def publish_status(self) -> None:
-        """Tell the status."""
+        """Publish the status."""
         now = time.monotonic()
         endpoint = self._endpoint
         self._latency.turn_when_due()

@@ -1,1 +1,1 @@
-"""Model."""
+"""Emulated plant: equations of motion, rotors, friction, wind, sensors and integration."""

@@ -1,4 +1,4 @@
-"""The Quanser Aero with two degrees of freedom: the rigid body of (C.1)–(C.2) with its roll held by the mechanism.
+"""Quanser Aero with two degrees of freedom: the rigid body of (C.1)–(C.2) with its roll held by the mechanism.
 
 It yaws about the vertical and pitches about the body's y axis, so its attitude is R_z(yaw) R_y(pitch) and its body
 rates are ω = A ν with ν = [ṗ, ẏ]:
@@ -24,7 +24,7 @@ from aeroloop.protocol.wire.attitude import R, S, from_euler
 
 
 class AeroSettings(BaseModel):
-    """The Aero's body. Defaults: Table C.1 of the paper but for the centre of mass, which `lab calibrate` fitted."""
+    """The Aero's body. Defaults: Table C.1 of the paper, except the centre of mass, fitted by `lab calibrate`."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -41,12 +41,12 @@ class AeroSettings(BaseModel):
     )
     damping: tuple[float, float, float] = Field(
         default=(0.0, 0.0, 0.0),
-        description="θ of (C.2), damping about the *body* axes [N·m·s/rad]; the bench has its friction in the joints",
+        description="θ of (C.2), damping about the *body* axes [N·m·s/rad]; 0: friction of the bench is in the joints",
     )
 
 
 def free_motions(pitch: ca.SX) -> ca.SX:
-    """A(p) of the module's head: ω = A [ṗ, ẏ]. Shape (3, 2)."""
+    """A(p) of the module's docstring: ω = A [ṗ, ẏ]. Shape (3, 2)."""
     return ca.vertcat(ca.horzcat(0, -ca.sin(pitch)), ca.horzcat(1, 0), ca.horzcat(0, ca.cos(pitch)))
 
 

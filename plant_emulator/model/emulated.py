@@ -1,7 +1,7 @@
-"""The emulated plant: a mechanism, with rotors, friction and wind acting on it and sensors looking at it.
+"""Emulated plant: a mechanism with rotors, friction, wind and sensors.
 
-Each piece knows itself; this is where they meet. Motors clip the command to the supply, rotors lag behind it, friction
-and wind load the mechanism's axes, a Runge–Kutta step lets time pass, and the sensors say what they see.
+The supply clips the commanded voltages, the rotors lag behind them, friction and wind load the mechanism's axes,
+Runge–Kutta steps integrate one period, and the sensors sample the new state.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ def step_function(
 
 
 class EmulatedPlant(Plant):
-    """A plant that is computed, so its state is known.
+    """A computed plant with an accessible true state.
 
     Args:
         mechanism: The body.
-        rotor: How thrust follows voltage.
-        friction: What opposes its motion.
-        wind: What blows at it.
-        sensors: What looks at it.
-        period: Time that `advance` lets pass [s].
+        rotor: Rotor lag and dead zone.
+        friction: Friction about the axes.
+        wind: Wind torque about the axes.
+        sensors: Sensors of the plant.
+        period: Time of one `advance` [s].
         voltage_limit: Largest voltage of the supply [V].
         substeps: Runge–Kutta steps a period.
     """
@@ -101,7 +101,7 @@ class EmulatedPlant(Plant):
             self._u[i] = max(-limit, min(limit, voltage))
 
     def advance(self) -> None:
-        """Integrate one period and let the sensors look."""
+        """Integrate one period and sample the sensors."""
         if not self._wind.calm:
             for i, torque in enumerate(self._wind.sample()):
                 self._load[i] = torque
@@ -113,11 +113,11 @@ class EmulatedPlant(Plant):
         self._measurement = self._sensors.read(self._attitude, self._rate, self._angles)
 
     def measure(self) -> Measurement:
-        """What the sensors said at the end of the last period."""
+        """Sensor values at the end of the last period."""
         return self._measurement
 
     def truth(self) -> State:
-        """The unquantized state now."""
+        """The present true state."""
         return State(self._attitude, self._rate, tuple(self._u))
 
     def close(self) -> None:

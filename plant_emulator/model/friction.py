@@ -1,7 +1,7 @@
-"""Friction about each axis: viscous torque in proportion to the rate, Coulomb torque against its direction.
+"""Friction about each axis: viscous torque proportional to the rate, Coulomb torque against its direction.
 
-The Coulomb torque turns over smoothly, c·tanh(rate/width), within a rate so small that no sensor of the plant sees it;
-a jump would make the integration depend on where its steps fall.
+The Coulomb torque changes sign smoothly, c·tanh(rate/width), within a rate that the plant's sensors cannot resolve.
+Why: with a jump the result would depend on where the integration steps fall.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class FrictionSettings(BaseModel):
         max_length=3,
         description="Coulomb friction about the axes [N·m]; pitch measured (spin-down), yaw fitted by `lab calibrate`",
     )
-    width: float = Field(default=0.01, gt=0, le=1, description="rate within which Coulomb friction turns over [rad/s]")
+    width: float = Field(default=0.01, gt=0, le=1, description="rate within which Coulomb torque changes sign [rad/s]")
 
 
 def friction_torque(settings: FrictionSettings, rates: ca.SX) -> ca.SX:

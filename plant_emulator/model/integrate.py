@@ -14,7 +14,7 @@ def rk4(derivative: Callable[[ca.SX], ca.SX], x: ca.SX, period: float, substeps:
         derivative: ẋ of a state, inputs held. Shape (n,) to (n,).
         x: State at the start. Shape (n,).
         period: Time to pass [s].
-        substeps: Equal steps to take within it.
+        substeps: Number of equal steps within it.
     """
     h = period / substeps
     for _ in range(substeps):

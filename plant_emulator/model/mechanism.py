@@ -1,7 +1,7 @@
-"""What a body is to the emulator: a few equations, to which rotors, friction, wind and sensors are added from outside.
+"""Mechanism interface: the equations of motion of an emulated body, without rotors, friction, wind and sensors.
 
-A mechanism has axes about which it moves freely: two joints for the Aero, three body axes for a free body. A load is
-a torque about each axis; friction and wind are loads, and so need to know nothing else of the mechanism.
+A mechanism moves freely about its axes: two joints for the Aero, three body axes for a free body. A load is a torque
+about each axis. Friction and wind are loads, so they depend on the axes only.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Mechanism(ABC):
     """Equations of motion in CasADi. States are in rad, rad/s and, for a quaternion, 1.
 
     Attributes:
-        initial: State at the start. Its length is the number of states.
+        initial: Initial state; its length is the number of states.
         actuators: Number of motors.
         axes: Number of axes that a load acts about.
     """
@@ -57,5 +57,5 @@ class Mechanism(ABC):
         """Angles of the joints [rad], for encoders. Shape (axes,), or (0,) where there are no joints."""
 
     def settle(self, x: ca.SX) -> ca.SX:
-        """The state after a step, put back where integration has let it drift off."""
+        """Correct the drift of a state after an integration step."""
         return x

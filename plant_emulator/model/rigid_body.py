@@ -1,4 +1,4 @@
-"""A free rigid body, (C.1)–(C.2) with the disturbance of (C.78): three axes, three actuators, any attitude."""
+"""Free rigid body, (C.1)–(C.2) with the disturbance of (C.78): three axes, three actuators, any attitude."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ class RigidBody(Mechanism):
         return x[4:7]
 
     def axis_rates(self, x: ca.SX) -> ca.SX:
-        """ω again: the axes are the body's."""
+        """ω: the axes are the body's."""
         return x[4:7]
 
     def axis_angles(self, x: ca.SX) -> ca.SX:
-        """No joints."""
+        """Empty: a free body has no joints."""
         return x[0:0]
 
     def settle(self, x: ca.SX) -> ca.SX:

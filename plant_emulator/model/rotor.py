@@ -1,7 +1,7 @@
-"""Rotors: a motor does not change its thrust at once.
+"""Rotors: lag of thrust behind the commanded voltage, and a dead zone.
 
-The voltage that makes thrust follows the commanded one with a first-order lag, a little faster up than down, because
-drag helps to brake a rotor less than the motor helps to drive it. Near zero a rotor may make no thrust at all.
+The voltage that makes thrust follows the commanded one with a first-order lag, a little faster up than down: drag
+brakes a rotor less than the motor drives it. Below the dead zone a rotor makes no thrust.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class RotorSettings(BaseModel):
-    """How thrust follows voltage. Lags of 0 leave the rotors out."""
+    """Lag and dead zone of the rotors. Lags of 0 leave the rotors out."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -42,13 +42,13 @@ class RotorSettings(BaseModel):
 
 
 def rotor_derivative(settings: RotorSettings, state: ca.SX, command: ca.SX) -> ca.SX:
-    """V̇ of the voltages that make thrust [V/s], from those voltages and the commanded ones [V]. Shape as given."""
+    """V̇ of the voltages that make thrust [V/s], from those and the commanded ones [V]. Shape as given."""
     rising = (command - state) * state >= 0  # away from zero; a rotor that reverses falls first, then rises
     return (command - state) / ca.if_else(rising, settings.lag_up_s, settings.lag_down_s)
 
 
 def thrust_voltage(settings: RotorSettings, state: ca.SX) -> ca.SX:
-    """What is left of a voltage after the dead zone [V]. Shape as given."""
+    """Voltage beyond the dead zone [V]. Shape as given."""
     if not settings.dead_zone_v:
         return state
     return ca.sign(state) * ca.fmax(ca.fabs(state) - settings.dead_zone_v, 0)

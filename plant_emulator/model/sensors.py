@@ -1,7 +1,7 @@
-"""Sensors: what the plant end knows of the true state.
+"""Sensors of the emulated plant.
 
-Attitude comes from encoders that count steps of the joints, zeroed somewhere within a step, or is perfect. Angular
-velocity is the filtered derivative of the encoders' angles, or comes from a gyro with noise and bias, or is perfect.
+Attitude: encoders that count steps of the joints, with a random zero within a step, or perfect. Angular velocity: the
+filtered derivative of the encoders' angles, a gyro with noise and bias, or perfect.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
 NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))
-"""What sensors say of a state that has left the numbers."""
+"""Measurement without a valid value, such as of a state that is not finite."""
 
 _BLOCK = 4096  # random numbers are drawn this many samples at a time
 
 
 class SensorSettings(BaseModel):
-    """What measures attitude and angular velocity."""
+    """Sensors of attitude and angular velocity."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -62,7 +62,7 @@ class FilteredDerivative:
         self._rate = 0.0
 
     def update(self, angle: float) -> float:
-        """Take in a sample [rad] and return the rate [rad/s]; the first sample is where it starts, at rest."""
+        """Filter a sample [rad] and return the rate [rad/s]. The filter starts at the first sample, at rest."""
         if self._angle is None:
             self._angle = angle
         lag = self._angle - angle
@@ -72,10 +72,10 @@ class FilteredDerivative:
 
 
 class Sensors:
-    """Samples of one plant.
+    """Sensors of one plant.
 
     Args:
-        settings: What measures.
+        settings: Kinds and errors of the sensors.
         period: Time between samples [s].
     """
 
@@ -90,7 +90,7 @@ class Sensors:
         self._noise: list[Vector] = []
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
-        """What the sensors say of a true attitude q [1], rate ω [rad/s] and joint angles [rad]; once a period."""
+        """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
         try:
             return Measurement(*self._read(attitude, rate, angles))
         except (OverflowError, ValueError):  # an infinite or undefined angle has no count

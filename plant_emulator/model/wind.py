@@ -1,8 +1,8 @@
 """Wind: a steady torque about each axis and gusts around it.
 
-The gust is an Ornstein–Uhlenbeck process, the simplest noise with a memory (Dryden's longitudinal gust is the same
-filter): it forgets with time constant `gust_time_s` and keeps a standard deviation of `gust` times the steady torque.
-It is seeded, so that a run repeats, and stepped exactly, so that gusts are of one kind whatever the period.
+The gust is an Ornstein–Uhlenbeck process (the same filter as Dryden's longitudinal gust) with time constant
+`gust_time_s` and a standard deviation of `gust` times the steady torque. It is seeded, so that a run repeats, and
+stepped exactly, so that its statistics do not depend on the period.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _BLOCK = 4096  # random numbers are drawn this many periods at a time: one draw 
 
 
 class WindSettings(BaseModel):
-    """What blows at the plant. The default is calm; when it blows, it is the paper's fan as fitted."""
+    """Wind on the plant. The default is calm; the default torques are the fitted ones of the paper's fan."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -32,7 +32,7 @@ class WindSettings(BaseModel):
         le=10,
         description="standard deviation of gusts, all axes together, as a part of the steady torque; assumed",
     )
-    gust_time_s: float = Field(default=1.0, gt=0, le=1000, description="how long a gust is remembered [s]")
+    gust_time_s: float = Field(default=1.0, gt=0, le=1000, description="time constant of a gust [s]")
     seed: int = Field(default=0, ge=0, description="of the gusts' random numbers")
 
 
@@ -40,10 +40,10 @@ class Wind:
     """Torque about each axis, period by period.
 
     Attributes:
-        calm: Whether there is never any.
+        calm: Whether the torque is always 0.
 
     Args:
-        settings: What blows.
+        settings: Steady torque and gusts.
         axes: Number of axes.
         period: Time between samples [s].
     """

@@ -1,1 +1,1 @@
-"""Messages."""
+"""Topics, JSON messages, state machines and the trace, without I/O."""

@@ -1,6 +1,6 @@
-"""What crosses the network and is not a frame: JSON, by pydantic.
+"""JSON messages: everything on the network that is neither a frame nor a trace.
 
-Fields with a unit say it in their description, so that the JSON schema in a log explains the log.
+Units stand in the fields' descriptions, so that the JSON schema in a log explains the log.
 """
 
 from __future__ import annotations
@@ -9,9 +9,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, PlainSerializer, StringConstraints
 
-from aeroloop.protocol.messages import operator as verbs
 from aeroloop.protocol.messages.operator import Message
-from aeroloop.protocol.messages.topics import TOPICS, Topic
 from aeroloop.protocol.wire.spec import WireSpec
 
 PROTOCOL_VERSION: Final = 2
@@ -22,58 +20,60 @@ EventKind = Literal[
 
 
 def _no_other_topics_key(session: str) -> str:
+    from aeroloop.protocol.messages.topics import TOPICS  # whose rows name the models
+
     if any(session == topic.key.partition("/")[0] for topic in TOPICS.values()):
         raise ValueError(f"{session!r} is the key of a topic and cannot name a session")
     return session
 
 
 SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"), AfterValidator(_no_other_topics_key)]
-"""One chunk of a key, and no other topic's."""
+"""One chunk of a key, and not the first chunk of a topic's key."""
 
 
 class Claim(Message):
-    """A controller's question to a plant: may I have this vehicle?"""
+    """A controller's request for the exclusive control of a plant."""
 
-    protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md the controller speaks")
-    controller: str = Field(description="who asks; the name of its liveliness token")
-    session: SessionName = Field(description="the key its frames would travel under; new for every claim")
+    protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md that the controller implements")
+    controller: str = Field(description="name of the controller and of its liveliness token")
+    session: SessionName = Field(description="name of the session, in the keys of its frames; new for every claim")
     period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
-    lockstep: bool = Field(description="the plant waits for each answer before it steps")
+    lockstep: bool = Field(description="the plant waits for each command before it steps")
     auto_arm: bool = Field(default=False, description="arm the plant by this claim, unless an operator stopped it")
     wire: Annotated[WireSpec, PlainSerializer(WireSpec.agreed)]
 
 
 class Grant(Message):
-    """The plant's answer to a claim: yes. The first measurement follows at once."""
+    """The plant's answer to a claim it accepts. The first measurement follows at once."""
 
     granted: Literal[True] = True
     session: str
 
 
 class Refusal(Message):
-    """The plant's answer to a claim: no, and why."""
+    """The plant's answer to a claim it refuses, with the reason."""
 
     granted: Literal[False] = False
     reason: str = Field(description="for a person")
-    holder: str | None = Field(default=None, description="who has the vehicle, if somebody has")
+    holder: str | None = Field(default=None, description="controller that has the vehicle, if any")
     differences: list[str] = Field(default_factory=list, description="fields of the claim that do not fit the plant")
 
 
 class Release(Message):
-    """A controller gives its session back; the plant goes to 0 V."""
+    """A controller ends its session; the plant goes to 0 V."""
 
     session: str
 
 
 class Description(Message):
-    """Who a role is and how it was configured: all that a reader of the log needs to read it."""
+    """Identity and configuration of a role: all that a log reader needs to read the log."""
 
-    protocol: int = Field(description="version of SPEC.md that the role speaks; 1 did not say")
+    protocol: int = Field(description="version of SPEC.md that the role implements; version 1 did not have this field")
     role: str
     vehicle: str
     host: str
     versions: dict[str, str]
-    facts: dict[str, str] = Field(default_factory=dict, description="the machine, and what of it bears on time")
+    facts: dict[str, str] = Field(default_factory=dict, description="the host, and its properties that affect timing")
     config: dict[str, Any] = Field(description="the effective configuration; sections as in the TOML file")
     freshness_s: float | None = Field(
         default=None,
@@ -81,7 +81,7 @@ class Description(Message):
     )
     certificate: dict[str, Any] | None = Field(
         default=None,
-        description="controller: what the theorem promises of it, as `aeroloop lab certify --json` says it",
+        description="controller: certificate of its configuration, as `aeroloop lab certify --json` prints it",
     )
 
 
@@ -96,34 +96,34 @@ class Percentiles(Message):
 
 
 class Timing(Message):
-    """How well a loop keeps time, since its start-up and over the last ten seconds."""
+    """Timing of a loop, since its start-up and over the last ten seconds."""
 
-    wake: Percentiles | None = Field(description="from when a tick was due to when it began [µs]")
-    busy: Percentiles | None = Field(description="from when it began to when it was over [µs]")
-    period: Percentiles | None = Field(description="from one beginning to the next [µs]")
+    wake: Percentiles | None = Field(description="from a tick's deadline to its start [µs]")
+    busy: Percentiles | None = Field(description="from a tick's start to its end [µs]")
+    period: Percentiles | None = Field(description="from one tick's start to the next one's [µs]")
     recent_wake: Percentiles | None = Field(description="`wake`, last 10 s")
     recent_busy: Percentiles | None = Field(description="`busy`, last 10 s")
     recent_period: Percentiles | None = Field(description="`period`, last 10 s")
 
 
 class Status(Message):
-    """How a role is doing; the last one before it ends is final."""
+    """State and counters of a role; the last one before it ends has the final counts."""
 
     role: str
     state: str
     session: str | None = None
     cause: str | None = Field(
-        default=None, description="plant: why it may not be driven; controller: why it claims none; where that is so"
+        default=None, description="plant: why it is not armed; controller: why it claims no vehicle; null otherwise"
     )
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
     uptime_s: float
     ticks: int = Field(description="ticks since start")
     rate_hz: float = Field(description="ticks a second since the last status")
-    skipped: int = Field(description="grid ticks of the session that were missed, never made up for")
-    received: int = Field(default=0, description="frames (recorder: messages) taken in since start")
+    skipped: int = Field(description="ticks of the session's grid that were missed")
+    received: int = Field(default=0, description="frames (recorder: messages) received since start")
     sent: int = Field(default=0, description="frames sent since start")
     refused: int = Field(default=0, description="malformed frames since start")
-    stale: int = Field(default=0, description="frames since start that came too late to be acted upon")
+    stale: int = Field(default=0, description="stale frames since start, too late to be acted upon")
     saturated: int = Field(default=0, description="values beyond a quantizer's range since start")
     latency_us: Percentiles | None = Field(
         default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
@@ -133,8 +133,8 @@ class Status(Message):
         default=None,
         description="controller: from a measurement received to the command that answers it sent, last 10 s [µs]",
     )
-    timing: Timing | None = Field(default=None, description="how well the loop keeps time; null in lockstep")
-    notes: list[str] = Field(default_factory=list, description="what was asked of the machine and refused")
+    timing: Timing | None = Field(default=None, description="timing of the loop; null in lockstep")
+    notes: list[str] = Field(default_factory=list, description="settings that the host refused")
 
 
 class Telemetry(Message):
@@ -158,22 +158,22 @@ class Truth(Message):
     attitude: tuple[float, float, float, float] = Field(description="q, body relative to inertial [1]")
     rate: tuple[float, float, float] = Field(description="ω, body frame [rad/s]")
     voltages: tuple[float, ...] = Field(description="voltages at the motors [V]")
-    session: str | None = Field(default=None, description="whose measurement was taken of this very state, if one was")
+    session: str | None = Field(default=None, description="session whose measurement was taken of this state, if any")
     session_tick: int | None = Field(default=None, description="that measurement's tick since the session's first")
 
 
 class Event(Message):
-    """Something that happened once."""
+    """One event at a role."""
 
     role: str
     kind: EventKind
-    text: str = Field(description="one line for a person: what, why, and since when if that is known")
+    text: str = Field(description="one line for a person: what, why, and since when, if available")
     session: str | None = None
-    tick: int | None = Field(default=None, description="the session's tick at which it happened, if it was at one")
+    tick: int | None = Field(default=None, description="the session's tick at which it happened, if any")
 
 
 class Loss(Message):
-    """Messages of one key that the recorder knows are not in the log."""
+    """Messages of one key that the recorder found missing in the log."""
 
     key: str
     count: int = Field(ge=1, description="how many are missing")
@@ -181,9 +181,3 @@ class Loss(Message):
         description="network: published, and neither received nor recovered; queue: received faster than they could be "
         "written; disk: the log could not be written"
     )
-
-
-def model_of(topic: Topic) -> type[Message]:
-    """The model of what a topic of messages carries. Raises KeyError for a topic of frames."""
-    model: type[Message] = globals().get(topic.model) or vars(verbs)[topic.model]
-    return model

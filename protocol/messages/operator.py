@@ -1,7 +1,7 @@
-"""What an operator can ask of a running system, and what has changed: messages with the bounds that hold for them.
+"""Operator requests, references, gains and changes, with their bounds.
 
-A reference says roll, pitch and yaw over time. Whatever it is, it is joined to what was followed before by a quintic
-over `within_s`, so that angle, rate and acceleration never jump.
+A reference gives roll, pitch and yaw over time. A new one is joined to the one before by a quintic over `within_s`, so
+that angle, rate and acceleration never jump.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAX_POINTS: Final = 10_000
 
 
 class Message(BaseModel):
-    """A message; unknown fields are refused, so that two versions that differ do not half understand each other."""
+    """Base of all messages. Unknown fields are refused, so that a message of another version is not read in part."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -40,7 +40,7 @@ def _gain(gains: Vector) -> Vector:
 
 MAX_GAIN: Final = 20.0
 Gain = Annotated[Vector, AfterValidator(_finite), AfterValidator(_gain)]
-"""The diagonal of a positive definite gain matrix, bounded: no typing error makes it a hundred times too large."""
+"""Diagonal of a positive definite gain matrix; bounded, so that no typing error makes it a hundred times too large."""
 
 Angles = Annotated[Vector, AfterValidator(_finite)]
 """Roll, pitch, yaw [deg]."""
@@ -59,7 +59,7 @@ class Sinusoid(Message):
 
 
 class Hold(Message):
-    """One attitude, for ever."""
+    """One constant attitude."""
 
     kind: Literal["hold"] = "hold"
     attitude: Angles | None = Field(
@@ -86,10 +86,10 @@ class Points(Message):
 
 
 class Stream(Message):
-    """Whatever comes on the `reference` topic; when nothing comes, the last set-point is held."""
+    """Set-points received on the `reference` topic; the last one is held until the next."""
 
     kind: Literal["stream"] = "stream"
-    timeout_s: float = Field(default=0.5, gt=0, le=60, description="a stream silent for longer is told and held [s]")
+    timeout_s: float = Field(default=0.5, gt=0, le=60, description="a stream silent longer is reported and held [s]")
     within_s: float = Field(default=0.2, ge=0.02, le=60, description="time to reach each set-point [s]")
 
 
@@ -111,7 +111,7 @@ class Gains(Message):
 
 
 class Ask(Message):
-    """A question that needs no words: arm, stop, stand down, recall."""
+    """A request without arguments: arm, stop, stand down, recall."""
 
 
 class Track(Message):
@@ -122,9 +122,9 @@ class Track(Message):
 
 
 class Change(Message):
-    """What a controller follows from a tick on: told at the start of every session, and whenever it changes.
+    """Gains and reference from a tick on, in the trace at the start of every session and at every change.
 
-    With the frames, the changes and the description, the session can be computed again to the last bit.
+    With the trace's rows, the changes and the description, a session can be computed again to the last bit.
     """
 
     session: str
@@ -134,19 +134,19 @@ class Change(Message):
     within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: at once [s]")
     start: Angles | None = Field(
         default=None,
-        description="where the way to the reference starts, at rest; null: where one was [deg]",
+        description="where the approach to the reference starts, at rest; null: at the reference before [deg]",
     )
-    ease_s: float = Field(default=0.0, description="time to let the acceleration of before go, before that [s]")
+    ease_s: float = Field(default=0.0, description="time before that to reduce the present acceleration to 0 [s]")
 
 
 class Inject(Message):
-    """Put a fault on an emulated plant, now; null clears all faults."""
+    """Inject a fault into an emulated plant, now; null clears all faults."""
 
     fault: str | None = Field(description="signal:kind[=value][@start[..end]], seconds from now")
 
 
 class Advance(Message):
-    """Let a plant in lockstep that steps on request go on for so long."""
+    """Run a plant in lockstep that steps on request for this time."""
 
     seconds: float = Field(gt=0, le=86_400, description="of the plant's time [s]")
 

@@ -1,7 +1,7 @@
-"""The two state machines: what each end may be doing, and the one table each of what leads where.
+"""State machines of the plant end and the controller: states, triggers, and one transition table each.
 
-A state says what an end does; a trigger, what happened. What a table does not list cannot happen, and raises. SPEC.md
-draws both tables; the tests compare.
+A state is what an end does; a trigger is what happens to it. A transition that is not in the table raises ValueError.
+SPEC.md has both tables, too; the tests compare them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ PLANT_TABLE: Final[Mapping[tuple[PlantState, PlantTrigger], PlantState]] = {
     (_P.TRIPPED, _PT.TRIP):    _P.TRIPPED,
     (_P.TRIPPED, _PT.ARM):     _P.IDLE,
 }
-"""The plant end. A claim that carries its own arming arms first and is granted then."""
+"""Plant end. A claim with `auto_arm` first arms, and is then granted."""
 
 CONTROLLER_TABLE: Final[Mapping[tuple[ControllerState, ControllerTrigger], ControllerState]] = {
     (_C.SEARCHING, _CT.GRANT):      _C.CLAIMED,
@@ -115,8 +115,8 @@ CONTROLLER_TABLE: Final[Mapping[tuple[ControllerState, ControllerTrigger], Contr
     (_C.FAULTED,   _CT.STAND_DOWN): _C.HOLDING,
     (_C.FAULTED,   _CT.RECALL):     _C.SEARCHING,
 }
-"""The controller. Ready: it has the vehicle but no valid measurement, and commands "no valid value". Holding and
-faulted: it has no vehicle and wants none until it is recalled."""
+"""Controller. Ready: it has a session but no valid measurement, and commands "no valid value". Holding and faulted: it
+has no session and claims none until it is recalled."""
 # fmt: on
 
 State = TypeVar("State", bound=StrEnum)
@@ -124,14 +124,14 @@ Trigger = TypeVar("Trigger", bound=StrEnum)
 
 
 class Machine(Generic[State, Trigger]):
-    """A state, and the table that moves it.
+    """A state and its transition table.
 
     Args:
         start: The first state.
-        table: What leads where.
+        table: State and trigger to the next state.
 
     Attributes:
-        state: The state now.
+        state: Present state.
     """
 
     def __init__(self, start: State, table: Mapping[tuple[State, Trigger], State]) -> None:
@@ -139,10 +139,10 @@ class Machine(Generic[State, Trigger]):
         self._table = table
 
     def fire(self, trigger: Trigger) -> State:
-        """Let something happen, and return the state that follows.
+        """Apply a trigger and return the next state.
 
         Raises:
-            ValueError: It cannot happen in this state.
+            ValueError: The table has no such transition.
         """
         after = self._table.get((self.state, trigger))
         if after is None:

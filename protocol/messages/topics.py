@@ -1,8 +1,7 @@
-"""The one table of what crosses the network, and the keys it travels under.
+"""Topics: the one table of what crosses the network, with keys, senders, rates and models.
 
 Every key starts with `aeroloop/<vehicle>/`. Frames travel under the session's own keys, so that frames of another
-controller, or of another wire spec, cannot arrive. A service that wants to know what a topic is looks here, and so does
-the recorder.
+controller, or of another wire spec, cannot arrive. Services and the recorder look topics up here.
 """
 
 from __future__ import annotations
@@ -11,9 +10,12 @@ import re
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
+from aeroloop.protocol.messages.models import Claim, Description, Event, Loss, Release, Status, Telemetry, Truth
+from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Setpoint, Track
+
 ROOT: Final = "aeroloop"
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
-"""What a vehicle may be called: one chunk of a Zenoh key, and safe in a file name."""
+"""Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
 
 
 @dataclass(frozen=True)
@@ -21,13 +23,14 @@ class Topic:
     """One row of the table.
 
     Attributes:
-        name: What the rest of the program calls it.
+        name: Name in this program.
         key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
-        carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model of messages.py),
-            `query` (request and reply), `token` (liveliness, no payload).
-        sender: SessionKey end speaks.
+        carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
+            reply), `token` (liveliness, no payload).
+        sender: Role that publishes or queries it.
         rate: How often.
-        model: The class in messages.py, or the frame's name.
+        model: Model of its messages or requests; None of frames, traces and tokens, and where a request is empty.
+        decoded: For viewers: `always` or at most at the `limited` rate; None where nothing is shown.
     """
 
     name: str
@@ -35,41 +38,52 @@ class Topic:
     carries: Literal["frame", "trace", "json", "query", "token"]
     sender: str
     rate: str
-    model: str
+    model: type[Message] | None = None
+    decoded: Literal["always", "limited"] | None = None
+
+    @property
+    def recorded(self) -> bool:
+        """Whether it is published from a cache and recorded: a subscriber that joins late recovers earlier messages."""
+        return self.carries in ("trace", "json")
+
+    @property
+    def title(self) -> str:
+        """Name of what it carries, for schemas."""
+        return self.model.__name__ if self.model else self.name.capitalize()
 
 
 TOPICS: Final = {
     topic.name: topic
     for topic in (
-        Topic("claim", "claim", "query", "controller", "once a session", "Claim"),
-        Topic("release", "release", "query", "controller", "once a session", "Release"),
-        Topic("arm", "arm", "query", "operator", "when needed", ""),
-        Topic("stop", "stop", "query", "operator", "when needed", ""),
-        Topic("stand_down", "stand-down", "query", "operator", "when needed", ""),
-        Topic("recall", "recall", "query", "operator", "when needed", ""),
-        Topic("set_gains", "set-gains", "query", "operator", "when needed", "Gains"),
-        Topic("track", "track", "query", "operator", "when needed", "Track"),
-        Topic("inject", "inject", "query", "operator", "when needed", "Inject"),
-        Topic("advance", "advance", "query", "operator", "when needed", "Advance"),
-        Topic("description", "description/{role}", "json", "every role", "at start and on change", "Description"),
-        Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", "Measurement"),
-        Topic("command", "{session}/command", "frame", "controller", "answers a measurement", "Command"),
-        Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", "Telemetry"),
-        Topic("trace", "trace/{role}", "trace", "plant, controller", "trace_s", "Trace"),
-        Topic("reference", "reference", "json", "operator", "as it streams", "Setpoint"),
-        Topic("truth", "truth", "json", "plant", "truth_rate", "Truth"),
-        Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", "Status"),
-        Topic("event", "event", "json", "every role", "when it happens", "Event"),
-        Topic("loss", "loss", "json", "recorder", "when it is found", "Loss"),
-        Topic("alive", "alive/{role}", "token", "every role", "while it lives", ""),
+        Topic("claim", "claim", "query", "controller", "once a session", Claim),
+        Topic("release", "release", "query", "controller", "once a session", Release),
+        Topic("arm", "arm", "query", "operator", "when needed"),
+        Topic("stop", "stop", "query", "operator", "when needed"),
+        Topic("stand_down", "stand-down", "query", "operator", "when needed"),
+        Topic("recall", "recall", "query", "operator", "when needed"),
+        Topic("set_gains", "set-gains", "query", "operator", "when needed", Gains),
+        Topic("track", "track", "query", "operator", "when needed", Track),
+        Topic("inject", "inject", "query", "operator", "when needed", Inject),
+        Topic("advance", "advance", "query", "operator", "when needed", Advance),
+        Topic("description", "description/{role}", "json", "every role", "at start and on change", Description),
+        Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session"),
+        Topic("command", "{session}/command", "frame", "controller", "answers a measurement"),
+        Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", Telemetry, "limited"),
+        Topic("trace", "trace/{role}", "trace", "plant, controller", "trace_s"),
+        Topic("reference", "reference", "json", "operator", "as it streams", Setpoint, "limited"),
+        Topic("truth", "truth", "json", "plant", "truth_rate", Truth, "limited"),
+        Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", Status, "always"),
+        Topic("event", "event", "json", "every role", "when it happens", Event, "always"),
+        Topic("loss", "loss", "json", "recorder", "when it is found", Loss, "always"),
+        Topic("alive", "alive/{role}", "token", "every role", "while it runs"),
     )
 }
 
-RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries in ("trace", "json"))
-"""Topics that are published from a cache: a subscriber that joins late recovers what it missed."""
+RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
+"""Topics published from a cache."""
 
 FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
-"""Topics of the loop itself."""
+"""Topics of frames."""
 
 _PATTERNS: Final = [
     (
@@ -84,7 +98,7 @@ _PATTERNS: Final = [
 
 
 class Address(NamedTuple):
-    """What a key says: the topic, and whose."""
+    """Parts of a key."""
 
     topic: Topic
     vehicle: str
@@ -98,7 +112,7 @@ def key(name: str, vehicle: str, *, session: str = "*", role: str = "*") -> str:
 
 
 def read_key(text: str) -> Address | None:
-    """What a key is about, or None if it is not in the table."""
+    """Parse a key; None if it is not in the table."""
     for topic, pattern in _PATTERNS:
         if found := pattern.fullmatch(text):
             parts = found.groupdict()

@@ -7,7 +7,7 @@ columns, which compress to two thirds of the records' size:
 
 `SPEC.md`, section 10, defines every byte, with golden vectors. Both writers are sans-I/O: the owner passes times and
 publishes what `take` returns. Times in rows are whole microseconds after the header's `monotonic_ns`, on the end's own
-monotonic clock; nothing here compares the clocks of two hosts.
+monotonic clock; the clocks of two hosts are never compared.
 """
 
 from __future__ import annotations
@@ -39,44 +39,44 @@ STEPS: Final = ("tick", "session_tick", "answered", "received", "sent")
 to a fifth. The first row's step is from 0."""
 
 NEVER: Final = 0xFFFF_FFFF
-"""In a column of times or of session ticks: there is none."""
+"""In a column of times or of session ticks: none."""
 
 _BATCHES_BEYOND: Final = 1.25
-"""Batches beyond those of a steady loop: sessions that begin and end, operations between them."""
+"""Factor for batches beyond those of a steady loop: sessions that begin and end, operations between them."""
 
 _FASTEST_HZ: Final = 10_000.0
-"""In lockstep ticks come as fast as they are computed, whatever the grid's rate."""
+"""Bound on the tick rate in lockstep, where the grid's rate does not apply."""
 
 _HEADER: Final = struct.Struct("<BBBBHHIIQQqq64s")
 HEADER_BYTES: Final = _HEADER.size
 _FINAL: Final = 1
 _MARGIN_NS: Final = 1_000_000_000
-"""The base of a batch's times is so long before its first row: a command may be received before the row begins."""
+"""A batch's times start this long before its first row: a command may be received before the row begins."""
 
 _MASK: Final = 0xFFFF_FFFF
-"""Times wrap after 71 minutes, which no batch lasts: `due` is looked at after every row."""
+"""Times wrap after 71 minutes, longer than any batch: `due` is checked after every row."""
 
 
 class Sent(IntEnum):
     """What an end did with the frame of a tick: a measurement at the plant, a command at the controller.
 
-    The plant's `received_as` says with it what was received since the last tick.
+    The plant's `received_as` uses it for what was received since the last tick.
     """
 
     NONE = 0
     FRAME = 1
     SILENT = 2
     MALFORMED = 3
-    """Received, of another length than the wire's frames: nothing of it is in the row."""
+    """Received with a wrong length; the row has none of its bytes."""
 
 
 class Received(IntEnum):
-    """What the controller computed a tick with."""
+    """The measurement that the controller computed a tick with."""
 
     FRAME = 0
     SILENT = 1
     LATE = 2
-    """The frame came when its tick was over, or stale: its levels hold from the next tick on, and nothing is sent."""
+    """The frame arrived after its tick, or stale: its levels hold from the next tick on, and nothing is sent."""
     MALFORMED = 3
 
 
@@ -94,14 +94,14 @@ class Outcome(IntEnum):
     INVALID = 5
     """It has no valid value and answers a measurement that has one: the plant trips."""
     WITHHELD = 6
-    """An injected fault keeps it back."""
+    """Withheld by an injected fault."""
 
 
 OperationKind = Literal["claim", "release", "arm", "stop", "lost", "expire", "inject", "reconfigure"]
 
 
 class Operation(Message):
-    """Something that changed the plant end between two ticks. With the rows, the end's run can be computed again."""
+    """A change at the plant end between two ticks. With the rows, the end's run can be computed again."""
 
     tick: int = Field(ge=-1, description="the last tick of the plant before it; −1: before the first")
     kind: OperationKind
@@ -113,7 +113,7 @@ class Operation(Message):
 
 
 class Tail(Message):
-    """What belongs to the rows of a batch and has no fixed size."""
+    """Variable-size part of a batch."""
 
     state: dict[str, Any] | None = Field(
         default=None, description="controller: its state before the batch's first row; a replay can begin there"
@@ -155,10 +155,10 @@ def row_dtype(end: End, measurement: int, command: int, actuators: int) -> np.dt
 
 
 class Header(NamedTuple):
-    """What a batch says of all its rows.
+    """Header of a batch: what holds for all its rows.
 
     Attributes:
-        end: SessionKey end.
+        end: Which end.
         final: Whether the session's rows end with it.
         actuators: Number of motors.
         measurement_bytes: Size of a measurement frame.
@@ -166,7 +166,7 @@ class Header(NamedTuple):
         rows: Rows in it.
         tail_bytes: Size of its tail.
         run: A random number of the end's process.
-        first_row: Rows that this process has published before it, in all its sessions.
+        first_row: Rows that this process published before this batch, in all its sessions.
         monotonic_ns: Base of the rows' times, on the end's monotonic clock [ns].
         wall_ns: The same instant on the end's wall clock [ns since 1970].
         session: Name of the session; empty where the plant has none.
@@ -187,12 +187,12 @@ class Header(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """A batch as it was read.
+    """A decoded batch.
 
     Attributes:
-        header: What holds for all rows.
+        header: Its header.
         columns: A structured scalar with one field a column, each of shape (rows,) or (rows, actuators).
-        tail: What has no fixed size.
+        tail: Its variable-size part.
     """
 
     header: Header
@@ -207,14 +207,16 @@ class Batch(NamedTuple):
 
 
 def read_header(payload: bytes) -> Header | None:
-    """The header of a batch; None if the bytes are none of this version."""
+    """Parse a batch's header; None if it is malformed or of another version."""
     if len(payload) < HEADER_BYTES:
         return None
     version, end, flags, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, name = (
         _HEADER.unpack_from(payload)
     )
     session = _name(name)
-    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3) or session is None:
+    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3):
+        return None
+    if session is None or not measurement or not command:
         return None
     final = bool(flags & _FINAL)
     return Header(
@@ -224,7 +226,7 @@ def read_header(payload: bytes) -> Header | None:
 
 @lru_cache(maxsize=16)
 def _name(padded: bytes) -> str | None:
-    """The name of a session; None if it is none."""
+    """Decode a session's name; None if it is not ASCII."""
     try:
         return padded.rstrip(b"\0").decode("ascii")
     except UnicodeDecodeError:
@@ -232,23 +234,13 @@ def _name(padded: bytes) -> str | None:
 
 
 def read_batch(payload: bytes) -> Batch | None:
-    """A batch; None if it is malformed: another version, a wrong length, a tail that is no Tail."""
+    """Parse a batch; None if it is malformed: another version, a wrong length, a tail that is no Tail."""
     header = read_header(payload)
-    if header is None or header.rows > MAX_ROWS:
-        return None
-    columns = read_columns(payload, header)
-    if columns is None:
+    if header is None or header.rows > MAX_ROWS or len(payload) != batch_bytes(header):
         return None
     try:
         tail = Tail.model_validate_json(payload[-header.tail_bytes :]) if header.tail_bytes else Tail()
     except ValidationError:
-        return None
-    return Batch(header, columns, tail)
-
-
-def read_columns(payload: bytes, header: Header) -> np.void | None:
-    """The columns of a batch, as in `Batch`; None if its length is not what its header says."""
-    if len(payload) != batch_bytes(header):
         return None
     dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
     columns: np.void = np.frombuffer(bytearray(payload), dtype, 1, HEADER_BYTES)[0]
@@ -257,20 +249,22 @@ def read_columns(payload: bytes, header: Header) -> np.void | None:
         if name in STEPS:
             column = columns[name]
             np.add.accumulate(column, out=column)
-    return columns
+    return Batch(header, columns, tail)
 
 
 def batch_bytes(header: Header) -> int:
-    """How long a batch is by its header."""
+    """Size of a batch by its header."""
     dtype = _columns_dtype(header.end, header.measurement_bytes, header.command_bytes, header.actuators, header.rows)
     return HEADER_BYTES + dtype.itemsize + header.tail_bytes
 
 
 def join_columns(batches: Sequence[tuple[Header, bytes]]) -> dict[str, npt.NDArray[Any]]:
-    """Columns of batches of one end and wire, one after another; of their times see `Batch.times_ns`. Shapes (rows,).
+    """Concatenate the columns of batches of one end and wire. Shapes (rows,).
+
+    Times stay relative to the base of their own batch; see `Batch.times_ns`.
 
     Args:
-        batches: At least one; headers, and bytes of the length that they say.
+        batches: At least one; headers, and payloads of the size that `batch_bytes` gives.
     """
     first = batches[0][0]
     dtype = row_dtype(first.end, first.measurement_bytes, first.command_bytes, first.actuators)
@@ -293,26 +287,26 @@ def join_columns(batches: Sequence[tuple[Header, bytes]]) -> dict[str, npt.NDArr
 
 @lru_cache(maxsize=1024)
 def _columns_dtype(end: End, measurement: int, command: int, actuators: int, rows: int) -> np.dtype[np.void]:
-    """The columns of so many rows, one after another; a reader of hours has few different numbers of rows."""
+    """Dtype of a batch's columns. Cached: the batches of a long log have few different numbers of rows."""
     row = row_dtype(end, measurement, command, actuators)
     assert row.names is not None
     return np.dtype([(name, row[name].base, (rows, *row[name].shape)) for name in row.names])
 
 
 class TraceWriter:
-    """Gathers one end's rows.
+    """Buffers one end's rows and packs them into batches.
 
     Args:
-        end: SessionKey end.
+        end: Which end.
         wire: Sizes of the frames.
         run: A random number of this process, 64 bits.
         every_ns: A batch is due this long after its first row [ns].
 
     Attributes:
-        rows: Rows that wait.
-        session: Name of the session that they are of; set between batches only.
-        state: The controller's state before the first row that waits, as JSON; null at the plant.
-        changes: Changes that belong to the rows that wait.
+        rows: Number of rows in the buffer.
+        session: Name of their session; set between batches only.
+        state: The controller's state before the first row in the buffer, as JSON; None at the plant.
+        changes: Changes that belong to the rows in the buffer.
         operations: Operations likewise.
     """
 
@@ -337,11 +331,11 @@ class TraceWriter:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing waits."""
+        """Whether nothing is buffered."""
         return not (self.rows or self.changes or self.operations)
 
     def due(self, now_ns: int) -> bool:
-        """Whether a batch is to be published: it is full, or its first row has waited long enough."""
+        """Whether a batch is to be published: the buffer is full, or its first row is `every_ns` old."""
         if self.rows:
             return self.rows >= MAX_ROWS or now_ns - self._base_ns >= self._every_ns + _MARGIN_NS
         return not self.empty
@@ -428,7 +422,7 @@ class TraceWriter:
         self.rows = rows + 1
 
     def take(self, now_ns: int, wall_ns: int, *, final: bool = False) -> bytes:
-        """The batch of all that waits; then nothing does.
+        """Pack all that is buffered into a batch, and clear the buffer.
 
         Args:
             now_ns: The end's monotonic clock now [ns].
@@ -465,17 +459,17 @@ class TraceWriter:
 
 
 def batches_per_s(loop: LoopSettings) -> float:
-    """Batches that an end publishes a second at the most, in the long run."""
+    """Bound on the batches that an end publishes per second, in the long run."""
     rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
     return _BATCHES_BEYOND * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
 
 
 def _steps(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """What a column of STEPS holds instead of its values. Shapes (n,)."""
+    """Steps of a column, the first one from 0. Shapes (n,)."""
     return np.diff(column, prepend=column.dtype.type(0))
 
 
 def _record_format(end: End, measurement: int, command: int, actuators: int) -> str:
-    """What `row_dtype` says, for struct."""
+    """`row_dtype` as a format of struct."""
     frames = f"{measurement}s{command}s"
     return f"<IBBII{frames}" if end == "controller" else f"<QIBBBBIII{frames}{actuators}d"

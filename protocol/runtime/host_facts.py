@@ -1,4 +1,4 @@
-"""What a process runs on and is made of, for its description: a log without it cannot be judged a year later."""
+"""Host facts and package versions for a role's description, which make a log interpretable a year later."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 PACKAGES: Final = ("aeroloop", "casadi", "eclipse-zenoh", "mcap", "numpy", "pydantic")
-"""What computes the figures in a log, or carries and keeps them."""
+"""Packages that compute, transport or store the figures in a log."""
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _GIT_WAIT_S: Final = 2.0
@@ -19,7 +19,7 @@ _GIT_WAIT_S: Final = 2.0
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of what computes the figures in a log; `revision` is git's, where this runs from a checkout."""
+    """Versions of Python and of PACKAGES; `revision` is git's, when run from a checkout."""
     found = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
     revision = _revision()
     return {**found, "revision": revision} if revision else found
@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def host_facts() -> dict[str, str]:
-    """The machine and what of it bears on time. What a system does not tell is left out."""
+    """The host, and its properties that affect timing; those that the system does not report are left out."""
     facts = {
         "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         "realtime_kernel": "yes" if _read("/sys/kernel/realtime") == "1" else "no",
@@ -43,7 +43,7 @@ def host_facts() -> dict[str, str]:
 
 
 def _revision() -> str:
-    """`git describe` of the checkout this runs from, with `-dirty` where files were changed; empty if it is none."""
+    """`git describe` of this checkout, with `-dirty` if files were changed; empty outside of a checkout."""
     if not (_ROOT / ".git").exists():
         return ""
     try:

@@ -16,20 +16,20 @@ _MCL_FUTURE: Final = 2
 
 
 class RealtimeError(AeroloopError):
-    """`loop.realtime = "strict"`, and this machine refused something; one line that names it."""
+    """`loop.realtime = "strict"`, and this host refused a setting; one line that names it."""
 
 
 def prepare_process(settings: LoopSettings) -> list[str]:
-    """Make this process fit for a timed loop, and say what was refused.
+    """Apply the real-time settings to this process, and report what was refused.
 
-    The garbage collector is switched off (the loop makes no cycles), the timer slack set to its least, memory locked,
-    the process bound to `cpus`, SCHED_FIFO asked for.
+    The garbage collector is switched off (the loop makes no cycles), the timer slack set to its minimum, memory locked,
+    the process bound to `cpus`, SCHED_FIFO requested.
 
     Returns:
-        One line for each thing that this machine refused; nothing is asked for with `realtime = "off"`.
+        One line for each setting that this host refused; nothing is requested with `realtime = "off"`.
 
     Raises:
-        RealtimeError: Something was refused, and `realtime` is strict.
+        RealtimeError: A setting was refused, and `realtime` is strict.
     """
     if settings.realtime == "off":
         return []
@@ -43,7 +43,7 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
         refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
     try:
-        # Every thread: what carries the frames must not wait for other work any more than the loop itself.
+        # Every thread: Zenoh's, which carry the frames, must not wait for other work any more than the loop.
         for thread in os.listdir("/proc/self/task"):
             if settings.cpus:
                 os.sched_setaffinity(int(thread), settings.cpus)

@@ -1,8 +1,8 @@
-"""What every process is on the network: alive, configured, doing well or not, and stoppable.
+"""Role: a process's presence on the network, with description, status, events, liveliness and stop signals.
 
-A Role joins the network, answers questions about its configuration and, once its owner is ready, shows a liveliness
-token; the owner publishes status, events and whatever else through it. It is a context: leaving it closes the Zenoh
-session, without which a Python process would not end.
+A Role joins the network and answers queries for its description and status. Its owner declares the liveliness token
+once ready, and publishes through it. It is a context manager: leaving it closes the Zenoh session, without which a
+Python process would not end.
 """
 
 from __future__ import annotations
@@ -35,17 +35,16 @@ from aeroloop.protocol.wire.spec import WireSpec
 
 log: Final = logging.getLogger("aeroloop")
 
-
 M = TypeVar("M", bound=Message)
 _SELDOM_PER_S: Final = 8.0
-"""Messages a second of a topic that is not declared beforehand: statuses, events."""
+"""Cached messages per second of a topic that was not declared beforehand: statuses, events."""
 
 Action = Callable[[], object]
-"""Something to do between two ticks."""
+"""A function to run between two ticks."""
 
 
 def notify_systemd(state: str) -> None:
-    """Tell the service manager, if one asked to be told (sd_notify(3)); nobody listening is no error."""
+    """Notify the service manager if `NOTIFY_SOCKET` is set (sd_notify(3)); failures are ignored."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
@@ -58,8 +57,8 @@ class Role:
 
     Args:
         role: `plant`, `controller` or `recorder`.
-        vehicle: Whose topics it speaks on.
-        network: Where to meet the others.
+        vehicle: Vehicle in the keys of its topics.
+        network: How to join the network.
         config: Its effective configuration, for the description.
         name: Name of its liveliness token; the role's name if None.
 
@@ -96,23 +95,23 @@ class Role:
         self.zenoh.close()
 
     def announce(self) -> None:
-        """Show the liveliness token. Declarations keep their order on a link: who sees it knows ours before it too."""
+        """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
         notify_systemd("READY=1")
         self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
 
     def stop_on_signals(self) -> None:
         """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""
 
-        def ask_to_stop(_signum: int, _frame: FrameType | None) -> None:
+        def request_stop(_signum: int, _frame: FrameType | None) -> None:
             self.stop.set()
 
-        signal.signal(signal.SIGTERM, ask_to_stop)
-        signal.signal(signal.SIGINT, ask_to_stop)
+        signal.signal(signal.SIGTERM, request_stop)
+        signal.signal(signal.SIGINT, request_stop)
 
     def on_hangup(self, reload: Callable[[], Action]) -> None:
-        """On SIGHUP, call `reload` in a thread of its own, and what it returns between two ticks.
+        """On SIGHUP, call `reload` in a thread of its own; the action that it returns runs between two ticks.
 
-        What `reload` raises as an AeroloopError is told, and nothing changes.
+        An AeroloopError from `reload` is published as a fault event, and nothing changes.
         """
 
         def prepare() -> None:
@@ -128,7 +127,7 @@ class Role:
 
         Args:
             config: The effective configuration.
-            certificate: What the theorem promises of it; of a controller.
+            certificate: The theorem's bounds for it; controller only.
         """
         freshness_s = None
         if "wire" in config and "loop" in config:
@@ -153,7 +152,7 @@ class Role:
         return time.monotonic() - self._started
 
     def answer(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
-        """Answer queries on a key for as long as the role lives. The callback runs in a thread of Zenoh's."""
+        """Answer queries on a key until the role is closed. The callback runs in one of Zenoh's threads."""
         self.zenoh.declare_queryable(key, callback, complete=True)
 
     def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
@@ -161,9 +160,9 @@ class Role:
 
         Args:
             topic: Name of a query in the table.
-            model: What is asked; anything else is answered by an Answer that says so.
-            prepare: Called in a thread of Zenoh's with what was asked, to do what takes time; what it returns is
-                called between ticks and gives the reply. An AeroloopError from either is the reply.
+            model: Model of the request; any other payload is answered by an Answer with the error.
+            prepare: Called with the request in one of Zenoh's threads, for work that takes time. The function that it
+                returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
         """
 
         def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
@@ -174,7 +173,7 @@ class Role:
             query.reply(query.key_expr, reply.encode())
             query.drop()
 
-        def asked(query: zenoh.Query) -> None:
+        def received(query: zenoh.Query) -> None:
             try:
                 action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
             except ValidationError as error:
@@ -186,14 +185,14 @@ class Role:
             else:
                 self._inbox.append(lambda: guarded(query, action))
 
-        self.answer(topics.key(topic, self.vehicle), asked)
+        self.answer(topics.key(topic, self.vehicle), received)
 
     def later(self, action: Action) -> None:
-        """Let the owner do something between two ticks; may be called from any thread."""
+        """Queue an action to run between two ticks; may be called from any thread."""
         self._inbox.append(action)
 
     def take_inbox(self) -> bool:
-        """Do what has come for the time between two ticks. Whether anything had."""
+        """Run the queued actions; whether there were any."""
         inbox = self._inbox
         if not inbox:
             return False
@@ -202,9 +201,9 @@ class Role:
         return True
 
     def watch_tokens(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with the name of every liveliness token of any role, and whether it came (True) or went (False).
+        """Call back with the name of each role's liveliness token, and whether it appeared (True) or disappeared.
 
-        The callback runs in a thread of Zenoh's.
+        The callback runs in one of Zenoh's threads.
         """
         alive = topics.TOPICS["alive"]
 
@@ -216,7 +215,7 @@ class Role:
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", self.vehicle), seen, history=True)
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
-        """Declare a topic's publisher before it is needed: a cache for so many messages a second takes a while."""
+        """Declare a topic's publisher before its first message: a cache for many messages a second takes a while."""
         carries = topics.TOPICS[topic].carries
         self._publishers[topic] = CachedPublisher(
             self.zenoh,
@@ -237,19 +236,19 @@ class Role:
         self._publishers[topic].put(payload)
 
     def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
-        """Publish and log something that happened, at a session's tick if it was at one."""
+        """Publish and log an event, with the session's tick if there is one."""
         log.log(logging.WARNING if kind in ("tripped", "lost", "fault") else logging.INFO, "%s: %s", self.role, text)
         self.publish("event", Event(role=self.role, kind=kind, text=text, session=session, tick=tick))
 
     def warn(self, about: str, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
-        """Publish something that may go on for long: at most once in ten seconds for each thing it is about."""
+        """Publish an event that may recur for long: at most once in ten seconds for each `about`."""
         held_back = self._throttle.let_pass(about)
         if held_back is not None:
             more = f" ({held_back} more like it in the last {self._throttle.period_s:g} s)" if held_back else ""
             self.event(kind, text + more, session, tick)
 
     def status(self, status: Status) -> None:
-        """Tell how the role is doing, now and to whoever asks before the next time."""
+        """Publish the status, and answer queries with it until the next one."""
         notify_systemd("WATCHDOG=1")
         self._status = status.encode()
         self.publish("status", status)

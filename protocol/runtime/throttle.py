@@ -1,4 +1,4 @@
-"""Throttle: lets one of each kind of message pass in a while, and counts the others."""
+"""Throttle: passes one message of each kind per period, and counts the others."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Final
 
 
 class Throttle:
-    """Lets one of each kind pass in a while, and counts what it holds back.
+    """Passes one message of each kind per period, and counts those it holds back.
 
     Args:
-        period_s: How long the next of a kind is held back [s].
+        period_s: Least time between two messages of a kind [s].
     """
 
     MAX_KINDS: Final = 1000
@@ -20,7 +20,7 @@ class Throttle:
         self._passed: dict[str, tuple[float, int]] = {}
 
     def let_pass(self, kind: str) -> int | None:
-        """None if it is to be held back; else how many were since the last that passed."""
+        """None if the message is held back; else the number held back since the last one passed."""
         now = time.monotonic()
         at, held_back = self._passed.get(kind, (-self.period_s, 0))
         if now - at < self.period_s:

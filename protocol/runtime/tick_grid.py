@@ -1,7 +1,7 @@
 """Tick grid: absolute deadlines on CLOCK_MONOTONIC.
 
-A tick is due at `start + k·period`. After a stall the grid continues at the next tick that is still ahead and counts
-those it missed; it never bursts to catch up, because a plant does not. The tick index is the law's time. The wall clock
+A tick is due at `start + k·period`. After a stall the grid continues at the next deadline ahead and counts the missed
+ticks; it never bursts to catch up, because a plant does not. The tick index is the law's time. The wall clock
 only stamps logs.
 """
 
@@ -36,7 +36,7 @@ class TickGrid:
     def wait(self) -> int:
         """Sleep until the next tick is due and return its index.
 
-        A tick that is a little late is taken at once; after a stall of a period or more, the next one still ahead.
+        A tick that is less than a period late is taken at once; after a longer stall, the next one ahead.
         """
         k = self.tick + 1
         now = time.monotonic_ns()

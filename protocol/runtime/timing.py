@@ -15,7 +15,7 @@ _SHORTEST_WINDOW_NS: Final = 900_000_000
 
 
 class Histogram:
-    """Durations in bins 4.4 % wide (16 an octave, from 1 µs): of fixed size, however long it runs."""
+    """Durations in bins 4.4 % wide (16 an octave, from 1 µs): memory stays bounded."""
 
     def __init__(self) -> None:
         self._bins: dict[int, int] = {}
@@ -32,7 +32,7 @@ class Histogram:
             self.max_us = us
 
     def merge(self, other: Histogram) -> None:
-        """Count all that another has counted."""
+        """Add the counts of another histogram."""
         for i, n in other._bins.items():
             self._bins[i] = self._bins.get(i, 0) + n
         self.count += other.count
@@ -50,7 +50,7 @@ class Histogram:
 
 
 class RollingHistogram:
-    """A histogram of all durations, and one of those of the last ten seconds."""
+    """Histograms of all durations, and of those in the last ten seconds."""
 
     WINDOWS: Final = 10
 
@@ -72,7 +72,7 @@ class RollingHistogram:
         self._windows.append(self._current)
 
     def turn_when_due(self) -> None:
-        """End a one-second window; called by whoever reports. A report that comes sooner ends none."""
+        """End a one-second window, if it is over; called with every report."""
         if time.monotonic_ns() - self._turned_at >= _SHORTEST_WINDOW_NS:
             self.turn()
 
@@ -85,12 +85,12 @@ class RollingHistogram:
 
 
 class LoopTiming:
-    """How well a loop keeps time: wake-up latency, time a tick takes, period between ticks.
+    """Timing of a loop: wake-up latency, duration of a tick, period between ticks.
 
     The first second is left out: caches are cold, and code runs for the first time.
 
     Args:
-        warm_up_ns: What counts as start-up [ns].
+        warm_up_ns: Duration of the start-up [ns].
     """
 
     def __init__(self, warm_up_ns: int = 1_000_000_000) -> None:
@@ -101,7 +101,7 @@ class LoopTiming:
         self._woke_at = 0
 
     def woke(self, due_ns: int) -> None:
-        """A tick begins that was due at `due_ns` on `time.monotonic_ns()`."""
+        """Count the start of a tick that was due at `due_ns` on `time.monotonic_ns()`."""
         now = time.monotonic_ns()
         if now >= self._warm_at:
             self.wake.add(now - due_ns)
@@ -110,12 +110,12 @@ class LoopTiming:
             self._woke_at = now
 
     def done(self) -> None:
-        """The tick is over."""
+        """Count the end of the tick."""
         if self._woke_at:
             self.busy.add(time.monotonic_ns() - self._woke_at)
 
     def pause(self) -> None:
-        """No ticks for a while: the time until the next is no period."""
+        """Pause: the time until the next tick is no period."""
         self._woke_at = 0
 
     def turn(self) -> None:
@@ -125,7 +125,7 @@ class LoopTiming:
 
 
 def summary(durations: Histogram) -> Percentiles | None:
-    """Percentiles of what a histogram has counted; None if nothing."""
+    """Percentiles of a histogram; None if it is empty."""
     if not durations.count:
         return None
     return Percentiles(
@@ -138,7 +138,7 @@ def summary(durations: Histogram) -> Percentiles | None:
 
 
 def report(timing: LoopTiming) -> Timing:
-    """End a one-second window of a loop's timing and say how it stands."""
+    """End a one-second window of a loop's timing, and return its percentiles."""
     timing.turn()
     return Timing(
         wake=summary(timing.wake.total),

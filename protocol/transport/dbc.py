@@ -1,9 +1,9 @@
-"""The DBC of one node: what every bit on the CAN bus means, for tools that know nothing of this project.
+"""DBC file of one node: the meaning of every bit on the CAN bus, for CAN tools.
 
 A CAN payload is the wire frame byte for byte, so the whole file follows from the `WireSpec`: widths place the signals,
-and the quantizer gives factor, bounds and the code that says "no valid value". Uniform with half-step dead zone, with
-or without hysteresis, the level of code i is i·l, which is what a DBC can say. Otherwise it is not; the signal is then
-the bare code, and its comment has the formula. Many tools read DBC files as cp1252, so the text keeps to ASCII.
+and the quantizer gives factor, bounds and the code of "no valid value". For a uniform quantizer with half-step dead
+zone, with or without hysteresis, the level of code i is i·l, which a DBC can express. For any other the signal is the
+bare code, and its comment has the formula. Many tools read DBC files as cp1252, so the text is ASCII.
 
 Identifiers and lengths are those of `can_link`. cantools takes about half a second to import: import this module where
 it is used, not at a program's head.
@@ -23,7 +23,7 @@ from cantools.typechecking import Choices
 
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_link import (
+from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
@@ -51,7 +51,7 @@ _SAME_STEP: Final = 1e-12  # a dead zone this near to l/2, relatively, shifts no
 
 
 class _Quantity(NamedTuple):
-    """A quantized signal, as a person knows it."""
+    """A quantized signal with its name, unit and comment."""
 
     name: str
     unit: str
@@ -86,7 +86,7 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         wire.measurement.size,
         [_unsigned("counter", 0, bits, counted), *_codes(wire.measurement, _measured(wire))],
         cycle_ms,
-        f"What the plant measures: {rate}. {idle}",
+        f"Measurement of the plant: {rate}. {idle}",
     )
     echo = _unsigned("echo", 0, bits, "Counter of the measurement that this command answers.")
     command = _message(
@@ -96,10 +96,10 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         wire.command.size,
         [echo, *_codes(wire.command, _commanded(wire))],
         cycle_ms,
-        f"What the controller commands in answer to a measurement: {rate}. {idle}",
+        f"Command of the controller, which answers a measurement: {rate}. {idle}",
     )
     causes: Choices = OrderedDict([(0, "none"), *((number_of(cause), str(cause)) for cause in TripCause)])
-    cause = _unsigned("cause", 0, 4, "What tripped the plant last.", causes)
+    cause = _unsigned("cause", 0, 4, "Cause of the plant's last trip.", causes)
     session = _unsigned("session", 0, 4, "Number of the session, modulo 16.")
     messages = [
         measurement,
@@ -110,8 +110,8 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
     database = Database(
         messages,
         [
-            Node(_PLANT, f"What measures and has the motors: node {node}."),
-            Node(_CONTROLLER, f"What computes the commands of node {node}."),
+            Node(_PLANT, f"Sensors and motors: node {node}."),
+            Node(_CONTROLLER, f"Computes the commands of node {node}."),
         ],
         version=f"aeroloop protocol {PROTOCOL_VERSION}",
         dbc_specifics=_bus_type("CAN FD" if any(message.is_fd for message in messages) else "CAN"),
@@ -155,10 +155,10 @@ def _message(
 def _heartbeat(name: str, identifier: int, sender: str, number: Signal) -> Message:
     """A heartbeat, whose first four bits are `number`."""
     states: Choices = OrderedDict((code, str(state)) for code, state in enumerate(PlantState))
-    state = _unsigned("state", 4, 4, "What the plant is doing, or what the controller wants it to do.", states)
-    agreed = "What both ends must agree on, wire, period and lockstep, as seven bytes of a hash."
+    state = _unsigned("state", 4, 4, "State of the plant, or the state that the controller requests.", states)
+    agreed = "Wire, period and lockstep, on which both ends must agree, as seven bytes of a hash."
     fingerprint = _unsigned("fingerprint", 8, _FINGERPRINT_BITS, agreed)
-    comment = f"The {sender.lower()} lives: one every {_HEARTBEAT_MS} ms, and at once on a change."
+    comment = f"Sign of life of the {sender.lower()}: one every {_HEARTBEAT_MS} ms, and at once on a change."
     return _message(name, identifier, sender, CLASSIC_BYTES, [number, state, fingerprint], _HEARTBEAT_MS, comment)
 
 
@@ -191,11 +191,11 @@ def _signal(quantity: _Quantity, at: int) -> Signal:
     choices: Choices | None = None
     if not isinstance(quantizer, UniformQuantizer | LogarithmicQuantizer):
         width, top = 64, quantizer.limit
-        comment += " IEEE 754 double; NaN says: no valid value."
+        comment += " IEEE 754 double; NaN means: no valid value."
     else:
         width, top = quantizer.bits, quantizer.top
         choices = OrderedDict([(quantizer.invalid, NO_VALID_VALUE)])
-        comment += f" Quantized; code {quantizer.invalid} says: no valid value."
+        comment += f" Quantized; code {quantizer.invalid} means: no valid value."
         formula = _formula(quantizer)
         if formula is None:
             scale = quantizer.step
@@ -220,7 +220,7 @@ def _signal(quantity: _Quantity, at: int) -> Signal:
 
 
 def _formula(quantizer: UniformQuantizer | LogarithmicQuantizer) -> tuple[str, str] | None:
-    """The level of code i, and the constants in it; None if that is i times the step."""
+    """Formula of code i's level, and its constants; None if the level is i times the step."""
     if isinstance(quantizer, LogarithmicQuantizer):
         return "sgn(i) * (e(|i| - 1) + e(|i|)) / 2", (
             "e(k) = y0 * (yt / y0) ** (k / m) for k < m, else yt + (k - m) * l;"
@@ -238,7 +238,7 @@ def _start(at: int) -> int:
 
 
 def _bus_type(bus: str) -> DbcSpecifics:
-    """What the database says of itself. Only with BusType "CAN FD" does cantools write which messages are FD."""
+    """The database's bus type. Only with BusType "CAN FD" does cantools write which messages are FD."""
     definition = DbcAttributeDefinition("BusType", default_value="CAN", type_name="STRING")
     return DbcSpecifics(
         attributes=OrderedDict([("BusType", DbcAttribute(bus, definition))]),

@@ -1,7 +1,7 @@
-"""A Link carries frames between the two ends, newest first and nothing queued.
+"""Links: carry frames between the two ends, without a queue.
 
-Both ends see the same four calls, whatever is underneath. A frame that arrives replaces one that was not yet taken: a
-loop wants the newest sample, and a queue would only make it old.
+Both ends use the same calls on every transport. A received frame replaces one that was not yet taken: a loop needs the
+newest sample, and a queue would only delay it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import zenoh
 
 
 class Arrival(NamedTuple):
-    """A frame as it arrived.
+    """A received frame.
 
     Attributes:
         frame: Its bytes.
-        at_ns: When it arrived, on `time.monotonic_ns()`.
+        at_ns: When it was received, on `time.monotonic_ns()`.
     """
 
     frame: bytes
@@ -28,36 +28,36 @@ class Arrival(NamedTuple):
 
 
 class Link(ABC):
-    """Frames out, frames in."""
+    """Sends frames and receives frames; implemented for each transport."""
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
-        """Send a frame. Never blocks for longer than it takes to hand it over, and never raises for a lost peer."""
+        """Send a frame. Blocks only to hand it over, and never raises for a lost peer."""
 
     @property
     @abstractmethod
     def pending(self) -> bool:
-        """Whether a frame has come that was not yet taken."""
+        """Whether a received frame waits to be taken."""
 
     @abstractmethod
     def take(self) -> Arrival | None:
-        """The newest frame that was not yet taken, or None."""
+        """The newest frame not yet taken, or None."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame to come."""
+        """As `take`, but wait up to `timeout_s` for a frame."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop receiving. Closing twice does no harm."""
+        """Stop receiving. May be called twice."""
 
 
 class Mailbox:
-    """A slot for a frame, written by a receiving thread and read by the loop. The newest wins.
+    """A slot for a frame, written by a receiving thread and read by the loop; a new frame replaces the oldest.
 
     Args:
-        changed: Notified when a frame comes; one of its own if None. Several slots may share one.
-        depth: How many frames it holds, for who must know of each that came; the oldest is taken first.
+        changed: Notified when a frame is put; one of its own if None. Several slots may share one.
+        depth: Frames it holds, for a reader that needs each of them; the oldest is taken first.
     """
 
     def __init__(self, changed: Condition | None = None, depth: int = 1) -> None:
@@ -73,16 +73,16 @@ class Mailbox:
 
     @property
     def pending(self) -> bool:
-        """Whether there is something in the slot."""
+        """Whether a frame is in the slot."""
         return bool(self._arrivals)
 
     def take(self) -> Arrival | None:
-        """Take a frame out of the slot."""
+        """Take the oldest frame out of the slot, or None."""
         with self._changed:
             return self._arrivals.popleft() if self._arrivals else None
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """Take a frame out of the slot once something is in it, or return None after `timeout_s`."""
+        """As `take`, but wait up to `timeout_s` for a frame."""
         with self._changed:
             if not self._arrivals:
                 self._changed.wait(timeout_s)
@@ -94,9 +94,9 @@ class ZenohLink(Link):
 
     Args:
         session: An open session; it outlives the link.
-        send_key: Where frames go.
-        receive_key: Where frames come from.
-        mailbox: Where frames wait; one of its own if None.
+        send_key: Key of the frames sent.
+        receive_key: Key of the frames received.
+        mailbox: Slot for received frames; one of its own if None.
         lossless: Block when a peer does not keep up, instead of dropping. For lockstep, where each frame is waited for.
     """
 
@@ -128,15 +128,15 @@ class ZenohLink(Link):
 
     @property
     def pending(self) -> bool:
-        """Whether a frame has come that was not yet taken."""
+        """Whether a received frame waits to be taken."""
         return self._mailbox.pending
 
     def take(self) -> Arrival | None:
-        """The newest frame that was not yet taken, or None."""
+        """The newest frame not yet taken, or None."""
         return self._mailbox.take()
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame to come."""
+        """As `take`, but wait up to `timeout_s` for a frame."""
         return self._mailbox.wait(timeout_s)
 
     def close(self) -> None:

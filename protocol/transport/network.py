@@ -1,8 +1,8 @@
-"""A process's place on the Zenoh network: peers, joined at a rendezvous, without a router or multicast.
+"""Network: opens this process's Zenoh session, peer to peer, without a router or multicast.
 
-The rendezvous is an address that everyone knows. Whoever comes first listens there; the others connect, learn of each
-other by gossip and link directly, so that nobody is needed to pass frames on. When its holder goes, the rest stay
-linked, and the next process to come takes the address, where the rest find it within a fraction of a second.
+Every process connects to `network.rendezvous`; the first one started listens there. Peers learn each other's addresses
+by gossip and link directly, so no process relays frames. When the listening process ends, the others stay linked; the
+next process to start listens on the address, and the others connect to it within a fraction of a second.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.errors import AeroloopError
 
-_PATIENCE_S: Final = 2.0
+_PEER_TIMEOUT_S: Final = 2.0
 QUEUE: Final = 16
-"""Batches that may wait to be sent on a link, of each priority; the most that Zenoh allows."""
+"""Batches that may wait to be sent on a link, per priority; the most that Zenoh allows."""
 _QUEUES: Final = (
     "control",
     "real_time",
@@ -30,21 +30,21 @@ _QUEUES: Final = (
     "background",
 )
 HANDSHAKE_MS: Final = 2000
-"""A program that holds a port and says nothing is given up after this [ms]."""
+"""Time-out of the handshake with a program that accepts a connection and sends nothing [ms]."""
 
 
 class NetworkError(AeroloopError):
-    """The network cannot be joined; one line that says why and what to do."""
+    """The network cannot be joined; one line with the reason and what to do."""
 
 
 class NetworkSettings(BaseModel):
-    """Where this process meets the others."""
+    """Zenoh endpoints of this process and its peers."""
 
     model_config = ConfigDict(extra="forbid")
 
     rendezvous: str = Field(
         default="tcp/127.0.0.1:7447",
-        description="Zenoh endpoint where everyone meets; listened on by whoever comes first; '' for none",
+        description="Zenoh endpoint every process connects to; the first one started listens there; '' for none",
     )
     listen: list[str] = Field(
         default=["tcp/127.0.0.1:0"],
@@ -52,9 +52,9 @@ class NetworkSettings(BaseModel):
     )
     connect: list[str] = Field(default=[], description="Zenoh endpoints to reach besides the rendezvous")
     gossip: bool = Field(
-        default=True, description="learn of further processes from those one is linked to, and link to them directly"
+        default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )
-    lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is given up after this [ms]")
+    lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is disconnected after this [ms]")
 
 
 def _zenoh_config(settings: NetworkSettings, listen: list[str], connect: list[str]) -> zenoh.Config:
@@ -68,10 +68,10 @@ def _zenoh_config(settings: NetworkSettings, listen: list[str], connect: list[st
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "transport": {
-            # Useless at seven bytes, and it leaves files behind when a process is killed.
+            # No use for frames of seven bytes, and a killed process leaves its files behind.
             "shared_memory": {"enabled": False},
-            # Zenoh's own lengths are 1 for most priorities: a sending thread kept waiting for 2 ms then drops frames.
-            # What comes late is refused where it matters, by the tick that it answers.
+            # Zenoh's default is 1 for most priorities: a sending thread that is blocked for 2 ms then drops frames.
+            # Late frames do no harm: the receiver refuses them by their tick.
             "link": {"tx": {"lease": settings.lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
             "unicast": {"open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
         },
@@ -95,7 +95,7 @@ def join(settings: NetworkSettings) -> zenoh.Session:
             config = _zenoh_config(settings, [*settings.listen, settings.rendezvous], settings.connect)
             return zenoh.open(config)
         except zenoh.ZError:
-            pass  # held by somebody, or in another host's hands: connect to it instead
+            pass  # in use, or on another host: connect to it instead
     connect = [*settings.connect, *([settings.rendezvous] if settings.rendezvous else [])]
     try:
         session = zenoh.open(_zenoh_config(settings, settings.listen, connect))
@@ -114,7 +114,7 @@ def join(settings: NetworkSettings) -> zenoh.Session:
 
 
 def _has_peer(session: zenoh.Session) -> bool:
-    deadline = time.monotonic() + _PATIENCE_S
+    deadline = time.monotonic() + _PEER_TIMEOUT_S
     while time.monotonic() < deadline:
         if session.info.peers_zid() or session.info.routers_zid():
             return True

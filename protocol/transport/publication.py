@@ -1,9 +1,9 @@
-"""Publication: messages that a late or interrupted subscriber recovers from their publisher's cache.
+"""Publication: publishes messages from a cache, from which late or interrupted subscribers recover them.
 
-Zenoh's advanced publisher numbers what it publishes and keeps the last of it; the advanced subscriber asks for what was
-published before it came and for every number that it lacks. Messages are dropped where a peer does not keep up, so a
-publisher never waits for a recorder, and the subscriber recovers them later. Each message bears its publisher's wall
-clock, for logs alone.
+Zenoh's advanced publisher numbers its messages and caches the last of them; the advanced subscriber queries what was
+published before it joined, and every missing number. Messages are dropped where a peer does not keep up, so a publisher
+never waits for a recorder, and the subscriber recovers them later. Each message carries its publisher's wall clock, for
+logs alone.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ import zenoh.ext
 from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 KEPT_S: Final = 65.0
-"""A cache holds what was published in this time, at the topic's rate [s]: 60 s and what a restart takes."""
+"""A cache holds the messages of this time at the topic's rate [s]: 60 s and the duration of a restart."""
 HEARTBEAT_S: Final = 2.0
-"""How often a publisher that has published says its last number [s]: the very last message can be recovered, too."""
+"""Interval at which a publisher repeats its last number [s], so that the very last message can be recovered, too."""
 CACHE_S: Final = 2.0
-"""How long a publisher's cache may take to answer before it is queried again [s]."""
+"""Time-out of a cache query, which is then repeated [s]."""
 AGAIN_S: Final = 0.2
-"""How long after an answer without what was published the cache is queried again [s]: Zenoh may not know of it yet."""
+"""Delay before an incomplete cache query is repeated [s]: Zenoh may not have discovered the cache yet."""
 JOIN_S: Final = 10.0
 """How long messages of a new publisher are held back for the answer of its cache [s]."""
 HISTORY: Final = 1_000_000
-"""Messages of one publisher that a subscriber asks for at the most; the publisher's cache is smaller."""
+"""Bound on the messages queried of one publisher; the publisher's cache is smaller."""
 WAITING: Final = 65_536
-"""Messages of one topic that may wait to be taken; then the oldest is dropped, and counted by its number."""
+"""Messages of one topic that may wait to be taken; beyond that the oldest is dropped, and counted by its number."""
 
 _CLOCK: Final = struct.Struct("<q")
 
@@ -45,8 +45,8 @@ class CachedPublisher:
 
     Args:
         session: An open session; it outlives the publisher.
-        key: Where.
-        per_s: Messages a second at the most, in the long run; the cache holds `KEPT_S` of them.
+        key: Key to publish on.
+        per_s: Bound on the messages per second, in the long run; the cache holds `KEPT_S` of them.
         lossless: Wait for peers that do not keep up instead of dropping; for lockstep.
         encoding: Of the payload.
     """
@@ -76,14 +76,14 @@ class CachedPublisher:
 
 
 class Delivery(NamedTuple):
-    """A message as it was received.
+    """A received message.
 
     Attributes:
         key: Its key.
         payload: Its bytes.
-        sequence: How many its publisher had published on this key before it, modulo 2³².
-        published_ns: When it was published, on its publisher's wall clock [ns since 1970]; None if that is not said.
-        source: Its publisher; None if that is not said.
+        sequence: Number of messages that its publisher published on this key before it, modulo 2³².
+        published_ns: Publication time on its publisher's wall clock [ns since 1970]; None if absent.
+        source: Its publisher; None if absent.
     """
 
     key: str
@@ -94,7 +94,7 @@ class Delivery(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """Messages that were published and can be recovered no more.
+    """Messages that were published and can no longer be recovered.
 
     Attributes:
         source: Their publisher.
@@ -106,16 +106,16 @@ class Missed(NamedTuple):
 
 
 class CacheQuery:
-    """Queries the cache of a new publisher for what it published before the first message that was received.
+    """Queries the cache of a new publisher for messages before the first one received.
 
-    A message that is published while a link is being set up can be received before Zenoh's subscriber learns that
-    there is a cache; it then drops the cache's older ones without a miss (seen with zenoh 1.10). The query includes
-    that first message, which the cache holds: an answer without it is none, and the cache is queried again. Until then
-    what is received of this publisher is held back, so that all is delivered in order.
+    A message that is published while a link is being set up can be received before Zenoh's subscriber discovers the
+    cache; it then drops the cache's older messages without a miss (seen with zenoh 1.10). The query includes that first
+    message, which the cache holds: an answer without it is incomplete, and the cache is queried again. Until then all
+    messages of this publisher are held back, so that they are delivered in order.
 
     Args:
         session: An open session.
-        first: The first message that was received.
+        first: The first message received.
     """
 
     def __init__(self, session: zenoh.Session, first: Delivery) -> None:
@@ -130,7 +130,7 @@ class CacheQuery:
         self._replies = self._query()
 
     def finished(self) -> bool:
-        """Whether the cache has answered, or has had its time. Never waits."""
+        """Whether the cache has answered, or `JOIN_S` are over. Never waits."""
         now = time.monotonic()
         if now < self._again_at:
             return False
@@ -138,7 +138,7 @@ class CacheQuery:
             while (reply := self._replies.try_recv()) is not None:
                 if reply.ok is not None and (found := read_sample(reply.ok)).sequence <= self._first:
                     self._before[found.sequence] = found
-        except zenoh.ZError:  # that was all
+        except zenoh.ZError:  # no more replies
             if self._first in self._before or now > self._deadline:
                 return True
             if self._answered:
@@ -148,17 +148,17 @@ class CacheQuery:
         return False
 
     def deliver(self) -> list[Delivery]:
-        """All that was received of this publisher so far, in order."""
+        """All messages of this publisher so far, in order."""
         self._before.pop(self._first, None)
         return [*(self._before[number] for number in sorted(self._before)), *self.held]
 
     def _query(self) -> Handler[zenoh.Reply]:
-        room: FifoChannel[zenoh.Reply] = FifoChannel(HISTORY)
-        return self._session.get(self._key, room, consolidation=zenoh.ConsolidationMode.NONE, timeout=CACHE_S)
+        channel: FifoChannel[zenoh.Reply] = FifoChannel(HISTORY)
+        return self._session.get(self._key, channel, consolidation=zenoh.ConsolidationMode.NONE, timeout=CACHE_S)
 
 
 class RecoveringSubscriber:
-    """Receives a key expression from its publishers' caches on. Nothing of Python runs when a message is received.
+    """Subscriber that recovers earlier messages from publishers' caches. No Python runs when a message is received.
 
     Args:
         session: An open session; it outlives the subscriber.
@@ -187,10 +187,10 @@ class RecoveringSubscriber:
         return bool(self._joins)
 
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
-        """What was received and not yet taken, each publisher's in order. Never waits.
+        """Messages received and not yet taken, each publisher's in order. Never waits.
 
         Args:
-            held: Also take what is held back until a cache has answered.
+            held: Also take messages that are held back until a cache has answered.
         """
         while (sample := self._subscriber.try_recv()) is not None:
             received = read_sample(sample)
@@ -214,17 +214,17 @@ class RecoveringSubscriber:
             yield self._ready.popleft()
 
     def missed(self) -> Iterator[Missed]:
-        """What was found missing since this was last called."""
+        """Losses found since the last call."""
         while (miss := self._misses.try_recv()) is not None:
             yield Missed(miss.source, miss.nb)
 
     def undeclare(self) -> None:
-        """Receive no more."""
+        """Stop receiving."""
         self._subscriber.undeclare()
 
 
 def read_sample(sample: zenoh.Sample) -> Delivery:
-    """A sample of an advanced publisher, or of any other."""
+    """Convert a sample of an advanced publisher, or of any other."""
     clock, source = sample.attachment, sample.source_info
     published_ns: int | None = None
     if clock is not None and len(stamp := clock.to_bytes()) == _CLOCK.size:

@@ -1,1 +1,1 @@
-"""Wire."""
+"""Wire format: attitude conventions, quantizers, frames and transmit policy, without I/O."""

@@ -1,4 +1,4 @@
-"""Conventions of attitude, (C.3)–(C.11): one definition for both ends.
+"""Attitude conventions, (C.3)–(C.11): one definition for both ends.
 
 A quaternion `q = [η, ε]` is scalar first, multiplies as Hamilton's, and turns body vectors into the inertial frame
 through `R(q)`. Axes: x roll, y pitch, z yaw, z up. Euler angles are roll, pitch, yaw in radians, applied Z–Y–X.
@@ -72,16 +72,16 @@ def to_euler(q: Quaternion) -> Vector:
 
 
 def sent_vector(q: Quaternion) -> Vector:
-    """The ε that goes on the wire: that of whichever of ±q has η ≥ 0.
+    """ε as it is sent: that of ±q with η ≥ 0.
 
-    q and −q are the same attitude, so the receiver may take η ≥ 0 for granted. η itself is never sent (Remark 1).
+    q and −q are the same attitude, so the receiver can assume η ≥ 0. η itself is never sent (Remark 1).
     """
     w, x, y, z = q
     return (x, y, z) if w >= 0 else (-x, -y, -z)
 
 
 def received_quaternion(x: float, y: float, z: float, last: Quaternion) -> Quaternion:
-    """q of a received ε: η = +√(1 − εᵀε) by (C.11), then whichever of ±q is nearest to `last`.
+    """q of a received ε: η = +√(1 − εᵀε) by (C.11), then of ±q the one nearest to `last`.
 
     Near η = 0 quantization can make ‖ε‖ > 1; then ε is scaled to unit length (Remark 2).
     """

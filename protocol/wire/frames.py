@@ -1,13 +1,12 @@
-"""Frames: level indices ↔ bytes, and which tick a frame is of.
+"""Frames: pack level indices into bytes, unpack them, and find the tick of a received measurement.
 
 Sans-I/O. A frame is a counter and R-bit codes, most significant bit first, with zero bits up to the byte:
 
     measurement  counter · ε₁ ε₂ ε₃ : R_ε each · ω₁ ω₂ ω₃ : R_ω each
     command      echo    · u … : R_u each             (echo: the counter of the measurement it answers)
 
-A signal without quantization travels as big-endian doubles; in a frame that holds any, zero bits fill the counter's
-last byte. What arrives malformed is refused whole, with None and never an exception; what a caller passes wrongly
-raises ValueError.
+A signal without quantization is sent as big-endian doubles; in a frame that holds any, zero bits fill the counter's
+last byte. A malformed frame is refused whole: `unpack` returns None. Misuse by the caller raises ValueError.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ class FrameFormat:
 
     Attributes:
         counter_bits: As given.
-        counters: How many values the counter has; it runs 0…counters − 1 and round again.
-        bits: Bits that carry something: counter and codes.
-        first_bit: Where the first code begins.
+        counters: Number of counter values; the counter runs 0…counters − 1 and wraps.
+        bits: Bits of counter and codes, without padding.
+        first_bit: Offset of the first code [bit].
         size: Bytes of a frame, padding included.
     """
 
@@ -65,7 +64,7 @@ class FrameFormat:
 
         Args:
             counter: 0…counters − 1.
-            codes: One a signal: ints within R-bit two's complement, or floats where the signal is not quantized.
+            codes: One per signal: ints within R-bit two's complement, or floats where the signal is not quantized.
 
         Raises:
             ValueError: A counter or code that does not fit, a wrong number of codes, an infinite float.
@@ -82,7 +81,7 @@ class FrameFormat:
         return frame
 
     def counter(self, frame: bytes) -> int | None:
-        """The counter of a frame, or None if it is malformed, as `unpack` says but cheaper."""
+        """Counter of a frame, or None if it is malformed: the checks of `unpack`, but cheaper."""
         if self._floats:
             read = self.unpack(frame)
             return None if read is None else read[0]
@@ -105,21 +104,21 @@ class FrameFormat:
 
 
 class TickCounter:
-    """The tick of each received measurement, from its counter and its time of arrival on the receiver's own clock.
+    """Finds the tick of each received measurement from its counter and its arrival time on the receiver's own clock.
 
-    The plant's grid is absolute, and frames arrive late, never early. So the earliest arrivals mark the grid, and a
-    counter stands for the one tick that has it from 3/4 of the counter's range before to 1/4 after where the grid is
-    now (4 bits: from 12 ticks before to 3 after). A frame may be held up by that long, and one frame that is placed
-    wrongly does not mislead the next.
+    The plant's grid is absolute, and frames arrive late, never early, so the earliest arrivals mark the grid. A counter
+    stands for the one tick with that counter between 3/4 of the counter's range before the grid's present tick and 1/4
+    after it (4 bits: from 12 ticks before to 3 after). A frame may be that late, and one frame that is assigned to a
+    wrong tick does not affect the next.
 
-    Two clocks drift apart. The mark may therefore move to later times by 2 % of the elapsed periods: twice what a clock
-    that runs 1 % fast takes, so that the mark follows either clock's error and still recovers from an early mark. A
-    stream that is late as a whole is taken for its grid at the same pace.
+    The two clocks drift apart. The mark may therefore move later by 2 % of the elapsed periods: twice the error of a
+    clock that runs 1 % fast, so that the mark follows either clock and still recovers from a mark that is too early. A
+    stream that is late as a whole becomes the grid at the same pace.
 
     Args:
         period_ns: Period of the plant's grid [ns].
-        counters: How many values the counter has.
-        lockstep: Whether nothing is ever skipped, so that no time is needed.
+        counters: Number of counter values.
+        lockstep: Whether no tick is ever skipped; then the counter alone gives the tick.
         tick: Tick of the last measurement before the first one given; −1 at a session's start.
 
     Attributes:
@@ -127,14 +126,14 @@ class TickCounter:
     """
 
     DRIFT: Final = 50
-    """The mark may move by one period in so many."""
+    """The mark may move later by one period in this many."""
 
     def __init__(self, period_ns: int, counters: int, *, lockstep: bool, tick: int = -1) -> None:
         self._period_ns = period_ns
         self._counters = counters
         self._early = counters // 4 - 1
         self._lockstep = lockstep
-        self._origin_ns: int | None = None  # arrival of tick 0, had it been as fast as the fastest; None in lockstep
+        self._origin_ns: int | None = None  # arrival time of tick 0 at the lowest latency seen; None in lockstep
         self.tick = tick
 
     def advance(self, counter: int, at_ns: int) -> int | None:
@@ -142,7 +141,7 @@ class TickCounter:
 
         Args:
             counter: Its counter.
-            at_ns: When it arrived, on the receiver's monotonic clock [ns].
+            at_ns: Its arrival time on the receiver's monotonic clock [ns].
         """
         if self._origin_ns is None:
             tick = self.tick + 1 + (counter - self.tick - 1) % self._counters
@@ -164,7 +163,7 @@ class TickCounter:
         return self._origin_ns is not None
 
     def due_ns(self, tick: int) -> int:
-        """When the frame of a tick is due, had it been as fast as the fastest; only where `known` [ns]."""
+        """Arrival time of a tick's frame at the lowest latency seen; only where `known` [ns]."""
         assert self._origin_ns is not None
         return self._origin_ns + tick * self._period_ns
 
@@ -173,11 +172,11 @@ class TickCounter:
         return (now_ns - self.due_ns(0)) // self._period_ns
 
     def late_ns(self, tick: int, at_ns: int) -> int:
-        """How much later than the fastest frames a tick's frame arrived [ns]; 0 in lockstep and before any frame.
+        """Latency of a tick's frame above the lowest seen [ns]; 0 in lockstep and before any frame.
 
         Args:
             tick: Its tick.
-            at_ns: When it arrived, on the receiver's monotonic clock [ns].
+            at_ns: Its arrival time on the receiver's monotonic clock [ns].
         """
         if self._origin_ns is None:
             return 0

@@ -1,13 +1,13 @@
-"""The hysteresis-uniform quantizer: levels as the uniform one's, and a code that stays while the value stays near.
+"""Hysteresis-uniform quantizer: the uniform quantizer's levels, and a code that is held while the value stays near it.
 
-The level held keeps its interval, widened by h on either side; a value beyond it is quantized uniformly. So noise of
-less than h about an edge changes no code, and with it no frame, for an error that is larger by h at the most:
+The held level's interval is widened by h on either side; a value outside it is quantized uniformly. Noise of less than
+h about an edge therefore changes no code and no frame, and the error bound grows by h:
 
     held level   0                  ±y_i
     stays while  |y| ≤ y₀ + h       y_i − l/2 − h ≤ ±y ≤ y_i + l/2 + h
 
-The paper names this kind (Remark 8) and refers to another for its definition; this one is the project's own, and
-SPEC.md, section 2, has it in full. What is remembered is the last code and nothing else.
+The paper names this kind (Remark 8) and cites another text for it; the definition here is the project's own (SPEC.md,
+section 2). The last code is the only state.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _SLACK: Final[float] = 1 - TIE
 
 
 class HysteresisQuantizer(UniformQuantizer):
-    """The hysteresis-uniform quantizer. A tie goes to the level held.
+    """The hysteresis-uniform quantizer. A tie goes to the held level.
 
     Args:
         bits: R, 2…16.
         limit: Edge of the range [signal's unit], > 0.
         deadzone: y₀ [signal's unit]; l/2 if None.
-        hysteresis: h [signal's unit]; l/2 if None: a code changes once the value is over a whole step from the level.
+        hysteresis: h [signal's unit]; l/2 if None: a code changes once the value is more than a step from its level.
 
     Attributes:
         hysteresis: h as used.
@@ -45,7 +45,7 @@ class HysteresisQuantizer(UniformQuantizer):
         self.reset()
 
     def encode(self, y: float) -> int:
-        """The code of a value, by what is held; see `Quantizer.encode`."""
+        """The code of a value, given the held code; see `Quantizer.encode`."""
         if self._low <= y <= self._high:
             return self._held
         code = super().encode(y)
@@ -63,7 +63,7 @@ class HysteresisQuantizer(UniformQuantizer):
             self._hold(int(code))
 
     def _hold(self, code: int) -> None:
-        # A value within a few units in the last place of an edge lies on it. What lies beyond the limit saturates.
+        # A value within a few units in the last place of an edge lies on it. Beyond the limit a value saturates.
         h, i = self.hysteresis, abs(code)
         outer = self.deadzone + i * self.step
         high = min(self.limit, outer + h + _SLACK * (outer + h))

@@ -1,13 +1,13 @@
-"""The logarithmic-uniform quantizer: intervals that grow with the value up to a threshold, and are alike beyond it.
+"""Logarithmic-uniform quantizer: intervals grow with the value up to a threshold, and have equal lengths beyond it.
 
-Its error is in proportion to the value where values are small, as a logarithmic quantizer's, and bounded throughout, as
-a uniform one's. Of the N = 2^(R−1) − 1 intervals on either side the first m are geometric, the others l long:
+The error is proportional to small values, as in a logarithmic quantizer, and bounded throughout, as in a uniform one.
+Of the N = 2^(R−1) − 1 intervals on either side the first m are geometric, the others l long:
 
     edge   e₀ = y₀   e_i = y₀·(y_t/y₀)^(i/m)   e_m = y_t   e_i = y_t + (i − m)·l   e_N = limit
     code      0     |         1 … m                |         m + 1 … N
 
-m is the least with which no geometric interval is longer than l. A level is the middle of its interval. The paper names
-this kind (Remark 8) and refers to another for its definition; this one is the project's own, in SPEC.md, section 2.
+m is the least number for which no geometric interval is longer than l. A level is the middle of its interval. The paper
+names this kind (Remark 8) and cites another text for it; the definition here is the project's own (SPEC.md, section 2).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ MIN_LOGARITHMIC_BITS: Final = 3
 """With 2 bits there is one interval, which cannot be geometric and uniform."""
 
 _ALIKE: Final = 1 - 2.0**-30
-"""The last geometric interval may be longer than l by this: where the two are equal, rounding must not choose m."""
+"""Tolerance of the last geometric interval against l: where the two are equal, rounding must not choose m."""
 
 _APART: Final = 2.0**-46
-"""Edges are farther from each other than what counts as a tie, relatively."""
+"""Least distance of two edges, relative: more than what counts as a tie."""
 
 
 class LogarithmicQuantizer(CodedQuantizer):
@@ -41,7 +41,7 @@ class LogarithmicQuantizer(CodedQuantizer):
     Attributes:
         threshold: y_t as used.
         growing: m, the number of geometric intervals on either side.
-        step: l, the length of the others [signal's unit].
+        step: l, the length of the uniform intervals [signal's unit].
         edges: e₀ … e_N [signal's unit].
 
     Raises:
@@ -78,7 +78,7 @@ class LogarithmicQuantizer(CodedQuantizer):
         return i if y > 0 else -i
 
     def _least_growing(self) -> int:
-        """m: with more of them the geometric intervals get shorter and the others longer, so it is found by halving."""
+        """m, by bisection: with a larger m the geometric intervals get shorter and the uniform ones longer."""
         low, high = 1, self.top - 1
         while low < high:
             m = (low + high) // 2

@@ -1,4 +1,4 @@
-"""Loop settings that both ends share: the tick grid, its real-time demands, and the times of a session."""
+"""Loop settings of both ends: tick grid, real-time set-up, trace interval, default time-outs of a session."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from typing import Final, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 WATCHDOG_S: Final = 0.1
-"""0 V after this long without a fresh command [s], unless configured; as drives in the field do."""
+"""0 V after this long without a fresh command [s], unless configured; as industrial drives do."""
 
 FIRST_COMMAND_S: Final = 1.0
 """How long a granted claim may wait for its first command [s]."""
 
 
 class LoopSettings(BaseModel):
-    """The grid that both ends keep."""
+    """Tick grid and process set-up of an end."""
 
     model_config = ConfigDict(extra="forbid")
 
     rate_hz: float = Field(default=500.0, ge=1, le=10_000, description="ticks a second [Hz]")
     lockstep: bool = Field(
-        default=False, description="the plant waits for each answer before it steps: repeatable, and as fast as it goes"
+        default=False, description="the plant waits for each command before it steps: repeatable, as fast as possible"
     )
 
     realtime: Literal["strict", "try", "off"] = Field(
         default="try",
-        description="ask for SCHED_FIFO, locked memory, affinity; strict: refuse to run without; off: do not ask",
+        description="request SCHED_FIFO, locked memory, affinity; strict: refuse to run without; off: request none",
     )
     priority: int = Field(default=10, ge=1, le=99, description="SCHED_FIFO priority")
     cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
     trace_s: float = Field(
-        default=0.1, ge=0.01, le=10, description="publish what was done tick by tick this often, for the log [s]"
+        default=0.1, ge=0.01, le=10, description="time between batches of the trace, which the log records [s]"
     )
 
     @property

@@ -1,16 +1,16 @@
-"""The quantizer, (C.13)–(C.15): value ↔ code ↔ level.
+"""Quantizers, (C.13)–(C.15): value ↔ code ↔ level.
 
-A value is quantized to a level (C.14); the level's index is the code, an R-bit two's-complement integer, and the only
-thing that travels. R bits index 2^R − 1 levels, symmetric about zero; the one code to spare, −2^(R−1), says "no valid
-value" and decodes to NaN.
+A value is quantized to a level (C.14); the level's index is the code, an R-bit two's-complement integer, and only the
+code is sent. R bits index 2^R − 1 levels, symmetric about zero; the spare code, −2^(R−1), means "no valid value" and
+decodes to NaN.
 
     code   −2^(R−1)   −(2^(R−1) − 1)  …  −1   0   1  …  2^(R−1) − 1
     level  NaN        −y_max          …  −y₁  0   y₁ …  y_max
 
-With the paper's dead zone y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). For any other y₀ the step is chosen
-so that, there too, the outermost interval ends exactly at the limit: l = (limit − y₀) / (2^(R−1) − 1).
+With the paper's dead zone y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). For any other y₀ the step is such
+that the outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1).
 
-The uniform quantizer is the paper's; `hysteresis` and `logarithmic` have two more kinds (Remark 8).
+The uniform quantizer is the paper's; `hysteresis` and `logarithmic` define two more kinds (Remark 8).
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ TIE: Final[float] = 1 - 2.0**-50
 
 
 class Quantizer(ABC):
-    """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) asks.
+    """A bounded quantizer of one scalar signal: |y^Q − y| ≤ bound for every |y| ≤ limit, as (C.13) requires.
 
-    Decoding needs no memory; encoding may have one, which is the last code. So each scalar has a quantizer of its own.
+    Decoding is stateless; encoding may depend on the last code, so each scalar has a quantizer of its own.
 
     Attributes:
         limit: Edge of the range, in the signal's unit.
         bound: δ_y of (C.13), in the signal's unit.
-        saturated: How often a value lay beyond the range and was given the outermost level.
+        saturated: Number of values beyond the range, which got the outermost level.
     """
 
     limit: float
@@ -47,7 +47,7 @@ class Quantizer(ABC):
         """The code of a value. Beyond the range: the outermost level's, and `saturated` goes up.
 
         Raises:
-            ValueError: y is NaN. A sensor that failed is told with `invalid`, by whoever knows that it failed.
+            ValueError: y is NaN. The caller sends `invalid` for a failed sensor.
         """
 
     @abstractmethod
@@ -58,11 +58,11 @@ class Quantizer(ABC):
             ValueError: Not a code of this quantizer.
         """
 
-    def reset(self) -> None:  # noqa: B027  # most kinds remember nothing
-        """Forget what was encoded: a session begins. The count of saturations goes on."""
+    def reset(self) -> None:  # noqa: B027  # most kinds have no memory
+        """Clear the memory at a session's start; `saturated` goes on counting."""
 
     def resume(self, code: float) -> None:  # noqa: B027  # the same
-        """Go on as if this code had been the last; `invalid` is none, and changes nothing."""
+        """Restore the memory: this code was the last. `invalid` changes nothing."""
 
     @property
     @abstractmethod
@@ -72,12 +72,12 @@ class Quantizer(ABC):
     @property
     @abstractmethod
     def invalid(self) -> float:
-        """The code that says "no valid value"."""
+        """The code of "no valid value"."""
 
     @property
     @abstractmethod
     def level(self) -> Callable[[float], float]:
-        """`decode` without its check, for codes that came out of a frame and so cannot be wrong."""
+        """`decode` without its check, for codes out of a frame, which are always valid."""
 
     def quantize(self, y: float) -> float:
         """y^Q, the level that the quantizer gives y; (C.15) applies it to each element of a vector."""
@@ -114,7 +114,7 @@ class CodedQuantizer(Quantizer):
         self.saturated = 0
 
     def _tabulate(self, positive: Sequence[float]) -> None:
-        """Take these for the levels 1…N."""
+        """Set the levels 1…N."""
         self.levels = [0.0, *positive, nan, *(-y for y in reversed(positive))]
 
     @property

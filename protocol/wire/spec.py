@@ -1,7 +1,7 @@
-"""The wire spec: what both ends must agree on, and from which every scale and width derives.
+"""Wire spec: quantizers, frame sizes and transmit policy, on which both ends must agree.
 
-A signal has a kind of quantizer, bits and a range; a wire has three signals, a number of motors, and a policy of when
-frames are sent. Claims, fingerprints, frames, the DBC and whoever reads a log take all they need from here.
+A signal has a kind of quantizer, bits and a range; a wire has three signals, a number of motors, a counter and a
+transmit policy. Claims, fingerprints, frames, the DBC and log readers derive every scale and width from it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from aeroloop.protocol.wire.transmit import Transmit
 
 
 def bits_or_continuous(value: object) -> object:
-    """The word "cont" stands for no quantization wherever a person writes bits (TOML has no null)."""
+    """The word "cont" stands for no quantization in configuration (TOML has no null)."""
     return None if value == "cont" else value
 
 
@@ -53,7 +53,7 @@ class SignalSpec(BaseModel):
         default=None,
         gt=0,
         allow_inf_nan=False,
-        description="h: how much farther a level is held [signal's unit]; half a step if left out; hysteresis-uniform",
+        description="h: widens a held level's interval [signal's unit]; half a step if left out; hysteresis-uniform",
     )
     threshold: float | None = Field(
         default=None,
@@ -70,11 +70,11 @@ class SignalSpec(BaseModel):
             if getattr(self, name) is not None and self.kind != owner:
                 raise ValueError(f'{name} belongs to kind = "{owner}", and kind is "{self.kind}"')
         if self.kind != "uniform":
-            self.quantizer()  # has bounds of its own, which depend on the bits
+            self.quantizer()  # raises: its bounds depend on the bits
         return self
 
     def quantizer(self) -> Quantizer:
-        """A quantizer of one element of this signal, with its own count of saturations and its own memory."""
+        """A new quantizer for one element of this signal."""
         if self.bits is None:
             return Continuous(self.limit)
         if self.kind == "hysteresis-uniform":
@@ -84,7 +84,7 @@ class SignalSpec(BaseModel):
         return UniformQuantizer(self.bits, self.limit, self.deadzone)
 
     def with_bits(self, bits: int | None) -> SignalSpec:
-        """The same with other bits. Raises ValueError where the kind takes no such number, or not with the rest."""
+        """The same signal with other bits. Raises ValueError if they do not fit its kind or its other parameters."""
         changed = self.model_copy(update={"bits": bits})
         if self.kind != "uniform":
             changed.quantizer()
@@ -109,7 +109,7 @@ class WireSpec(BaseModel):
         default=DEFAULT_COUNTER_BITS,
         ge=MIN_COUNTER_BITS,
         le=MAX_COUNTER_BITS,
-        description="bits of the counter in each frame; one that is 2^bits periods late may be taken for a newer one",
+        description="bits of the counter in each frame; a frame 2^bits periods late may be taken for a newer one",
     )
 
     @cached_property
@@ -123,7 +123,7 @@ class WireSpec(BaseModel):
         return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
 
     def freshness_ns(self, period_ns: int) -> int:
-        """How late a frame may be before it may be taken for a newer one: 2^counter_bits periods [ns].
+        """Lateness at which a frame may be taken for a newer one: 2^counter_bits periods [ns].
 
         Args:
             period_ns: Period of a tick [ns].
@@ -134,7 +134,7 @@ class WireSpec(BaseModel):
         """The same spec with R bits for both outputs (ε and ω) and for the inputs (u); None is the paper's "cont.".
 
         Raises:
-            ValueError: A signal's kind takes no such number of bits.
+            ValueError: The bits do not fit a signal's kind or its other parameters.
         """
         return WireSpec(
             attitude=self.attitude.with_bits(out),
@@ -146,18 +146,19 @@ class WireSpec(BaseModel):
         )
 
     def agreed(self) -> dict[str, Any]:
-        """What two ends must agree on, as JSON: what they use, so that an end that knows no more understands it.
+        """The spec as JSON, for claims and fingerprints.
 
-        A uniform signal has nothing of other kinds; `transmit` is left out unless some of it is not by default.
+        Leaves out what is not in use, so that an end without it can read the rest: parameters of other kinds in a
+        uniform signal, and `transmit` if all of it is by default.
         """
-        told = self.model_dump(mode="json")
+        tree = self.model_dump(mode="json")
         for name in ("attitude", "rate", "voltage"):
-            if told[name]["kind"] == "uniform":
+            if tree[name]["kind"] == "uniform":
                 for unused in ("kind", *_OWNER):
-                    del told[name][unused]
+                    del tree[name][unused]
         if self.transmit == Transmit():
-            del told["transmit"]
-        return told
+            del tree["transmit"]
+        return tree
 
     def differences(self, other: WireSpec) -> list[str]:
         """Where two specs differ, one line a field: `rate.bits: 8, not 10`. Empty if they are the same wire."""

@@ -1,14 +1,13 @@
-"""A `casadi.Function` evaluated in place, for one tick or for a block of them.
+"""Evaluation of a `casadi.Function` in place, for one tick or for a block of ticks.
 
-CasADi writes the equations; the loop evaluates them. Called with arguments a Function costs 160 µs, most of it in
-making and checking matrices. Through `Function.buffer()` it reads and writes memory that we own, and costs about a
-microsecond. `Compiled` keeps that memory alive and gives it names; two functions may share it, so that what one writes
-is what the next reads.
+CasADi writes the equations; the loop evaluates them. A call of a Function with arguments costs 160 µs, most of it for
+making and checking matrices. Through `Function.buffer()` it reads and writes preallocated memory, and costs about 1 µs.
+`Compiled` keeps that memory and names it; two functions may share a buffer: one's output is the next one's input.
 
-A reader of logs has many ticks at once. `in_columns` makes of a function of scalars the same function of columns, a row
-a tick: each of its instructions then runs over a whole column within CasADi, which costs a tenth. `along_rows` is for
-what goes from tick to tick. Both run the function's own instructions in the function's own order, so the bits are the
-same.
+A log reader has many ticks at once. `in_columns` turns a function of scalars into the same function of columns, a row a
+tick: each of its instructions then runs over a whole column within CasADi, at a tenth of the cost. `along_rows` is for
+recursions from tick to tick. Both run the function's own instructions in the function's own order, so the results are
+equal bit for bit.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from typing import Final, TypeAlias
 import casadi as ca
 
 Buffer: TypeAlias = "memoryview[float]"
-"""A row of doubles, written and read by index. Matrices lie column by column, as CasADi keeps them."""
+"""A row of doubles, written and read by index. Matrices are in CasADi's order, column by column."""
 
 UNROLLED: Final = 64
-"""Steps of a recursion that are one list of instructions, so that calls cost little."""
+"""Steps of a recursion that are unrolled into one function, so that calls cost little."""
 
 
 def buffer(size: int) -> Buffer:
@@ -38,10 +37,10 @@ class Compiled:
 
     Args:
         function: The function; all its inputs and outputs must be dense and named.
-        shared: Memory to use instead of fresh memory, by the name of an input or output.
+        shared: Buffers to use instead of new ones, by the name of an input or output.
 
     Raises:
-        ValueError: A shared buffer has another size than the input or output it stands for.
+        ValueError: A shared buffer differs in size from its input or output.
     """
 
     inputs: dict[str, Buffer]
@@ -109,7 +108,7 @@ def in_columns(function: ca.Function, rows: int) -> ca.Function:
 
 
 def along_rows(step: ca.Function, first: ca.MX, *columns: ca.MX) -> ca.MX:
-    """What a step makes of row after row.
+    """States of a recursion over rows.
 
     Args:
         step: (state, inputs…) ↦ next state; made of SX.

@@ -1,9 +1,9 @@
-"""When a frame is sent: every tick, or only when a level changes (Remark 3), with a heartbeat.
+"""Transmit policy: sends a frame every tick, or only when a level changes (Remark 3), with a heartbeat.
 
-What is quantized changes in steps, so a frame that says the same as the last one need not be sent: the other end holds
-the last levels, and nothing is lost. A heartbeat, after less than half the counter's range, shows that the sender
-lives and keeps its counter unmistakable. Where each frame is waited for, in lockstep, silence cannot be received: there
-an empty frame stands for it, `SILENCE`, which says as much and is no frame.
+Quantized values change in steps, so a frame equal to the last one need not be sent: the receiver holds the last levels,
+and nothing is lost. A heartbeat, after less than half the counter's range, is the sender's sign of life and keeps its
+counter unambiguous. In lockstep each frame is waited for, so silence cannot be received: an empty frame, `SILENCE`,
+stands for it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 SILENCE: Final = b""
-"""Stands for a frame that is not sent because it would say what the last one said."""
+"""Empty frame: stands for a frame that is not sent because it equals the last one."""
 
 Policy = Literal["periodic", "on_change"]
 
 
 class Transmit(BaseModel):
-    """What each end sends, and when. The word `on_change` alone stands for both directions."""
+    """When each end sends its frames. The word `on_change` alone stands for both directions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -45,7 +45,7 @@ class Transmit(BaseModel):
 
         Args:
             period_ns: Period of a tick [ns].
-            counters: How many values the counter of frames has.
+            counters: Number of values of the frames' counter.
         """
         return max(1, min(counters // 2 - 1, round(self.heartbeat_s * 1e9) // period_ns))
 
@@ -56,14 +56,14 @@ class Sender:
     Args:
         policy: When frames are sent.
         heartbeat: The most ticks from one frame to the next.
-        counters: How many values the counter of frames has.
+        counters: Number of values of the frames' counter.
     """
 
     def __init__(self, policy: Policy, heartbeat: int, counters: int) -> None:
         self._always = policy == "periodic"
         self._heartbeat = heartbeat
         self._counters = counters
-        self._said: Sequence[float] | None = None
+        self._codes: Sequence[float] | None = None
         self._at: int | None = None
 
     def due(self, k: int, codes: Sequence[float]) -> bool:
@@ -71,36 +71,36 @@ class Sender:
 
         Args:
             k: Tick index, rising.
-            codes: What the frame would say; a sequence that nobody changes any more.
+            codes: Codes of the frame; not to be modified afterwards.
         """
         if self._always:
             return True
         since = None if self._at is None else k - self._at
-        if since is not None and since < self._heartbeat and self._said is not None and _same(codes, self._said):
+        if since is not None and since < self._heartbeat and self._codes is not None and _same(codes, self._codes):
             return False
-        # With ticks missed, its counter may be that of the last frame, and it be taken for that one's repetition: then
-        # the next tick has to say it again.
-        self._said = None if since is not None and since % self._counters == 0 else codes
+        # After missed ticks its counter may equal the last frame's, and the receiver take it for a repetition of that
+        # one: then the next tick's frame is due as well.
+        self._codes = None if since is not None and since % self._counters == 0 else codes
         self._at = k
         return True
 
     def forget(self) -> None:
-        """A session begins: whatever comes is to be sent."""
-        self._said = self._at = None
+        """Clear the memory at a session's start: the next frame is due."""
+        self._codes = self._at = None
 
     @property
     def memory(self) -> tuple[Sequence[float] | None, int | None]:
-        """Codes and tick of the last frame, which is all that a sender remembers; None for what it does not."""
-        return self._said, self._at
+        """Codes and tick of the last frame, a sender's whole memory; None where there is none."""
+        return self._codes, self._at
 
     def resume(self, codes: Sequence[float] | None, k: int | None) -> None:
-        """Go on with the memory of another sender."""
-        self._said, self._at = codes if codes is None else list(codes), k
+        """Restore the memory of another sender."""
+        self._codes, self._at = codes if codes is None else list(codes), k
 
 
-def _same(codes: Sequence[float], said: Sequence[float]) -> bool:
-    """Whether two frames have the same bits: 0.0 and −0.0 are equal and have not, NaN is not and has."""
+def _same(codes: Sequence[float], last: Sequence[float]) -> bool:
+    """Whether two frames have the same bits. 0.0 equals −0.0 but differs in bits; NaN is the reverse."""
     return all(
         copysign(1, a) == copysign(1, b) if a == b == 0 else a == b or (a != a and b != b)
-        for a, b in zip(codes, said, strict=True)
+        for a, b in zip(codes, last, strict=True)
     )

@@ -1,1 +1,84 @@
-"""Adaptive attitude control over Eclipse Zenoh, in frames whose every bit is a quantizer's bit."""
+"""Adaptive attitude control over Eclipse Zenoh, in frames whose every bit is a quantizer's bit.
+
+The public Python API. Everything else under `aeroloop` may change without notice.
+
+    import aeroloop
+
+    settings = aeroloop.load_settings(overrides={"wire.voltage.bits": 8})
+    figures = aeroloop.run_experiment(settings, duration_s=10)
+    print(figures.z_track, aeroloop.certify(settings).verdict)
+
+Examples are in `aeroloop/service/examples`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from aeroloop.plant_emulator.plant import Measurement, Plant
+    from aeroloop.protocol.errors import AeroloopError
+    from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
+    from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
+    from aeroloop.protocol.wire.quantizer import UniformQuantizer
+    from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+    from aeroloop.research import RecordedRun, certify, load_settings, read_run, run_experiment
+    from aeroloop.service.config import Settings
+    from aeroloop.service.control.controller import Controller
+    from aeroloop.service.figures import Figures
+    from aeroloop.service.logs.ticks import Ticks
+    from aeroloop.service.theorem.certificate import Certificate
+
+_HOMES: Final = {
+    "AeroloopError": "aeroloop.protocol.errors",
+    "Certificate": "aeroloop.service.theorem.certificate",
+    "Controller": "aeroloop.service.control.controller",
+    "Figures": "aeroloop.service.figures",
+    "HysteresisQuantizer": "aeroloop.protocol.wire.hysteresis",
+    "LogarithmicQuantizer": "aeroloop.protocol.wire.logarithmic",
+    "Measurement": "aeroloop.plant_emulator.plant",
+    "Plant": "aeroloop.plant_emulator.plant",
+    "RecordedRun": "aeroloop.research",
+    "Settings": "aeroloop.service.config",
+    "SignalSpec": "aeroloop.protocol.wire.spec",
+    "Ticks": "aeroloop.service.logs.ticks",
+    "UniformQuantizer": "aeroloop.protocol.wire.quantizer",
+    "WireSpec": "aeroloop.protocol.wire.spec",
+    "certify": "aeroloop.research",
+    "load_settings": "aeroloop.research",
+    "read_run": "aeroloop.research",
+    "run_experiment": "aeroloop.research",
+}
+"""Module of each public name. Names load on first use: `import aeroloop` stays light, and so does every command."""
+
+__all__ = [
+    "AeroloopError",
+    "Certificate",
+    "Controller",
+    "Figures",
+    "HysteresisQuantizer",
+    "LogarithmicQuantizer",
+    "Measurement",
+    "Plant",
+    "RecordedRun",
+    "Settings",
+    "SignalSpec",
+    "Ticks",
+    "UniformQuantizer",
+    "WireSpec",
+    "certify",
+    "load_settings",
+    "read_run",
+    "run_experiment",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'aeroloop' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

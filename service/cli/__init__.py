@@ -1,1 +1,1 @@
-"""Cli."""
+"""Command `aeroloop`: parses arguments, calls one function, prints its result."""

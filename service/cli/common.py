@@ -1,12 +1,14 @@
-"""What every command shares: options, the configuration, errors in one line, figures as text or JSON."""
+"""Shared parts of the commands: options, configuration, one-line errors, figures as text or JSON."""
 
 from __future__ import annotations
 
 import logging
 import signal
 from collections.abc import Callable
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, NoReturn, TypeVar, get_type_hints
 
 import typer
 
@@ -39,9 +41,38 @@ BitsOut = Annotated[
 ]
 BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Say only warnings and errors on stderr.")]
-LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="What lines on stderr look like.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Log only warnings and errors.")]
+LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="Format of the log lines on stderr.")]
 WithParent = Annotated[int, typer.Option("--with-parent", metavar="PID", help="End with this process.", hidden=True)]
+
+
+class DaemonOptions(NamedTuple):
+    """Options that the command of every daemon has."""
+
+    config: Config = None
+    overrides: Overrides = None
+    quiet: Quiet = False
+    log_format: LogFormat = "text"
+    with_parent: WithParent = 0
+
+
+def daemon(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of every daemon to a command, which takes them as its first argument."""
+    own = list(signature(command).parameters.values())[1:]
+    shared = [Parameter(name, Parameter.KEYWORD_ONLY, default=value) for name, value in _DEFAULTS.items()]
+    hints = get_type_hints(command, include_extras=True) | get_type_hints(DaemonOptions, include_extras=True)
+
+    @wraps(command)
+    def with_options(**arguments: Any) -> None:
+        command(DaemonOptions(**{name: arguments.pop(name) for name in _DEFAULTS}), **arguments)
+
+    parameters = [each.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[each.name]) for each in (*own, *shared)]
+    with_options.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
+    with_options.__annotations__ = {each.name: hints[each.name] for each in parameters}
+    return with_options
+
+
+_DEFAULTS: Final = DaemonOptions()._asdict()
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -51,19 +82,14 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def settings_of(config: Path | None, overrides: list[str] | None) -> Settings:
-    """The effective configuration; what is wrong with it ends the command."""
-    from aeroloop.service.config import ConfigError, load
+    """The effective configuration; a configuration error ends the command."""
+    from aeroloop.service.config import load
 
-    try:
-        return load(config, overrides or [])
-    except ConfigError as error:
-        if state["debug"]:
-            raise
-        fail(str(error), 2)
+    return _configured(lambda: load(config, overrides or []))
 
 
 def reloadable(config: Path | None, overrides: list[str]) -> tuple[Settings, Callable[[], Settings]]:
-    """The effective configuration, and what reads it again."""
+    """The effective configuration, and a function that loads it again."""
 
     def load() -> Settings:
         from aeroloop.service import config as configuration
@@ -75,10 +101,16 @@ def reloadable(config: Path | None, overrides: list[str]) -> tuple[Settings, Cal
 
 def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
     """The settings with the bits given on the command line."""
-    from aeroloop.service.config import ConfigError, with_bits
+    from aeroloop.service.config import with_bits
+
+    return _configured(lambda: with_bits(settings, bits_out, bits_in))
+
+
+def _configured(make: Callable[[], Settings]) -> Settings:
+    from aeroloop.service.config import ConfigError
 
     try:
-        return with_bits(settings, bits_out, bits_in)
+        return make()
     except ConfigError as error:
         if state["debug"]:
             raise
@@ -86,7 +118,7 @@ def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) 
 
 
 def guarded(run: Callable[[], T]) -> T:
-    """Run, and turn what can go wrong into one line and an exit code."""
+    """Run, and turn expected errors into one line and an exit code."""
     from aeroloop.protocol.errors import AeroloopError
 
     try:
@@ -100,7 +132,7 @@ def guarded(run: Callable[[], T]) -> T:
 
 
 def checked(make: Callable[[], T]) -> T:
-    """Make something of what the user gave; what is wrong with it is his to put right."""
+    """Build a value from user input; invalid input ends the command with exit code 2."""
     from pydantic import ValidationError
 
     from aeroloop.protocol.errors import AeroloopError
@@ -115,13 +147,11 @@ def checked(make: Callable[[], T]) -> T:
         fail(str(error), 2)
 
 
-def run_role(
-    kind: str, settings: Settings, run: Callable[[Role], None], *, quiet: bool, log_format: str, with_parent: int
-) -> None:
-    """Join the network as a role and run until a signal says stop."""
-    _prepare(quiet=quiet, log_format=log_format, with_parent=with_parent)
+def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:
+    """Join the network as a role and run until SIGTERM or SIGINT."""
+    _prepare(options)
 
-    def live() -> None:
+    def join_and_run() -> None:
         from aeroloop.protocol.runtime.role import Role
         from aeroloop.service.daemon.claim import controller_name
 
@@ -130,35 +160,35 @@ def run_role(
             role.stop_on_signals()
             run(role)
 
-    guarded(live)
+    guarded(join_and_run)
 
 
-def run_alone(run: Callable[[Event], None], *, quiet: bool, log_format: str, with_parent: int) -> None:
-    """Run a process that is on no Zenoh network until a signal says stop."""
+def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
+    """Run a process that is no role on the network until SIGTERM or SIGINT."""
     from threading import Event
 
-    _prepare(quiet=quiet, log_format=log_format, with_parent=with_parent)
+    _prepare(options)
     stop = Event()
     for which in (signal.SIGTERM, signal.SIGINT):
         signal.signal(which, lambda *_: stop.set())
     guarded(lambda: run(stop))
 
 
-def _prepare(*, quiet: bool, log_format: str, with_parent: int) -> None:
+def _prepare(options: DaemonOptions) -> None:
     from aeroloop.service.terminal.log_lines import set_up_logging
 
-    set_up_logging(logging.WARNING if quiet else logging.INFO, as_json=log_format == "json")
-    if with_parent:
+    set_up_logging(logging.WARNING if options.quiet else logging.INFO, as_json=options.log_format == "json")
+    if options.with_parent:
         import ctypes
         import os
 
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != with_parent:  # it died before the kernel was asked to watch it
+        if os.getppid() != options.with_parent:  # the parent ended before prctl took effect
             raise typer.Exit(0)
 
 
 def print_figures(figures: Figures, json: bool) -> None:
-    """Print figures of merit, for a program or for a person."""
+    """Print figures of merit, as JSON or as a table."""
     if json:
         typer.echo(figures.model_dump_json(indent=2))
     else:

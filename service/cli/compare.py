@@ -1,4 +1,4 @@
-"""`aeroloop log compare`: several runs side by side; and what a log's page is written with."""
+"""`aeroloop log compare`: compares several runs; also writes the HTML page of one or more runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def compare(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Lay several runs over each other: their figures side by side, and what differs in their configurations."""
+    """Compare the figures and the configurations of several runs, side by side."""
     from aeroloop.service.review.requirements import Limit
 
     if len(logs) < 2:
@@ -65,7 +65,7 @@ def compare(
 
 
 def write_html(reports: Sequence[Report], out: Path) -> None:
-    """Write the page of some runs and say so. Raises AeroloopError if it cannot be written."""
+    """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
     from aeroloop.service.report.page.page import write_page
 
     write_page(reports, out)

@@ -1,4 +1,4 @@
-"""`aeroloop host`: this machine."""
+"""`aeroloop host`: checks this machine, soaks the loop on it, installs its daemons."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis
     from aeroloop.service.host.soak import Soak
 
-group = typer.Typer(no_args_is_help=True, help="This machine.")
+group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
 
 
 @group.command()
 def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Say whether this machine will hold the configured rate, and what to change if not."""
+    """Check whether this machine holds the configured rate, and print what to change if not."""
     settings = settings_of(config, overrides)
 
     def run() -> Diagnosis:
         from aeroloop.service.host.doctor import TRIAL_S, diagnose
         from aeroloop.service.terminal.display import progress_bar
 
-        with progress_bar("trial", TRIAL_S, hidden=json) as update:
+        with progress_bar("check", TRIAL_S, hidden=json) as update:
             return diagnose(settings.loop, update)
 
     diagnosis = guarded(run)
@@ -42,13 +42,13 @@ def doctor(json: Json = False, config: Config = None, overrides: Overrides = Non
 
 @group.command()
 def soak(
-    minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="How long.")] = 20.0,
-    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="Length of the soak, in minutes.")] = 20.0,
+    log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run the three processes for long, and say whether anything grows, drifts or is lost."""
+    """Run the three processes for a long time and report growth, drift and losses."""
     settings = settings_of(config, overrides)
 
     def run() -> Soak:
@@ -75,7 +75,7 @@ def soak(
 @group.command()
 def units(
     install: Annotated[
-        Path | None, typer.Option("--install", help="Write them into this folder instead.", show_default=False)
+        Path | None, typer.Option("--install", help="Write the units into this folder instead.", show_default=False)
     ] = None,
 ) -> None:
     """Print systemd units for the daemons, or install them."""

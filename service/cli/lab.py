@@ -1,4 +1,4 @@
-"""`aeroloop lab`: the theory and the bench, in lockstep."""
+"""`aeroloop lab`: experiments, tables, calibration and certificates, in lockstep and without a network."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from aeroloop.service.lab.tables import Tables
     from aeroloop.service.theorem.certificate import Certificate
 
-group = typer.Typer(no_args_is_help=True, help="The theory and the bench, in lockstep.")
+group = typer.Typer(no_args_is_help=True, help="Experiments, tables, calibration and certificates, in lockstep.")
 
 
 @group.command()
@@ -41,7 +41,7 @@ def experiment(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run the closed loop in this process, in lockstep and through real frames, without a network."""
+    """Run the closed loop in this process, in lockstep through real frames, without a network."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
 
     def run() -> Figures:
@@ -65,7 +65,7 @@ def tables(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Predict every cell of the paper's Tables C.2 to C.4, beside what was published."""
+    """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
     settings = settings_of(config, overrides)
 
     def run() -> Tables:
@@ -90,7 +90,7 @@ def tables(
 
 @group.command()
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Fit the bench to two of the paper's cells, calm and windy, and print the fitted values."""
+    """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
     settings = settings_of(config, overrides)
 
     def run() -> Calibration:
@@ -111,14 +111,14 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
 
 @group.command()
 def certify(
-    disturbance: Annotated[float, typer.Option(min=0, help="Largest disturbance to be reckoned with, in N·m.")] = 0.0,
+    disturbance: Annotated[float, typer.Option(min=0, help="Largest disturbance torque, in N·m.")] = 0.0,
     attitude_error: Annotated[
         float | None,
         typer.Option(
             min=0,
             max=180,
-            help="Assume that the attitude error stays below this, in degrees; controller.start_within_deg if left "
-            "out, and 180 assumes nothing.",
+            help="Assumed bound of the attitude error, in degrees; controller.start_within_deg if left out; 180 "
+            "assumes nothing.",
             show_default=False,
         ),
     ] = None,
@@ -128,7 +128,7 @@ def certify(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Say whether the paper's theorem holds for the configuration, and what error it then guarantees."""
+    """Check whether the paper's theorem holds for the configuration, and print the error that it guarantees."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
 
     def run() -> Certificate:
@@ -157,14 +157,18 @@ def certify(
 def burden(
     bits: Annotated[
         list[str] | None,
-        typer.Option(metavar="OUT/IN", help="Bits of ε and ω, and of u, such as 8/6; repeated.", show_default=False),
+        typer.Option(
+            metavar="OUT/IN",
+            help="Bits of ε and ω, and of u, such as 8/6; may be repeated; six pairs if left out.",
+            show_default=False,
+        ),
     ] = None,
     quantizer: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KIND",
             help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
-            "the rest); repeated.",
+            "the rest); may be repeated; all four if left out.",
             show_default=False,
         ),
     ] = None,
@@ -172,7 +176,8 @@ def burden(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); repeated.",
+            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); may be repeated; all four "
+            "if left out.",
             show_default=False,
         ),
     ] = None,
@@ -185,10 +190,7 @@ def burden(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Weigh error against bits: every number of bits, quantizer, transmit policy and sensor noise, beside float64.
-
-    What is left out is all of it: six pairs of bits, every quantizer, four kinds of sensors.
-    """
+    """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
     settings = settings_of(config, overrides)
 
     def run() -> Burden:
@@ -216,7 +218,7 @@ def burden(
         from aeroloop.service.lab.burden_table import burden_table
 
         burden_table(result)
-    if figure is not None:  # last, so that a disk that is full costs no table
+    if figure is not None:  # last: a full disk must not cost the table
         from aeroloop.service.lab.burden_figure import draw_burden
 
         guarded(lambda: draw_burden(result, figure))

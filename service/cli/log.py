@@ -1,4 +1,4 @@
-"""`aeroloop log`: what happened."""
+"""`aeroloop log`: reviews, compares, replays, recovers and exports logs, and serves a running loop to viewers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, run_alone, settings_of
+from aeroloop.service.cli.common import (
+    Config,
+    DaemonOptions,
+    Json,
+    Overrides,
+    checked,
+    fail,
+    guarded,
+    run_alone,
+    settings_of,
+)
 from aeroloop.service.cli.compare import Html, compare, write_html
 
 if TYPE_CHECKING:
@@ -18,7 +28,7 @@ if TYPE_CHECKING:
     from aeroloop.service.logs.replay import Replay
     from aeroloop.service.review.report import Report
 
-group = typer.Typer(no_args_is_help=True, help="What happened, from logs; and what happens.")
+group = typer.Typer(no_args_is_help=True, help="Review, compare, replay, recover and export logs; view a live loop.")
 
 
 @group.command()
@@ -39,7 +49,7 @@ def review(
     html: Html = None,
     json: Json = False,
 ) -> None:
-    """Say everything that logs tell of a run, hold its figures to limits, draw the paper's figures."""
+    """Compute every figure of a run from its logs, check limits, and draw the paper's figures."""
     from aeroloop.service.review.requirements import Limit
 
     limits = checked(lambda: [Limit.parse(text) for text in require or []])
@@ -83,7 +93,7 @@ def replay(
     logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Compute with this instead of what the log says."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Override the logged configuration."),
     ] = None,
     end: Annotated[
         Literal["controller", "plant"] | None,
@@ -91,7 +101,7 @@ def replay(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Compute what both ends did again from their traces, and compare byte for byte."""
+    """Compute both ends again from their traces and compare byte for byte."""
 
     def run() -> Replay:
         from aeroloop.protocol.messages.trace import ENDS
@@ -118,7 +128,7 @@ def recover(
     out: Annotated[Path, typer.Argument(help="The new file.")],
     json: Json = False,
 ) -> None:
-    """Write everything that is whole in a broken log into a new one, and say what was lost."""
+    """Copy the whole records of a broken log into a new log and report what was lost."""
 
     def run() -> Recovery:
         from aeroloop.service.logs.recover import recover
@@ -138,13 +148,13 @@ def recover(
 
 @group.command()
 def live(
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free one.")] = 8765,
-    address: Annotated[str, typer.Option("--address", help="Where to listen; 0.0.0.0 is everywhere.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 is any free one.")] = 8765,
+    address: Annotated[str, typer.Option("--address", help="Address to listen on; 0.0.0.0 is all.")] = "127.0.0.1",
     rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000, help="Messages a second of each topic.")] = 30.0,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Show what happens now in Foxglove or Lichtblick: a WebSocket server, until ^C."""
+    """Serve a running loop to Foxglove or Lichtblick over a WebSocket until ^C."""
     settings = settings_of(config, overrides)
     vehicle = settings.vehicle
 
@@ -157,24 +167,24 @@ def live(
 
         serve(settings.network, vehicle, stop, address=address, port=port, rate_hz=rate, ready=ready)
 
-    run_alone(run, quiet=False, log_format="text", with_parent=0)
+    run_alone(run, DaemonOptions())
 
 
 @group.command()
 def export(
     logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
-    to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="What kind of file.")],
+    to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="Format of the new file.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="The new file; the log's name with another ending if left out.", show_default=False),
+        typer.Option("--out", help="The new file; the log's name with another suffix if left out.", show_default=False),
     ] = None,
     session: Annotated[
         str | None,
-        typer.Option("--session", metavar="NAME|all", help="The longest one if left out.", show_default=False),
+        typer.Option("--session", metavar="NAME|all", help="The longest session if left out.", show_default=False),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Write a log as a table, a row a tick, for other programs; or, --to mcap, with everything decoded beside it."""
+    """Write a log as a table with a row per tick or, with --to mcap, as a log with every message decoded."""
 
     def run() -> Exported:
         from aeroloop.service.logs.export import export

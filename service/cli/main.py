@@ -1,14 +1,14 @@
-"""The command `aeroloop`: its groups of verbs, and what happens when something goes wrong.
+"""Entry point of the command `aeroloop`: groups of verbs, one-line errors, exit codes.
 
-What is printed is for a person; `--json` is for a program. Errors are one line on stderr: exit code 2 for usage and
-configuration, 1 for a run that failed, 130 for ^C. The verbs are in `service/cli/`, a module a group.
+Output is for a person; `--json` is for a program. An error is one line on stderr, with exit code 2 for usage and
+configuration, 1 for a failed run, 130 for ^C.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from typer.exceptions import TyperException
@@ -30,34 +30,66 @@ app.add_typer(host.group, name="host")
 app.add_typer(show.group, name="show")
 
 
+_EXTRAS: Final = {
+    "can": ("python-can", "can"),
+    "cantools": ("cantools", "can"),
+    "foxglove": ("foxglove-sdk", "foxglove"),
+    "matplotlib": ("matplotlib", "review"),
+    "plotly": ("plotly", "review"),
+    "pyarrow": ("pyarrow", "export"),
+    "scipy": ("scipy", "export"),
+}
+"""Modules that the core installs without: the package, and the extra that brings it."""
+
+
 def main() -> None:
     """Entry point of the command."""
     sys.exit(execute(sys.argv[1:]))
 
 
 def execute(arguments: Sequence[str]) -> int:
-    """Run a command line and return its exit code. Whatever goes wrong is one line on stderr."""
+    """Run a command line and return its exit code. Any error is one line on stderr."""
     state["debug"] = False
     try:
         return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
-        if message := error.format_message():  # empty where help was printed because nothing was asked
+        if message := error.format_message():  # empty where no verb was given and help was printed
             command = " ".join(["aeroloop", *arguments[:1]])
-            typer.echo(f"aeroloop: {message} (`{command} --help` tells more)", err=True)
+            typer.echo(f"aeroloop: {message} (see `{command} --help`)", err=True)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
         return 130
     except Exception as error:
         if state["debug"]:
             raise
+        if isinstance(error, ModuleNotFoundError) and (missing := _EXTRAS.get((error.name or "").partition(".")[0])):
+            package, extra = missing
+            typer.echo(
+                f"aeroloop: this needs {package}, which is not installed: pip install 'aeroloop[{extra}]'", err=True
+            )
+            return 1
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         typer.echo(f"aeroloop: unexpected {text}; `aeroloop --debug …` shows where", err=True)
         return 1
 
 
+def _print_version(requested: bool) -> None:
+    if requested:
+        from aeroloop.protocol.messages.models import PROTOCOL_VERSION
+        from aeroloop.protocol.runtime.host_facts import versions
+
+        found = versions()
+        revision = f" (revision {found['revision']})" if "revision" in found else ""
+        typer.echo(f"aeroloop {found['aeroloop']}{revision}, protocol and log schema {PROTOCOL_VERSION}")
+        raise typer.Exit(0)
+
+
 @app.callback()
 def options(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    version: Annotated[  # noqa: ARG001  # its callback prints and ends
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")
+    ] = False,
 ) -> None:
     """Options of every command."""
     state["debug"] = debug

@@ -1,4 +1,4 @@
-"""`aeroloop op`: what an operator asks and tells, over the network."""
+"""`aeroloop op`: an operator's verbs, sent to running roles over the network."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from aeroloop.protocol.messages.operator import Reference
     from aeroloop.service.host.operator import Statuses
 
-Within = Annotated[float, typer.Option("--in", metavar="S", help="Seconds to get there.")]
+Within = Annotated[float, typer.Option("--in", metavar="S", help="Duration of the move, in s.")]
 
-group = typer.Typer(no_args_is_help=True, help="An operator's verbs, over the network.")
+group = typer.Typer(no_args_is_help=True, help="Operate running roles over the network.")
 
 
 @group.command()
 def status(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Say how every role of every vehicle on the network is doing."""
+    """Print the status of every role of every vehicle on the network."""
     settings = settings_of(config, overrides)
 
     def run() -> Statuses:
@@ -66,7 +66,7 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
-    """Arm the plant, so that the next controller to claim it may drive it; recall controllers that hold."""
+    """Arm the plant for the next claim, and let controllers that hold or are faulted claim again."""
     from aeroloop.service.host import operator as operate
 
     settings = settings_of(config, overrides)
@@ -75,7 +75,7 @@ def arm(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command()
 def stop(config: Config = None, overrides: Overrides = None) -> None:
-    """Stop the plant at once: 0 V, and nobody drives it until it is armed again."""
+    """Stop the plant at once: 0 V, and no controller drives it until it is armed again."""
     from aeroloop.service.host import operator as operate
 
     settings = settings_of(config, overrides)
@@ -84,7 +84,7 @@ def stop(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
-    """Let the controller give the vehicle back, for another one to claim, and hold until `op arm`."""
+    """Make the controller release the vehicle and hold until `op arm`, so that another can claim it."""
     from aeroloop.service.host import operator as operate
 
     settings = settings_of(config, overrides)
@@ -94,20 +94,21 @@ def release(config: Config = None, overrides: Overrides = None) -> None:
 @group.command("set-gains")
 def set_gains(
     c1: Annotated[
-        tuple[float, float, float] | None, typer.Option("--C1", help="Of the attitude error (1/s).", show_default=False)
+        tuple[float, float, float] | None,
+        typer.Option("--C1", help="For the attitude error (1/s).", show_default=False),
     ] = None,
     c2: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--C2", help="Of the rate error (N·m·s/rad).", show_default=False),
+        typer.Option("--C2", help="For the rate error (N·m·s/rad).", show_default=False),
     ] = None,
     gamma: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--Gamma", help="Of the adaptation (N·m·s²/rad² per s).", show_default=False),
+        typer.Option("--Gamma", help="For the adaptation (N·m·s²/rad² per s).", show_default=False),
     ] = None,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Change the law's gains between two ticks; what is not given stays as it is."""
+    """Change the law's gains between two ticks; gains left out stay as they are."""
     from aeroloop.protocol.messages.operator import Gains
     from aeroloop.service.host import operator as operate
 
@@ -122,12 +123,12 @@ def set_gains(
 def goto(
     roll: Annotated[float, typer.Argument(help="Roll, in deg.")],
     pitch: Annotated[float, typer.Argument(help="Pitch, in deg.")],
-    yaw: Annotated[float, typer.Argument(help="Yaw, in deg; 350 from 0 is almost a turn to the left.")],
+    yaw: Annotated[float, typer.Argument(help="Yaw, in deg; not wrapped: from 0 to 350 is almost a full turn.")],
     within_s: Within,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Turn smoothly to an attitude and hold it; refused if that would be too fast."""
+    """Turn smoothly to an attitude and hold it; a turn that would be too fast is refused."""
     from aeroloop.protocol.messages.operator import Hold, Track
     from aeroloop.service.host import operator as operate
 
@@ -144,7 +145,7 @@ def track(
     within_s: Within = 2.0,
     amplitude: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="sinusoid: of roll, pitch, yaw, in deg; the paper's if left out.", show_default=False),
+        typer.Option(help="sinusoid: of roll, pitch, yaw (deg); the paper's if left out.", show_default=False),
     ] = None,
     frequency: Annotated[
         tuple[float, float, float] | None,
@@ -156,7 +157,7 @@ def track(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Follow another reference: a sinusoid, the attitude of now, a file, or live set-points on `reference`."""
+    """Follow another reference: a sinusoid, the current attitude, a file, or set-points published on `reference`."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.host import operator as operate
 

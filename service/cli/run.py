@@ -1,4 +1,4 @@
-"""The processes: the demo, and each of its parts by itself."""
+"""Commands that run processes: the demo, and each role alone."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from aeroloop.service.cli.common import (
     BitsIn,
     BitsOut,
     Config,
+    DaemonOptions,
     Duration,
     Json,
-    LogFormat,
     Overrides,
-    Quiet,
-    WithParent,
+    daemon,
     guarded,
     print_figures,
     reloadable,
@@ -42,7 +41,7 @@ Faults = Annotated[
     typer.Option(
         "--fault",
         metavar="SIGNAL:KIND@T",
-        help="What shall go wrong, such as rate:off@5 or command:drop=0.05; may be repeated.",
+        help="Fault to inject, such as rate:off@5 or command:drop=0.05; may be repeated.",
         show_default=False,
     ),
 ]
@@ -56,18 +55,16 @@ def demo(
     lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
     via: Annotated[
         str | None,
-        typer.Option(
-            "--via", metavar="emulator|can|quanser-fake", help="What the plant is behind.", show_default=False
-        ),
+        typer.Option("--via", metavar="emulator|can|quanser-fake", help="Plant end to run.", show_default=False),
     ] = None,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
-    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run the paper's experiment over Zenoh in three processes, and judge its log."""
+    """Run the paper's experiment over Zenoh in three processes, and review its log."""
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
     settings = settings_of(config, [*(overrides or []), *options])
     settings = with_bits_of(settings, bits_out, bits_in)
@@ -90,23 +87,20 @@ def demo(
 
 
 @group.command()
+@daemon
 def controller(
+    options: DaemonOptions,
     duration: Annotated[
         float | None, typer.Option("--duration", min=0.01, help="End after this long, in s.", show_default=False)
     ] = None,
     auto_arm: Annotated[
         bool, typer.Option("--auto-arm", help="Arm the plant with every claim, unless an operator stopped it.")
     ] = False,
-    config: Config = None,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-    log_format: LogFormat = "text",
-    with_parent: WithParent = 0,
 ) -> None:
     """Run the controller daemon until SIGTERM."""
-    options = [f"controller.duration_s={duration}"] if duration is not None else []
-    options += ["controller.auto_arm=true"] if auto_arm else []
-    settings, load = reloadable(config, [*(overrides or []), *options])
+    words = [f"controller.duration_s={duration}"] if duration is not None else []
+    words += ["controller.auto_arm=true"] if auto_arm else []
+    settings, load = reloadable(options.config, [*(options.overrides or []), *words])
 
     def run(role: Role) -> None:
         from aeroloop.service.config import from_description
@@ -128,60 +122,46 @@ def controller(
         )
         daemon.run()
 
-    run_role("controller", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+    run_role("controller", settings, run, options)
 
 
 @group.command()
+@daemon
 def emulator(
+    options: DaemonOptions,
     faults: Faults = None,
-    config: Config = None,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-    log_format: LogFormat = "text",
-    with_parent: WithParent = 0,
 ) -> None:
     """Run the emulated plant until SIGTERM."""
-    settings, load = reloadable(config, [*(overrides or []), "plant.via=emulator", *_fault_options(faults)])
-    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+    settings, load = reloadable(
+        options.config, [*(options.overrides or []), "plant.via=emulator", *_fault_options(faults)]
+    )
+    _run_plant(settings, load, options)
 
 
 @group.command()
-def plant(
-    config: Config = None,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-    log_format: LogFormat = "text",
-    with_parent: WithParent = 0,
-) -> None:
-    """Run the plant end that `plant.via` names, until SIGTERM: emulator, CAN bridge or Quanser's board."""
-    settings, load = reloadable(config, overrides or [])
-    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+@daemon
+def plant(options: DaemonOptions) -> None:
+    """Run the plant end that `plant.via` names until SIGTERM: emulator, CAN bridge or Quanser's board."""
+    settings, load = reloadable(options.config, options.overrides or [])
+    _run_plant(settings, load, options)
 
 
 @group.command()
-def bridge(
-    config: Config = None,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-    log_format: LogFormat = "text",
-    with_parent: WithParent = 0,
-) -> None:
-    """Run the bridge to a plant on the configured CAN bus, until SIGTERM."""
-    settings, load = reloadable(config, [*(overrides or []), "plant.via=can"])
-    _run_plant(settings, load, quiet=quiet, log_format=log_format, with_parent=with_parent)
+@daemon
+def bridge(options: DaemonOptions) -> None:
+    """Run the bridge to a plant on the configured CAN bus until SIGTERM."""
+    settings, load = reloadable(options.config, [*(options.overrides or []), "plant.via=can"])
+    _run_plant(settings, load, options)
 
 
 @group.command("can-node")
+@daemon
 def can_node(
+    options: DaemonOptions,
     faults: Faults = None,
-    config: Config = None,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-    log_format: LogFormat = "text",
-    with_parent: WithParent = 0,
 ) -> None:
-    """Run the emulated plant as a node on the configured CAN bus, until SIGTERM."""
-    settings = settings_of(config, [*(overrides or []), *_fault_options(faults)])
+    """Run the emulated plant as a node on the configured CAN bus until SIGTERM."""
+    settings = settings_of(options.config, [*(options.overrides or []), *_fault_options(faults)])
 
     def run(stop: Event) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanFront
@@ -190,36 +170,31 @@ def can_node(
         emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
         emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint))
 
-    run_alone(run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+    run_alone(run, options)
 
 
 def _fault_options(faults: list[str] | None) -> list[str]:
     return [f"plant.faults={dumps(faults)}"] if faults else []
 
 
-def _run_plant(
-    settings: Settings, load: Callable[[], Settings], *, quiet: bool, log_format: str, with_parent: int
-) -> None:
+def _run_plant(settings: Settings, load: Callable[[], Settings], options: DaemonOptions) -> None:
     def run(role: Role) -> None:
         from aeroloop.service.daemon.plants import run_plant
 
         run_plant(role, settings, load)
 
-    run_role("plant", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+    run_role("plant", settings, run, options)
 
 
 @group.command()
+@daemon
 def recorder(
-    log: Annotated[Path | None, typer.Option("--log", help="Where the log goes.", show_default=False)] = None,
-    config: Config = None,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-    log_format: LogFormat = "text",
-    with_parent: WithParent = 0,
+    options: DaemonOptions,
+    log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,
 ) -> None:
-    """Record traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
-    options = [f"recorder.path={dumps(str(log))}"] if log is not None else []
-    settings, load = reloadable(config, [*(overrides or []), *options])
+    """Record the traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
+    words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
+    settings, load = reloadable(options.config, [*(options.overrides or []), *words])
 
     def run(role: Role) -> None:
         from aeroloop.service.daemon.reload import reload_on_hangup
@@ -229,4 +204,4 @@ def recorder(
         reload_on_hangup(role, settings, load, lambda new: recorder.reconfigure(new.recorder))
         recorder.run()
 
-    run_role("recorder", settings, run, quiet=quiet, log_format=log_format, with_parent=with_parent)
+    run_role("recorder", settings, run, options)

@@ -1,4 +1,4 @@
-"""`aeroloop show`: what would be used."""
+"""`aeroloop show`: prints the configuration and what is derived from it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from aeroloop.service.cli.common import Config, Overrides, fail, settings_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
-group = typer.Typer(no_args_is_help=True, help="What would be used.")
+group = typer.Typer(no_args_is_help=True, help="Print the configuration, the wire, a DBC file, a layout, examples.")
 
 
 @group.command("config")
@@ -22,7 +22,7 @@ def show_config(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command()
 def spec(config: Config = None, overrides: Overrides = None) -> None:
-    """Print the wire as configured: frames, widths, steps."""
+    """Print the configured wire: frames, widths and quantizer steps."""
     from aeroloop.service.terminal.wire_table import wire_table
 
     wire_table(settings_of(config, overrides).wire)
@@ -30,7 +30,7 @@ def spec(config: Config = None, overrides: Overrides = None) -> None:
 
 @group.command()
 def dbc(config: Config = None, overrides: Overrides = None) -> None:
-    """Print the DBC file of the configured wire on the configured CAN node."""
+    """Print the DBC file of the configured wire and CAN node."""
     settings = settings_of(config, overrides)
 
     from aeroloop.protocol.transport.dbc import dbc as describe
@@ -41,12 +41,12 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 @group.command()
 def layout(
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", metavar="NAME", help="Whose topics; the configured one's if left out.")
+        str | None, typer.Option("--vehicle", metavar="NAME", help="Vehicle to show; the configured one if left out.")
     ] = None,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print a layout for Foxglove or Lichtblick that shows a log, or `log live`: save it, and import the file there."""
+    """Print a layout file for Foxglove or Lichtblick that shows a log or `log live`."""
     settings = settings_of(config, [*(overrides or []), *([f'vehicle="{vehicle}"'] if vehicle is not None else [])])
 
     from aeroloop.service.viewers.layout import layout as describe
@@ -57,16 +57,16 @@ def layout(
 @group.command()
 def examples(
     name: Annotated[
-        str | None, typer.Argument(help="SessionKey one; all are listed if left out.", show_default=False)
+        str | None, typer.Argument(help="Example to print; all are listed if left out.", show_default=False)
     ] = None,
 ) -> None:
     """List the example configurations, or print one of them."""
-    known = {path.stem: path.read_text(encoding="utf-8") for path in sorted(EXAMPLES.glob("*.toml"))}
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(EXAMPLES.glob("*.toml"))}
     if name is None:
-        for stem, text in known.items():
+        for stem, text in texts.items():
             about = " ".join(line[2:] for line in text.split("\n\n")[0].splitlines() if line.startswith("# "))
             typer.echo(f"{stem:12}  {about}")
-    elif name in known:
-        typer.echo(known[name], nl=False)
+    elif name in texts:
+        typer.echo(texts[name], nl=False)
     else:
-        fail(f"no example is called {name!r}; there are {', '.join(known)}", 2)
+        fail(f"no example {name!r}; choose from {', '.join(texts)}", 2)

@@ -1,1 +1,1 @@
-"""Control."""
+"""The control law, its references and the controller end of the loop, sans-I/O."""

@@ -1,8 +1,8 @@
-"""The controller end of the loop, sans-I/O: measurement frame in, command frame out, at tick k.
+"""Controller end of the loop, sans-I/O: measurement frame in, command frame out, at tick k.
 
-It knows no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
-run this one code path. The law's time is k times the period. Where a frame says nothing new and is not sent, silence
-stands for it: the law goes on with the levels it has.
+It uses no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
+run this one code path. The law's time is k times the period. A frame that would repeat the last levels need not be
+sent; the controller then receives SILENCE and computes with the levels it holds.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ Codes = tuple[float, ...]
 
 
 class ControllerSnapshot(BaseModel):
-    """All that goes from tick to tick, besides reference and gains. As JSON it keeps every bit of its floats.
+    """State carried from tick to tick, besides reference and gains. Its JSON keeps every bit of the floats.
 
     Attributes:
         attitude: q^Q of the last measurement [1].
         sign: ±1, the equilibrium that is approached; 0 before the first measurement (Assumption 3).
         damping_estimate: θ̂ [N·m·s/rad].
         held: Codes of the last measurement, for silence; None before the first. Shape (6,).
-        voltage_codes: Codes of the last voltages that had a valid value, for quantizers with a memory; None before the
-            first. Shape (actuators,).
+        voltage_codes: Codes of the last valid voltages, for quantizers with a memory; None before the first.
+            Shape (actuators,).
         sent_codes: Codes of the last command sent; None where commands are periodic, before the first, and where the
-            next command is sent whatever it says. Shape (actuators,).
+            next command is sent in any case. Shape (actuators,).
         sent_tick: Its tick.
     """
 
@@ -52,7 +52,7 @@ class ControllerSnapshot(BaseModel):
 
 
 def resume(quantizers: Sequence[Quantizer], codes: Sequence[float] | None) -> None:
-    """Have quantizers go on as after these codes, one each; as before the first if None."""
+    """Set quantizers to the state after these codes, one each; to the initial state if None."""
     for i, quantizer in enumerate(quantizers):
         quantizer.reset()
         if codes is not None:
@@ -60,22 +60,22 @@ def resume(quantizers: Sequence[Quantizer], codes: Sequence[float] | None) -> No
 
 
 class Controller:
-    """The adaptive law between two frames.
+    """The adaptive law between a measurement frame and a command frame.
 
     Args:
-        wire: How frames are read and written.
+        wire: Format of the frames.
         law: Parameters and gains.
-        reference: What the body shall do from tick 0 on.
+        reference: Reference from tick 0 on.
         period: Time between ticks [s].
 
     Attributes:
         tick_index: k of the last measurement answered; −1 before the first.
         counter: Its counter.
         voltages: The last u before quantization [V]. Shape (actuators,).
-        motion: What it follows; may be told to follow something else between two ticks.
+        motion: The reference as followed; may be changed between two ticks.
         refused: Malformed measurement frames so far.
-        failed: Whether the law has given no number.
-        invalid: Measurements that said "no valid value" so far.
+        failed: Whether the law has returned NaN.
+        invalid: Measurements with the code "no valid value" so far.
 
     Raises:
         ValueError: The law's B cannot be inverted.
@@ -106,7 +106,7 @@ class Controller:
         self._counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), self._counters)
         self._sender = Sender(wire.transmit.command, heartbeat, self._counters)
-        self._hears_silence = wire.transmit.measurement == "on_change"
+        self._silence_allowed = wire.transmit.measurement == "on_change"
         self._held: Sequence[float] | None  # codes of the last measurement
         self._voltage_codes: Sequence[float] | None
         self._read, self._write = wire.measurement.unpack, wire.command.pack
@@ -118,18 +118,18 @@ class Controller:
         """Answer a measurement.
 
         Args:
-            frame: The newest measurement frame; SILENCE if the plant sent none because its levels are what they were;
-                None if none came since the last tick.
+            frame: The newest measurement frame; SILENCE if the plant sent none because its levels have not changed;
+                None if none was received since the last tick.
             k: Tick index; the law's time is k·period.
 
         Returns:
-            The command frame that answers it; SILENCE if there is none to send, because it would say what the last one
-            said; None if there is nothing to answer, which includes malformed bytes. A measurement without a valid
-            value is answered by a command without one: the plant then goes to 0 V.
+            The command frame; SILENCE if it would repeat the last one and need not be sent; None if there is nothing to
+            answer, which includes malformed bytes. A measurement without a valid value is answered by a command without
+            one: the plant then goes to 0 V.
         """
         if frame is None:
             return None
-        if frame == SILENCE and self._hears_silence and self._held is not None:
+        if frame == SILENCE and self._silence_allowed and self._held is not None:
             return self.answer(k % self._counters, self._held, k)
         read = self._read(frame)
         if read is None:
@@ -139,7 +139,7 @@ class Controller:
         return self.answer(*read, k)
 
     def hold(self, frame: bytes) -> bool:
-        """Go on with the levels of a measurement that came after its tick was over. False if it is malformed."""
+        """Hold the levels of a measurement that was received after its tick was over. False if it is malformed."""
         read = self._read(frame)
         if read is None:
             self.refused += 1
@@ -151,13 +151,13 @@ class Controller:
         """The command frame that answers a measurement with this counter and these codes; see `tick`."""
         voltages = self.compute(counter, codes, k)
         if voltages is None:
-            said = self._no_command
+            command = self._no_command
         else:
-            said = self._voltage_codes = [encode(u) for encode, u in zip(self._encode, voltages, strict=True)]
-        return self._write(counter, said) if self._sender.due(k, said) else SILENCE
+            command = self._voltage_codes = [encode(u) for encode, u in zip(self._encode, voltages, strict=True)]
+        return self._write(counter, command) if self._sender.due(k, command) else SILENCE
 
     def compute(self, counter: int, codes: Sequence[float], k: int) -> list[float] | None:
-        """What `answer` sends, before quantization [V]; None if that has no valid value. Shape (actuators,)."""
+        """The voltages of `answer` before quantization [V]; None if there is no valid value. Shape (actuators,)."""
         attitude, rate = self._attitude_level, self._rate_level
         x, y, z = attitude(codes[0]), attitude(codes[1]), attitude(codes[2])
         wx, wy, wz = rate(codes[3]), rate(codes[4]), rate(codes[5])
@@ -180,30 +180,30 @@ class Controller:
         return voltages
 
     def attitude_of(self, frame: bytes) -> Quaternion | None:
-        """The attitude that a measurement says; None if it is malformed or says no valid value."""
+        """The attitude in a measurement; None if it is malformed or has no valid value."""
         read = self._read(frame)
-        codes = read[1] if read is not None else self._held if frame == SILENCE and self._hears_silence else None
+        codes = read[1] if read is not None else self._held if frame == SILENCE and self._silence_allowed else None
         if codes is None:
             return None
         x, y, z = (self._attitude_level(code) for code in codes[:3])
         return received_quaternion(x, y, z, IDENTITY) if x + y + z == x + y + z else None
 
     def set_gains(self, gains: Gains) -> None:
-        """Use other gains from the next tick on; what is None stays as it is."""
+        """Use other gains from the next tick on; None leaves a gain unchanged."""
         for name in ("C1", "C2", "Gamma"):
             if (diagonal := getattr(gains, name)) is not None:
                 self._law.inputs[name][:] = memoryview(array("d", diagonal))
 
     def apply(self, change: Change) -> None:
-        """Follow a change as it was told; the next tick must be its first, or later."""
+        """Apply a recorded change; the next tick must be its first, or later."""
         if change.gains is not None:
             self.set_gains(change.gains)
         self.motion.change(change, self.period)
 
     @property
     def state(self) -> ControllerSnapshot:
-        """All that the next tick goes by, besides reference and gains."""
-        said, at = self._sender.memory
+        """State for the next tick, besides reference and gains."""
+        sent_codes, sent_tick = self._sender.memory
         held, encoded = self._held, self._voltage_codes
         return ControllerSnapshot(
             attitude=self.attitude,
@@ -211,12 +211,12 @@ class Controller:
             damping_estimate=self.damping_estimate,
             held=None if held is None else tuple(held),
             voltage_codes=None if encoded is None else tuple(encoded),
-            sent_codes=None if said is None else tuple(said),
-            sent_tick=at,
+            sent_codes=None if sent_codes is None else tuple(sent_codes),
+            sent_tick=sent_tick,
         )
 
     def restore(self, state: ControllerSnapshot) -> None:
-        """Go on, bit for bit, as the controller that had this state, given the same reference and gains."""
+        """Continue bit for bit from this state, given the same reference and gains."""
         self._last[:] = memoryview(array("d", state.attitude))
         self._sign[0] = state.sign
         self._theta[:] = memoryview(array("d", state.damping_estimate))
@@ -234,7 +234,7 @@ class Controller:
         return Gains.model_validate({name: tuple(self._law.inputs[name]) for name in ("C1", "C2", "Gamma")})
 
     def _choose_sign(self) -> None:
-        """z₁₊ or z₁₋ by the sign of η̃ at the first measurement, for good (Assumption 3)."""
+        """Choose z₁₊ or z₁₋ by the sign of η̃ at the first measurement, once per session (Assumption 3)."""
         self._sign[0] = 1.0
         self._law()
         self._sign[0] = 1.0 if self._eta_e[0] >= 0 else -1.0

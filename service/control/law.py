@@ -16,8 +16,8 @@
 
 The equations without quantization, (C.16)–(C.23), are the same expressions with unquantized arguments; where the paper
 repeats an equation for its quantized form, the line carries both numbers. That (C.25) follows from them is proved in
-tests/service/test_law.py. What arrives here is within the bounds (C.28) and (C.29) of the truth: its errors are (C.31),
-(C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the bound (C.30).
+tests/service/control/test_law.py. Received values are within the bounds (C.28) and (C.29) of the true ones; errors are
+(C.31), (C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the bound (C.30).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Diagonal = Annotated[tuple[float, float, float], AfterValidator(_positive)]
 
 
 class LawSettings(BaseModel):
-    """What the controller believes of the plant, and its gains. The default is the paper's experiment, Table C.1."""
+    """Model of the plant and gains of the law. The default is the paper's experiment, Table C.1."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -66,7 +66,7 @@ class LawSettings(BaseModel):
     damping_estimate: tuple[float, float, float] = Field(
         default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
     )
-    damping_bound: float = Field(default=0.05, gt=0, description="k_θ: ‖θ‖ is known to be below this [N·m·s/rad]")
+    damping_bound: float = Field(default=0.05, gt=0, description="k_θ: ‖θ‖ is assumed to be below this [N·m·s/rad]")
 
     @model_validator(mode="after")
     def _estimate_within_bound(self) -> LawSettings:
@@ -77,7 +77,7 @@ class LawSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Law:
-    """The law's expressions, each as named in the module's table, and the symbols they are made of."""
+    """The law's expressions, each as named in the module's table, and their symbols."""
 
     q: ca.SX
     omega: ca.SX
@@ -122,7 +122,7 @@ def build_law(p: LawSettings) -> Law:
     eta_e = eta_d * eta + ca.dot(eps_d, eps)  # (C.16), (C.32)
     eps_e = eta_d * eps - eta * eps_d - S(eps_d) @ eps  # (C.16), (C.32)
     R_ib = R(q).T  # (C.48): inertial to body, of the attitude as received
-    omega_e = omega - R_ib @ omega_d  # (C.18), (C.47); it moves e as (C.17) says
+    omega_e = omega - R_ib @ omega_d  # (C.18), (C.47); e moves by (C.17)
 
     z1 = ca.vertcat(1 - s * eta_e, eps_e)  # (C.19), (C.39)
     G = ca.vertcat(s * eps_e.T, eta_e * I + S(eps_e)).T  # (C.21), (C.41)
@@ -146,7 +146,7 @@ def build_law(p: LawSettings) -> Law:
 def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
     """Proj{τ} of (C.38): the smooth projection of Krstić, Kanellakopoulos and Kokotović onto ‖θ̂‖ ≤ k_θ (Remark 5).
 
-    Inside ‖θ̂‖ ≤ 0.95 k_θ it is τ itself; from there to k_θ it takes away, more and more, what points outwards.
+    For ‖θ̂‖ ≤ 0.95 k_θ it is τ itself; from there to k_θ a growing share of the outward component is removed.
 
     Args:
         tau: Γ Φ z₂, the update without projection. Shape (3,).
@@ -166,7 +166,7 @@ def received(eps: ca.SX, last: ca.SX) -> ca.SX:
 
     Args:
         eps: ε. Shape (3,).
-        last: The q^Q before. Shape (4,).
+        last: The previous q^Q. Shape (4,).
     """
     square = ca.dot(eps, eps)
     eta = ca.sqrt(ca.fmax(0, 1 - square))  # (C.11)
@@ -175,12 +175,12 @@ def received(eps: ca.SX, last: ca.SX) -> ca.SX:
 
 
 class Steps(NamedTuple):
-    """A tick of the law in four parts, so that only two of them go from tick to tick.
+    """A tick of the law in four parts; two carry state from tick to tick, the others can be evaluated for many ticks.
 
     Attributes:
-        attitude: last, eps ↦ q. From tick to tick: `last` is the q before.
+        attitude: last, eps ↦ q. Carries state: `last` is the previous q.
         adaptation: q, omega, q_d, omega_d, s, C1, C2, Gamma ↦ tau.
-        estimate: theta, tau, Gamma ↦ theta_next. From tick to tick.
+        estimate: theta, tau, Gamma ↦ theta_next. Carries state.
         command: q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2 ↦ u, eta_e, eps_e, omega_e.
     """
 
@@ -191,7 +191,7 @@ class Steps(NamedTuple):
 
 
 def law_steps(p: LawSettings, period: float) -> Steps:
-    """The law's parts, with θ̂ carried over a period by Euler's rule.
+    """The law's parts, with θ̂ integrated over a period by Euler's rule.
 
     Args:
         p: Parameters; the gains are inputs.
@@ -222,10 +222,10 @@ _SIZES: Final = {"eps": 3, "omega": 3, "q_d": 4, "omega_d": 3, "omega_d_dot": 3,
 
 
 def law_function(p: LawSettings, period: float) -> ca.Function:
-    """The law as the loop evaluates it: one tick. Raises as `law_steps` does.
+    """One tick of the law, for the loop. Raises as `law_steps` does.
 
-    Inputs: last, theta, and eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma. `last` is the q before, which the
-    next q is nearest to. Outputs: q, u, theta_next, eta_e, eps_e, omega_e.
+    Inputs: last, theta, and eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma. `last` is the
+    previous q; of ±q the nearer one is taken. Outputs: q, u, theta_next, eta_e, eps_e, omega_e.
     """
     steps = law_steps(p, period)
     last, theta = ca.SX.sym("last", 4), ca.SX.sym("theta", 3)
@@ -245,7 +245,7 @@ def law_function(p: LawSettings, period: float) -> ca.Function:
 
 
 def law_of_many(p: LawSettings, period: float, rows: int) -> ca.Function:
-    """The law as a reader of logs evaluates it: many ticks in a row. Raises as `law_steps` does.
+    """Many consecutive ticks of the law, for readers of logs. Raises as `law_steps` does.
 
     Args:
         p: Parameters; the gains are inputs.
@@ -254,7 +254,7 @@ def law_of_many(p: LawSettings, period: float, rows: int) -> ca.Function:
 
     Returns:
         A function with the inputs and outputs of `law_function`. `last` and `theta` are those before the first tick;
-        everything else has a row a tick, shape (rows, …). One output more: theta_before, the θ̂ that each u is made of.
+        all others have a row per tick, shape (rows, …). One more output: theta_before, the θ̂ of each u.
     """
     steps = law_steps(p, period)
     last, first = ca.MX.sym("last", 4), ca.MX.sym("theta", 3)

@@ -1,9 +1,9 @@
-"""What the body shall do: Euler angles over time, and what the law needs of them.
+"""Reference: Euler angles over time, and the q_d, ω_d, ω̇_d that the law uses.
 
-Every reference is a row of pieces, and every piece a quintic plus a sinusoid, of which either may be zero. One CasADi
-function evaluates any piece: the desired quaternion, the angular velocity of (C.12) in the inertial frame and its
-derivative follow by CasADi's own derivatives, so they are exact and agree. Another reference is joined to the one
-before by a quintic piece: angle, rate and acceleration never jump, however often somebody changes his mind.
+Every reference is a sequence of pieces, and every piece a quintic plus a sinusoid, of which either may be zero. One
+CasADi function evaluates any piece: the desired quaternion, the angular velocity of (C.12) in the inertial frame and
+its derivative follow by CasADi's own derivatives, so they are exact and consistent. A new reference is joined to the
+present one by a quintic piece, so angle, rate and acceleration never jump, however often the reference changes.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ Floats = NDArray[np.float64]
 
 POWERS: Final = 6
 _SAMPLES: Final = 65
-"""Of a quintic, whose rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
+"""Samples of a quintic. Its rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
 _TURNS: Final = 8
 _MOST_SAMPLES: Final = 100_000
 _SLOWER: Final = 1.05
 _TRIES: Final = 8
 _LONGEST_S: Final = 3600.0
-"""A way that would take longer begins too fast for any: it is tried again with an ease."""
+"""Longest approach tried [s]. One that would take longer begins too fast for any; it is tried again with an ease."""
 
 
 class FollowError(AeroloopError):
-    """A reference that the vehicle must not follow; one line that says what would do."""
+    """A reference that the vehicle must not follow; one line with the limit and a remedy."""
 
 
 class Limits(NamedTuple):
-    """How far a reference may go.
+    """Limits of a reference.
 
     Attributes:
         rate: Largest angular velocity [rad/s].
@@ -65,10 +65,10 @@ class Angles(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """Pieces in a row, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last goes on for ever.
+    """Consecutive pieces, each Σ cₙ τⁿ + amplitude · sin(frequency · τ) with τ = t − start; the last never ends.
 
     Attributes:
-        starts: When each begins [s], rising. Shape (n,).
+        starts: Start time of each [s], increasing. Shape (n,).
         quintic: c₀…c₅ of roll, pitch, yaw [rad/sᵖ]. Shape (n, 6, 3).
         amplitude: Of roll, pitch, yaw [rad]. Shape (n, 3).
         frequency: Of roll, pitch, yaw [rad/s]. Shape (n, 3).
@@ -81,7 +81,7 @@ class Plan:
 
     @classmethod
     def of(cls, reference: Reference) -> Plan:
-        """The plan of a reference whose time begins at 0. A stream holds 0 until it is told more."""
+        """The plan of a reference that begins at t = 0. A stream holds 0 until its first set-point."""
         if isinstance(reference, Points):
             return cls._through(np.array(reference.times), np.radians(np.array(reference.attitudes)))
         still = cls._polynomial(np.zeros(1), np.zeros((1, POWERS, 3)))
@@ -98,7 +98,7 @@ class Plan:
 
     @classmethod
     def _through(cls, times: Floats, angles: Floats) -> Plan:
-        """Through points, with the rates and accelerations of their differences; at rest at both ends."""
+        """A plan through points, with rates and accelerations by differences; at rest at both ends."""
         rates = np.gradient(angles, times, axis=0)
         rates[0] = rates[-1] = 0.0
         accelerations = np.gradient(rates, times, axis=0)
@@ -110,9 +110,10 @@ class Plan:
         return cls._polynomial(times, np.concatenate([join(here, there, np.diff(times)), last]))
 
     def joined(self, here: Angles, t: float, within_s: float, ease_s: float = 0.0) -> Plan:
-        """This plan from t + ease_s + within_s on, reached by a quintic from where one is at t; shapes (1, 3).
+        """This plan from t + ease_s + within_s on, reached by a quintic from the state at t; shapes (1, 3).
 
-        With `ease_s`, the acceleration of now is let go first: a long way that began with it would only get faster.
+        With `ease_s`, the present acceleration is first reduced to 0: a long approach that began with it would only get
+        faster.
         """
         if ease_s:
             eased = Angles(
@@ -133,7 +134,7 @@ class Plan:
         return Plan(*(np.concatenate([getattr(p, name) for p in (self, later)]) for name in self.__annotations__))
 
     def piece(self, t: float) -> int:
-        """SessionKey piece time t [s] lies in."""
+        """Index of the piece that contains time t [s]."""
         return max(0, int(np.searchsorted(self.starts, t, side="right")) - 1)
 
     def at(self, tau: Floats) -> Angles:
@@ -152,7 +153,7 @@ class Plan:
         )
 
     def samples(self) -> Angles:
-        """Every piece at enough times to know its extremes, one after another. Shapes (n, 3)."""
+        """All pieces, sampled densely enough for their extremes, concatenated. Shapes (n, 3)."""
         lengths = np.append(np.diff(self.starts), 0.0)
         every = Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, _SAMPLES))))
         if not self.frequency[-1].any():
@@ -160,7 +161,7 @@ class Plan:
         return Angles(*(np.concatenate(both) for both in zip(every, self._swing(), strict=True)))
 
     def _swing(self) -> Angles:
-        """The last piece's sinusoid over some turns of its slowest axis; its bounds where that would take too many."""
+        """The last piece's sinusoid over `_TURNS` periods of its slowest axis; its bounds if too many samples."""
         moving = self.frequency[-1][self.frequency[-1] > 0]
         count = int(_TURNS * (_SAMPLES - 1) * moving.max() / moving.min()) + 1
         if count <= _MOST_SAMPLES:
@@ -180,16 +181,16 @@ class Plan:
 
     def check(self, limits: Limits) -> None:
         """Raise FollowError if it goes beyond the limits."""
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is too fast, too
+        with np.errstate(over="ignore", invalid="ignore"):  # a rate that is not finite counts as too fast
             fastest = self.fastest()
         if not fastest <= limits.rate:
             raise FollowError(
                 f"that would turn at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
-                f"{limits.rate:g} rad/s; allow more time, or ask for less"
+                f"{limits.rate:g} rad/s; allow more time, or a smaller motion"
             )
         angle = self.samples().angle
         tilt = acos(max(-1.0, float((np.cos(angle[:, 0]) * np.cos(angle[:, 1])).min())))
-        # A swing beyond the limit passes through it, though its ends may be level again.
+        # A sinusoid with an amplitude beyond the limit passes through it, though its extremes may be level again.
         swings = (np.abs(self.amplitude) * (self.frequency > 0))[:, :2]
         tilt = max(tilt, float(np.minimum(swings, pi).max()))
         if tilt > limits.tilt:
@@ -198,11 +199,11 @@ class Plan:
                 f"{degrees(limits.tilt):g}°"
             )
         if not limits.rolls and np.abs(angle[:, 0]).max() > 0:
-            raise FollowError("this vehicle has no motor that rolls it: give it a roll of 0")
+            raise FollowError("this vehicle has no motor that rolls it: set its roll to 0")
 
 
 def join(here: Angles, there: Angles, length: Floats) -> Floats:
-    """The quintics that lead from states to states, of shape (n, 3), in `length` seconds, of shape (n,).
+    """The quintics from states `here` to states `there`, of shape (n, 3), in `length` seconds, of shape (n,).
 
     Returns:
         Their coefficients. Shape (n, 6, 3).
@@ -250,19 +251,19 @@ def reference_function() -> ca.Function:
 
 
 def at_rest(attitude: Vector) -> Angles:
-    """The state of a body that rests at roll, pitch, yaw [deg]. Shapes (1, 3)."""
+    """The state of a body at rest at roll, pitch, yaw [deg]. Shapes (1, 3)."""
     return Angles(np.radians(np.array([attitude])), np.zeros((1, 3)), np.zeros((1, 3)))
 
 
 class Motion:
-    """A reference as the loop follows it.
+    """The reference as the loop evaluates it, tick by tick.
 
     Args:
         reference: What to follow from t = 0 on.
-        shared: Memory for q_d, omega_d and omega_d_dot, where whoever uses them reads them.
+        shared: Memory for the outputs q_d, omega_d and omega_d_dot; own memory if None.
 
     Attributes:
-        plan: What it follows now.
+        plan: The plan followed now.
     """
 
     def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
@@ -272,7 +273,7 @@ class Motion:
         self._load(0)
 
     def at(self, t: float) -> None:
-        """Write what is desired at time t [s]; t does not fall from one call to the next."""
+        """Write the desired motion at time t [s]; t never decreases between calls."""
         if t >= self._until:
             self._load(self.plan.piece(t))
         self._time[0] = t
@@ -288,24 +289,24 @@ class Motion:
         ease_s: float = 0.0,
         start: Vector | None = None,
     ) -> None:
-        """Follow another plan, reached from the present one within some time; its own time begins then.
+        """Follow another plan, reached from the present one after `within_s`; its own time begins then.
 
         Args:
             target: What to follow.
             t: The time now [s].
-            within_s: When to have reached it [s]; 0 jumps.
-            limits: How far the way there may go; None for no limits.
-            ease_s: Time to let the acceleration of now go before [s].
+            within_s: Time to reach it [s]; 0 jumps.
+            limits: Limits of the approach; None for no limits.
+            ease_s: Time before that to reduce the present acceleration to 0 [s].
             start: Roll, pitch, yaw to begin from, at rest, instead of the present plan [deg].
 
         Raises:
-            FollowError: It goes further; nothing has changed then.
+            FollowError: The approach exceeds the limits; the present plan stays.
         """
         here = self._here(t) if start is None else at_rest(start)
         plan = target.joined(here, t, within_s, ease_s)
         if limits is not None and within_s:
-            way = plan.piece(t + ease_s + within_s) + 1  # pieces, up to the target's first
-            replace(plan, **{name: getattr(plan, name)[:way] for name in plan.__annotations__}).check(limits)
+            count = plan.piece(t + ease_s + within_s) + 1  # pieces, up to the target's first
+            replace(plan, **{name: getattr(plan, name)[:count] for name in plan.__annotations__}).check(limits)
         self.plan = plan
         self._load(plan.piece(t))
 
@@ -322,7 +323,7 @@ class Motion:
         return w, x, y, z
 
     def rest(self, t: float, within_s: float) -> Hold:
-        """Where one comes to rest within some time, braking evenly."""
+        """The attitude reached when braking evenly to rest within `within_s` [s]."""
         here = self._here(t)
         roll, pitch, yaw = (degrees(float(angle)) for angle in here.angle[0] + here.rate[0] * within_s / 2)
         return Hold(attitude=(roll, pitch, yaw))
@@ -330,7 +331,7 @@ class Motion:
     def time_to_reach(
         self, target: Plan, t: float, within_s: float, limits: Limits, start: Vector | None = None
     ) -> tuple[float, float]:
-        """How to reach a set-point within the rate limit: `within_s`, at least as given, and `ease_s` [s]."""
+        """The times that keep an approach within the rate limit: `within_s`, at least as given, and `ease_s` [s]."""
         here = self._here(t) if start is None else at_rest(start)
         least = within_s
         for ease_s in (0.0, least):
@@ -352,6 +353,6 @@ class Motion:
         plan, inputs = self.plan, self._function.inputs
         self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else float("inf")
         inputs["start"][0] = plan.starts[i]
-        inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # a row a power here is a column a power there
+        inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # CasADi is column-major
         inputs["amplitude"][:] = memoryview(plan.amplitude[i].copy())
         inputs["frequency"][:] = memoryview(plan.frequency[i].copy())

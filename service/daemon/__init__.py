@@ -1,1 +1,1 @@
-"""Daemon."""
+"""The controller process, and what both daemons share: choice of the plant end and configuration reload."""

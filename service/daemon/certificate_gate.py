@@ -1,9 +1,9 @@
-"""What the theorem promises of a controller as it runs: told when it changes, and asked for before it drives.
+"""Certificate gate: publishes the theorem's verdict on the running controller, and refuses what must hold and does not.
 
-With `controller.require_certificate` a controller of which the theorem does not hold claims no vehicle, and an
-operator's change after which it would not hold is refused. A certificate takes some 10 ms, and 200 ms where remedies
-are sought, so there it is computed in the thread of whoever asks for a change, and kept; the loop only looks it up.
-Otherwise it is computed in a thread of its own once the change is made, and counts as not holding until then.
+With `controller.require_certificate` the controller claims no vehicle unless the theorem holds, and an operator's
+change after which it would not hold is refused. A certificate takes some 10 ms, and 200 ms with remedies, so it is
+computed in the thread of the operator's query and cached; the loop only looks it up. Without that setting it is
+computed in a thread of its own after the change, and counts as not holding until then.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from aeroloop.service.theorem.certificate import Certificate, certify
 from aeroloop.service.theorem.extremes import BoundlessError
 
 KEPT: Final = 8
-"""Verdicts that are kept: a few for what runs, and for changes that are being asked for."""
+"""Cached verdicts: a few for the running configuration, and for pending changes."""
 
 GIVE_WAY_S: Final = 1e-4
-"""How long a thread that computes a certificate keeps the loop waiting, each time the loop has something to do [s]."""
+"""Longest that a thread computing a certificate delays the loop, each time the loop becomes ready [s]."""
 
 
 class UncertifiedError(AeroloopError):
-    """A change after which the theorem would not hold, where it must; one line that says why, and what would do."""
+    """A change after which the theorem would not hold, where it must; one line with the reason and the remedies."""
 
 
 class Verdict(NamedTuple):
-    """What can be said of gains and a reference.
+    """Whether gains and a reference satisfy the theorem.
 
     Attributes:
-        certificate: None of a stream, of which nothing can be promised.
-        text: In a sentence, but for its full stop.
-        helps: What would help where it does not hold, to be put behind it.
+        certificate: None of a stream, which cannot be certified.
+        text: The verdict in a sentence, without full stop.
+        helps: Remedies where it does not hold, to be appended to the text.
     """
 
     certificate: Certificate | None
@@ -56,7 +56,7 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, certificate: Certificate) -> Verdict:
-        """The verdict that a certificate is."""
+        """The verdict of a certificate."""
         text = certificate.verdict.rstrip(".")
         if certificate.holds:
             return cls(certificate, text)
@@ -65,17 +65,17 @@ class Verdict(NamedTuple):
 
 
 class CertificateGate:
-    """What the theorem promises of one controller.
+    """Certificates of one controller: computed, cached, published and required.
 
     Args:
         role: Its presence on the network.
         wire: Its quantizers.
-        law: Its model, and the gains to begin with.
-        reference: The reference to begin with.
+        law: Its model and initial gains.
+        reference: Its initial reference.
         settings: How a session begins, and whether the theorem must hold.
 
     Attributes:
-        required: Whether it must.
+        required: Whether the theorem must hold.
     """
 
     def __init__(
@@ -86,32 +86,32 @@ class CertificateGate:
         self._law = law
         self._settings = settings
         self.required = settings.require_certificate
-        self._weighed: deque[tuple[Gains, Reference, Verdict]] = deque(maxlen=KEPT)
+        self._cache: deque[tuple[Gains, Reference, Verdict]] = deque(maxlen=KEPT)
         self._now = gains_of(law), reference
         self._verdict: Verdict | None = self.weigh(*self._now)
-        self._told: str | None = None
+        self._published = ""
 
     # ── in any thread ──
 
     def weigh(self, gains: Gains, reference: Reference) -> Verdict:
-        """The verdict on gains and a reference; at once if they were weighed lately."""
-        if (known := self._known(gains, reference)) is not None:
-            return known
+        """The verdict on gains and a reference, from the cache if there."""
+        if (cached := self._cached(gains, reference)) is not None:
+            return cached
         law = self._law.model_copy(update={name: value for name, value in gains if value is not None})
         try:
             with _giving_way():
                 verdict = Verdict.of(certify(self._wire, law, reference, self._settings))
         except BoundlessError as error:
             verdict = Verdict(None, f"nothing is certified: {error}")
-        self._weighed.append((gains, reference, verdict))
+        self._cache.append((gains, reference, verdict))
         return verdict
 
     def admit(self, gains: Gains, reference: Reference, *, required: bool | None = None) -> None:
-        """Refuse what is asked for if it must be certified and is not.
+        """Refuse a change that must be certified and is not.
 
         Args:
             gains: All three.
-            reference: What would be followed.
+            reference: The reference after the change.
             required: Whether the theorem must hold; as configured if None.
 
         Raises:
@@ -132,57 +132,54 @@ class CertificateGate:
 
     @property
     def blocks(self) -> str | None:
-        """Why no vehicle is to be claimed; None if nothing forbids it."""
+        """Why no vehicle is claimed; None if claims are allowed."""
         if not self.required or (self._verdict is not None and self._verdict.holds):
             return None
-        why = "it is not known yet whether the theorem holds" if self._verdict is None else self._verdict.text
+        why = "whether the theorem holds is not known yet" if self._verdict is None else self._verdict.text
         return f"claims no vehicle, as controller.require_certificate is set: {why}"
 
     def take(self, gains: Gains, reference: Reference) -> None:
-        """This is in force from now on."""
+        """Take the gains and the reference now in force, and publish their verdict."""
         self._now = gains, reference
-        self._verdict = self._known(gains, reference)
+        self._verdict = self._cached(gains, reference)
         if self._verdict is not None:
             self.publish()
             return
 
         def weigh() -> None:
             verdict = self.weigh(gains, reference)
-            self._role.later(lambda: self._stand_by(gains, reference, verdict))
+            self._role.later(lambda: self._take_verdict(gains, reference, verdict))
 
         threading.Thread(target=weigh, name="weigh", daemon=True).start()
 
     def publish(self) -> None:
-        """Tell the verdict, if it is not what was told last."""
+        """Publish the verdict, if it differs from the last one published."""
         if self._verdict is None:
             return
-        blocks, told = self.blocks, self._told
-        self._told = (blocks or self._verdict.text) + self._verdict.helps
-        if self._told != told:
-            kind: EventKind = "fault" if blocks else "started" if told is None else "changed"
-            self._role.event(kind, self._told)
+        blocks, before = self.blocks, self._published
+        self._published = (blocks or self._verdict.text) + self._verdict.helps
+        if self._published != before:
+            kind: EventKind = "fault" if blocks else "changed" if before else "started"
+            self._role.event(kind, self._published)
 
-    def _stand_by(self, gains: Gains, reference: Reference, verdict: Verdict) -> None:
+    def _take_verdict(self, gains: Gains, reference: Reference, verdict: Verdict) -> None:
         if self._now == (gains, reference):
             self._verdict = verdict
             self.publish()
 
-    def _known(self, gains: Gains, reference: Reference) -> Verdict | None:
-        for weighed in tuple(self._weighed):
-            if weighed[:2] == (gains, reference):
-                return weighed[2]
-        return None
+    def _cached(self, gains: Gains, reference: Reference) -> Verdict | None:
+        return next((entry[2] for entry in tuple(self._cache) if entry[:2] == (gains, reference)), None)
 
 
 @contextmanager
 def _giving_way() -> Iterator[None]:
-    """The interpreter changes threads more often meanwhile, or a loop beside would miss a dozen ticks at once."""
-    usual = sys.getswitchinterval()
+    """Switch threads more often meanwhile: otherwise the loop would miss a dozen ticks at once."""
+    interval = sys.getswitchinterval()
     sys.setswitchinterval(GIVE_WAY_S)
     try:
         yield
     finally:
-        sys.setswitchinterval(usual)
+        sys.setswitchinterval(interval)
 
 
 def gains_of(law: LawSettings) -> Gains:

@@ -1,4 +1,4 @@
-"""How a controller comes by a vehicle, and gives it back: the questions it puts to the plant."""
+"""Claim protocol, controller side: requests a session, releases it, reports refusals."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ ANSWER_WAIT_S: Final = 1.0
 
 
 class SessionLostError(AeroloopError):
-    """A run of a given duration lost its session before its end; to claim again would start the law's time anew."""
+    """A run of a given duration lost its session before its end. A new claim would restart the law's time at 0."""
 
 
 class ClaimClient:
-    """Asks for one vehicle.
+    """Claims one vehicle.
 
     Args:
-        role: Who asks; its name must be unique, because the plant knows its holder by it.
+        role: The controller's; its name must be unique, because the plant identifies its holder by it.
         loop: The grid.
-        wire: How frames are read and written.
+        wire: Format of the frames.
         auto_arm: Whether to arm the plant with every claim.
 
     Attributes:
         auto_arm: As given; may change.
-        session: The session it has, or None.
+        session: The granted session, or None.
     """
 
     def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
@@ -48,11 +48,11 @@ class ClaimClient:
         self._loop = loop
         self._wire = wire
         self.auto_arm = auto_arm
-        self._told = ""
+        self._refusal = ""
         self.session: str | None = None
 
     def claim(self) -> ZenohLink | None:
-        """Ask for the vehicle. The link is there before the question, so that the first measurement is not lost."""
+        """Claim the vehicle. The link is opened before the query, so that the first measurement is not lost."""
         role = self._role
         claim = Claim(
             controller=role.name,
@@ -69,18 +69,18 @@ class ClaimClient:
             lossless=self._loop.lockstep,
             mailbox=Mailbox(depth=MAILBOX if self._wire.transmit.measurement == "on_change" else 1),
         )
-        answer = self._ask(claim)
+        answer = self._query(claim)
         if isinstance(answer, Grant):
-            self.session, self._told = claim.session, ""
+            self.session, self._refusal = claim.session, ""
             return link
         link.close()
-        if answer is not None and answer.reason != self._told:
-            self._told = answer.reason
+        if answer is not None and answer.reason != self._refusal:
+            self._refusal = answer.reason
             role.event("refused", f"{role.vehicle} refuses: {answer.reason}", claim.session)
         return None
 
     def release(self) -> None:
-        """Give the session back, whether or not the plant still is there to take it."""
+        """Release the session, whether or not the plant still answers."""
         if self.session is None:
             return
         release = Release(session=self.session)
@@ -92,8 +92,8 @@ class ClaimClient:
             log.warning("controller: could not release the session: %s", error)
         self.session = None
 
-    def _ask(self, claim: Claim) -> Grant | Refusal | None:
-        """The plant's answer, or None if there is no plant, or none that answers in time."""
+    def _query(self, claim: Claim) -> Grant | Refusal | None:
+        """The plant's answer; None if no plant answers in time."""
         key = topics.key("claim", self._role.vehicle)
         for reply in self._role.zenoh.get(key, payload=claim.encode(), timeout=ANSWER_WAIT_S):
             if reply.ok is None:
@@ -112,5 +112,5 @@ class ClaimClient:
 
 
 def controller_name() -> str:
-    """A name for this controller that no other has: host names repeat, so a few random digits follow the process id."""
+    """A unique name for this controller. Process ids repeat between hosts, so a few random digits follow."""
     return f"controller-{os.getpid()}-{uuid.uuid4().hex[:4]}"

@@ -1,9 +1,9 @@
-"""The controller process: claim a vehicle, then wait → tick → send → account, until told to stop.
+"""Controller process: claims a vehicle, then waits → ticks → sends → accounts, until it is stopped.
 
-What a tick is, tick_source.py says; in lockstep the very same loop runs as fast as the plant asks. Whenever the daemon
-has no session it claims again, four times a second, so either end may start first and either may be restarted. When
-measurements stop coming for longer than `stale_s` it gives the session up and sends nothing more; the plant's watchdog
-does the rest. Every tick is a row of the trace, which is published after the command.
+`tick_source.py` defines a tick; in lockstep the same loop runs as fast as the plant sends. Without a session the daemon
+claims four times a second, so either end may start first and either may be restarted. After `stale_s` without a
+measurement it gives the session up and sends nothing more; the plant's watchdog does the rest. Every tick is a row of
+the trace, which is published after the command.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from aeroloop.service.settings import ControllerSettings
 STATUS_PERIOD_NS: Final = 1_000_000_000
 CLAIM_PERIOD_S: Final = 0.25
 LOCKSTEP_PATIENCE_S: Final = 2.0
-"""In lockstep a plant may take its time, but not to begin."""
+"""Longest wait for the first measurement in lockstep [s]; between steps a plant may pause for any time."""
 WAIT_S: Final = 0.02
-"""How often to look whether the session still stands while nothing comes [s]."""
+"""How often the session is checked while nothing is received [s]."""
 STALL_TICKS: Final = 10
-"""So many ticks missed in a row are worth a warning."""
+"""Ticks missed in a row that cause a warning."""
 
 State, Trigger = ControllerState, ControllerTrigger
 
@@ -53,12 +53,12 @@ class Daemon:
     """The controller end as a process.
 
     Args:
-        role: Its presence on the network; its name must be unique, because the plant knows its holder by it.
+        role: Its presence on the network; its name must be unique, because the plant identifies its holder by it.
         loop: The grid.
-        wire: How frames are read and written.
+        wire: Format of the frames.
         law: Parameters and gains.
-        reference: What the body shall do.
-        settings: How it behaves.
+        reference: The initial reference.
+        settings: Its own settings.
 
     Raises:
         ValueError: The law's B cannot be inverted.
@@ -79,11 +79,11 @@ class Daemon:
         self._settings = settings
         self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
-        self._claimant = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
-        self._assurance = CertificateGate(role, wire, law, reference, settings)
+        self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
+        self._gate = CertificateGate(role, wire, law, reference, settings)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
-        self._live = OperatorChanges(
-            role, law, reference, settings, self._trace, self._assurance, rolls=wire.actuators == 3
+        self._changes = OperatorChanges(
+            role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators == 3
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
@@ -101,18 +101,18 @@ class Daemon:
         self._take(settings)
 
     def run(self) -> None:
-        """Run until the role is told to stop or `duration_s` of the law's time are over."""
+        """Run until the role's `stop` is set or `duration_s` of the law's time is over."""
         if not self._loop.lockstep:
             self._notes = prepare_process(self._loop)
             self._timing = LoopTiming()
         role, loop = self._role, self._loop
         role.declare("telemetry", self._settings.telemetry_rate_hz)
         role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
-        self._live.serve()
+        self._changes.serve()
         role.serve("stand_down", Ask, lambda _: self._stand_down)
         role.serve("recall", Ask, lambda _: self._recall)
         role.watch_tokens(self._token)
-        role.zenoh.declare_subscriber(topics.key("status", role.vehicle, role="plant"), self._hear_plant)
+        role.zenoh.declare_subscriber(topics.key("status", role.vehicle, role="plant"), self._receive_plant)
         role.announce()
         role.event("started", f"{role.name} looks for {role.vehicle}")
         try:
@@ -139,12 +139,12 @@ class Daemon:
             self._publish_status()
 
     def _run(self, link: ZenohLink) -> bool:
-        """One session: a tick for every one of the plant's. True once the duration is over, False if it was lost."""
-        controller, live, timing, lockstep = self._controller, self._live, self._timing, self._loop.lockstep
+        """Run one session. True once the duration is over, False if the session was lost."""
+        controller, changes, timing, lockstep = self._controller, self._changes, self._timing, self._loop.lockstep
         own_grid = self._settings.pace == "clock" and not lockstep
         source = TickSource(link, self._loop, self._wire, own_grid=own_grid, stale_s=self._stale_s)
         k, last = -1, time.monotonic()
-        while self._may_go_on() and (self._last_tick is None or k < self._last_tick):
+        while self._may_continue() and (self._last_tick is None or k < self._last_tick):
             now = source.next(min(WAIT_S, self._stale_s))
             if now is not None and now.fresh:
                 last = time.monotonic()
@@ -158,8 +158,8 @@ class Daemon:
                 continue
             if timing:
                 timing.woke(now.due_ns)
-            live.before_tick(now.tick, now.frame)
-            if not self._may_go_on():
+            changes.before_tick(now.tick, now.frame)
+            if not self._may_continue():
                 break
             command = controller.tick(now.frame, now.tick)
             if command or (command is not None and lockstep):
@@ -171,16 +171,16 @@ class Daemon:
             self._account(command, now)
             if timing:
                 timing.done()
-        return self._may_go_on()
+        return self._may_continue()
 
     def _take_late(self, late: PlantTick) -> None:
-        """A frame that is no tick of its own: its levels hold from the next tick on, if it has any."""
+        """A late or malformed frame, which is no tick: its levels, if it has any, hold from the next tick on."""
         self._received += 1
         self._controller.hold(late.frame)
         if not late.fresh and late.received_as is Received.LATE:
             self._stale += 1
-            text = f"measurements come {late.late_ns * 1e-6:.0f} ms later than the fastest: not answered"
-            self._role.warn("stale", "fault", text, self._claimant.session, late.tick)
+            text = f"measurements arrive {late.late_ns * 1e-6:.0f} ms later than the fastest: not answered"
+            self._role.warn("stale", "fault", text, self._claims.session, late.tick)
         self._record(late, None, 0)
 
     def _record(self, now: PlantTick, command: bytes | None, sent_ns: int) -> None:
@@ -203,39 +203,39 @@ class Daemon:
             self._role.publish_bytes("trace", self._trace.take(now_ns, time.time_ns()))
             self._trace.state = self._controller.state.model_dump(mode="json")
 
-    def _may_go_on(self) -> bool:
+    def _may_continue(self) -> bool:
         return not self._role.stop.is_set() and self._machine.state not in (State.HOLDING, State.FAULTED)
 
     def _account(self, command: bytes | None, now: PlantTick) -> None:
-        measured = now.tick
+        tick = now.tick
         self._ticks += 1
         if now.frame != SILENCE:
             self._received += 1
         self._skipped += now.missed
         if now.missed >= STALL_TICKS:
-            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self._claimant.session, measured)
+            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self._claims.session, tick)
         if command is not None:
             self._sent += command != SILENCE
-            self._follow(measured)
-        if self._controller.tick_index == measured and measured % self._telemetry_every == 0:
+            self._advance_state(tick)
+        if self._controller.tick_index == tick and tick % self._telemetry_every == 0:
             self._publish_telemetry()
         self._publish_when_due()
 
-    def _follow(self, measured: int) -> None:
+    def _advance_state(self, tick: int) -> None:
         """Move the state machine after an answer."""
-        before, session, role = self._machine.state, self._claimant.session, self._role
+        before, session, role = self._machine.state, self._claims.session, self._role
         if self._controller.failed:
             self._machine.fire(Trigger.FAULT)
             self._lost = "the law gave no number"
-            role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session, measured)
-        elif self._controller.tick_index != measured:
+            role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session, tick)
+        elif self._controller.tick_index != tick:
             if before is not State.READY:
                 self._machine.fire(Trigger.INVALID)
-                role.warn("invalid", "fault", "no valid measurement: commands no valid value", session, measured)
+                role.warn("invalid", "fault", "no valid measurement: commands no valid value", session, tick)
         elif before is not State.RUNNING:
             self._machine.fire(Trigger.ANSWERED)
             if before is State.CLAIMED:
-                role.event("claimed", f"{role.name} has {role.vehicle}", session, measured)
+                role.event("claimed", f"{role.name} has {role.vehicle}", session, tick)
         if self._machine.state is not before:
             self._status_due = 0
 
@@ -243,33 +243,33 @@ class Daemon:
 
     def _may_claim(self) -> bool:
         recorded = self._recorders > 0 or not self._settings.require_recorder
-        blocks = self._assurance.blocks
+        blocks = self._gate.blocks
         if recorded or blocks:
-            self._assurance.publish()
+            self._gate.publish()
         return recorded and not blocks
 
     def _claim(self) -> ZenohLink | None:
-        if self._controller.tick_index >= 0:  # made before the claim: once granted, every tick counts
+        if self._controller.tick_index >= 0:  # created before the claim, because ticks start with the grant
             self._refused += self._controller.refused
             self._saturated += self._controller.saturated
             self._controller = self._new_controller()
-        link = self._claimant.claim()
+        link = self._claims.claim()
         if link is None:
             return None
-        self._granted = self._plant is not None and self._plant.session == self._claimant.session
+        self._granted = self._plant is not None and self._plant.session == self._claims.session
         self._machine.fire(Trigger.GRANT)
-        assert self._claimant.session is not None
-        self._trace.session = self._claimant.session
+        assert self._claims.session is not None
+        self._trace.session = self._claims.session
         self._trace.state = self._controller.state.model_dump(mode="json")
-        self._live.begin(self._controller, self._claimant.session)
+        self._changes.begin(self._controller, self._claims.session)
         return link
 
     def _is_lost(self, silent_s: float) -> str | None:
-        """Why the session is over, if it is: the plant says so, or is gone, or has been silent for too long."""
+        """Why the session is lost, if it is: the plant has ended it, is gone, or has been silent for too long."""
         plant = self._plant
-        if plant is not None and self._granted and plant.session != self._claimant.session:
+        if plant is not None and self._granted and plant.session != self._claims.session:
             return f"the plant ended the session{': ' + plant.cause if plant.cause else ''}"
-        # In lockstep a plant may rest between two steps; it is lost once its session is, or it never had one.
+        # In lockstep a granted plant may pause between steps: it is lost only when its session ends or it is gone.
         patience = LOCKSTEP_PATIENCE_S if self._loop.lockstep and not self._granted else self._stale_s
         if silent_s > patience and not (self._loop.lockstep and self._granted and plant is not None):
             return f"no measurement for {silent_s * 1e3:.0f} ms"
@@ -279,43 +279,43 @@ class Daemon:
         self._machine.fire(Trigger.LOST)
         self._lost = reason
         text = f"{reason}: stopped commanding, looking for {self._role.vehicle}"
-        self._role.event("lost", text, self._claimant.session, self._last_computed)
+        self._role.event("lost", text, self._claims.session, self._last_computed)
         return False
 
     def _end(self, link: ZenohLink) -> None:
         if self._timing:
             self._timing.pause()
-        self._live.end()
+        self._changes.end()
         self._role.publish_bytes("trace", self._trace.take(time.monotonic_ns(), time.time_ns(), final=True))
-        self._claimant.release()
+        self._claims.release()
         link.close()
         self._status_due = 0
 
-    def _token(self, name: str, came: bool) -> None:
+    def _token(self, name: str, appeared: bool) -> None:
         if name == "recorder":
-            self._recorders = max(0, self._recorders + (1 if came else -1))
-        elif name == "plant" and not came:
+            self._recorders = max(0, self._recorders + (1 if appeared else -1))
+        elif name == "plant" and not appeared:
             self._plant = None
 
-    def _hear_plant(self, sample: zenoh.Sample) -> None:
+    def _receive_plant(self, sample: zenoh.Sample) -> None:
         try:
             self._plant = plant = Status.model_validate_json(sample.payload.to_bytes())
         except ValidationError:
-            self._role.warn("plant's status", "fault", "the plant's status is not one: is it of another version?")
+            self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
         else:
-            self._granted = self._granted or plant.session == self._claimant.session is not None
+            self._granted = self._granted or plant.session == self._claims.session is not None
 
-    # ── an operator's words, taken between ticks ──
+    # ── an operator's requests, taken between ticks ──
 
     def _stand_down(self) -> Answer:
         name, vehicle = self._role.name, self._role.vehicle
-        if self._claimant.session is None:
+        if self._claims.session is None:
             return Answer(done=False, text=f"{name} does not have {vehicle}")
         self._machine.fire(Trigger.STAND_DOWN)
         self._lost = "released by an operator"
         text = f"{self._lost}: {name} holds until `aeroloop op arm`"
-        self._role.event("released", text, self._claimant.session, self._last_computed)
-        return Answer(done=True, text=f"{name} gives {vehicle} back and holds until `aeroloop op arm`")
+        self._role.event("released", text, self._claims.session, self._last_computed)
+        return Answer(done=True, text=f"{name} releases {vehicle} and holds until `aeroloop op arm`")
 
     def _recall(self) -> Answer:
         if self._machine.state not in (State.HOLDING, State.FAULTED):
@@ -324,26 +324,26 @@ class Daemon:
         return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
 
     def promise(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> dict[str, Any] | None:
-        """What the theorem promises of a configuration, for the description; in any thread, before `reconfigure`.
+        """The certificate of a configuration, for the description; in any thread, before `reconfigure`.
 
         Raises:
-            UncertifiedError: It must hold, would not, and a session runs: no vehicle is dropped for a configuration.
+            UncertifiedError: The theorem must hold and would not, and a session runs: a reload never ends a session.
         """
-        prospect = self._live.prospect(law, reference)
-        self._assurance.weigh(*prospect)
-        self._assurance.admit(*prospect, required=settings.require_certificate and bool(self._claimant.session))
-        return self._assurance.promise(gains_of(law), reference)
+        prospect = self._changes.prospect(law, reference)
+        self._gate.weigh(*prospect)
+        self._gate.admit(*prospect, required=settings.require_certificate and bool(self._claims.session))
+        return self._gate.promise(gains_of(law), reference)
 
     def reconfigure(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> None:
         """Take over gains, reference and settings between two ticks."""
-        self._assurance.required = settings.require_certificate
-        self._live.configure(settings)
-        self._live.adopt(law, reference)
+        self._gate.required = settings.require_certificate
+        self._changes.configure(settings)
+        self._changes.adopt(law, reference)
         self._take(settings)
 
     def _take(self, settings: ControllerSettings) -> None:
         self._stale_s = settings.stale_s
-        self._claimant.auto_arm = settings.auto_arm
+        self._claims.auto_arm = settings.auto_arm
         self._telemetry_every = max(1, round(self._loop.rate_hz / settings.telemetry_rate_hz))
 
     @property
@@ -351,11 +351,11 @@ class Daemon:
         """The last tick that was answered; None before the first."""
         return self._controller.tick_index if self._controller.tick_index >= 0 else None
 
-    # ── what it publishes ──
+    # ── publications ──
 
     def _publish_telemetry(self) -> None:
-        assert self._claimant.session is not None
-        self._role.publish("telemetry", telemetry_of(self._controller, self._claimant.session))
+        assert self._claims.session is not None
+        self._role.publish("telemetry", telemetry_of(self._controller, self._claims.session))
 
     def _publish_when_due(self) -> None:
         if time.monotonic_ns() >= self._status_due:
@@ -368,15 +368,15 @@ class Daemon:
             Status(
                 role=self._role.role,
                 state=self._machine.state,
-                session=self._claimant.session,
-                cause=self._assurance.blocks,
+                session=self._claims.session,
+                cause=self._gate.blocks,
                 uptime_s=self._role.uptime_s,
                 ticks=self._ticks,
                 rate_hz=(self._ticks - self._status_ticks) / (now - self._status_time),
                 skipped=self._skipped,
                 received=self._received,
                 sent=self._sent,
-                refused=self._refused + self._controller.refused + self._live.refused,
+                refused=self._refused + self._controller.refused + self._changes.refused,
                 stale=self._stale,
                 saturated=self._saturated + self._controller.saturated,
                 age_us=summary(self._age.recent()),

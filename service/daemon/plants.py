@@ -1,4 +1,4 @@
-"""What can stand at the plant end of a Zenoh network, by the name that `plant.via` has for it."""
+"""Plant end of a Zenoh network, selected by `plant.via`: emulator, CAN bridge or Quanser board."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from aeroloop.service.daemon.reload import reload_on_hangup
 
 
 def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> None:
-    """Run the plant end that the configuration names until the role is told to stop.
+    """Run the configured plant end until the role's `stop` is set.
 
     Args:
-        role: Its name on the network.
+        role: Its presence on the network.
         settings: The configuration.
         load: Reads it again, on SIGHUP.
 
     Raises:
-        AeroloopError: It cannot be run, in one line.
-        ValueError: The same, of the configuration.
+        AeroloopError: It cannot run, in one line.
+        ValueError: The configuration does not fit it, in one line.
     """
     loop, wire, plant = settings.loop, settings.wire, settings.plant
     if plant.via == "can":

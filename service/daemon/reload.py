@@ -1,6 +1,6 @@
-"""SIGHUP: the configuration read again, and what of it can change while a daemon runs.
+"""Reload on SIGHUP: reads the configuration again and applies the keys that may change while a daemon runs.
 
-What cannot is named, and stays as it was until a restart.
+A key that needs a restart is named in the event and keeps its value.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SECTIONS: Final = {
     "plant": ("vehicle", "loop", "wire", "plant", "network"),
     "recorder": ("vehicle", "recorder", "network"),
 }
-"""By role, what concerns it at all."""
+"""By role, the sections that it uses."""
 
 
 def reload_on_hangup(
@@ -44,40 +44,40 @@ def reload_on_hangup(
     take_over: Callable[[Settings], None],
     promise: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda _: None,
 ) -> None:
-    """Let SIGHUP read the configuration again.
+    """Reload the configuration on SIGHUP.
 
     Args:
-        role: Who.
-        settings: Its configuration so far.
+        role: The daemon's presence on the network.
+        settings: Its present configuration.
         load: Reads it again; raises ConfigError.
-        take_over: Given the new configuration between two ticks, takes what is in `LIVE`.
-        promise: What the theorem promises of an effective configuration, for the description; raises an AeroloopError
-            where it must hold and does not, and nothing changes.
+        take_over: Called with the new configuration between two ticks; applies what is in `LIVE`.
+        promise: Returns the certificate of an effective configuration, for the description. Raises an AeroloopError
+            where the theorem must hold and does not; then nothing changes.
     """
     current = settings
     effective = settings.description()
 
     def reload() -> Action:
         nonlocal current, effective
-        before, now = current, load()
-        lines = differences(before, now, role.role)
-        description = _with_what_is_live(effective, now.description(), role.role)
-        promised = promise(description)
+        now = load()
+        lines = differences(current, now, role.role)
+        description = _with_live_keys(effective, now.description(), role.role)
+        certificate = promise(description)
         current, effective = now, description
 
-        def take() -> None:
+        def apply() -> None:
             take_over(now)
-            # What needs a restart is not in effect, and a log must not say so.
-            role.configured(description, promised)
+            # The description holds effective values only: a log must not contain those that need a restart.
+            role.configured(description, certificate)
             role.event("changed", f"configuration read again: {'; '.join(lines) or 'nothing has changed'}")
 
-        return take
+        return apply
 
     role.on_hangup(reload)
 
 
-def _with_what_is_live(effective: dict[str, Any], after: dict[str, Any], role: str) -> dict[str, Any]:
-    """A configuration with what takes effect at once of another one."""
+def _with_live_keys(effective: dict[str, Any], after: dict[str, Any], role: str) -> dict[str, Any]:
+    """The effective configuration with the live keys of a new one."""
     merged = {**effective}
     for name in LIVE[role]:
         section, _, key = name.partition(".")
@@ -86,7 +86,7 @@ def _with_what_is_live(effective: dict[str, Any], after: dict[str, Any], role: s
 
 
 def differences(before: Settings, after: Settings, role: str) -> list[str]:
-    """What has changed for a role, one line a key: from what, to what, and whether it needs a restart."""
+    """The changes for a role, a line per key: old value, new value, and whether it needs a restart."""
     old, new = (_flat(settings.description(), _SECTIONS[role]) for settings in (before, after))
     lines = []
     for key in sorted(old.keys() | new.keys()):

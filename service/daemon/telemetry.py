@@ -1,4 +1,4 @@
-"""What a controller tells of the tick it has computed last; for the daemon, and for whoever stands in for it."""
+"""Telemetry message of the controller's last tick."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from aeroloop.service.control.controller import Controller
 
 
 def telemetry_of(controller: Controller, session: str) -> Telemetry:
-    """What the controller computed at its last tick, in a session."""
+    """The controller's last tick in a session."""
     return Telemetry(
         session=session,
         tick=controller.tick_index,

@@ -3,8 +3,8 @@
 Where the plant sends every tick, a tick is due when its measurement arrives, so that the plant's clock leads. Where it
 sends on change, a tick without a frame is silent once half a period has passed since the frame was due on the plant's
 grid, as the earliest frames mark that grid on this end's monotonic clock. A frame that arrives later than that is late:
-its tick was computed with the levels before. One that arrives later than `stale_s` is not answered. With a grid of its
-own the controller takes the newest frame whenever a tick of that grid is due.
+its tick was computed with the previous levels. One that arrives later than `stale_s` is stale and not answered. With a
+grid of its own the controller takes the newest frame whenever a tick of that grid is due.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 MAILBOX: Final = 16
-"""Frames that may wait where silence counts: of one that another displaced, nobody could say that it was late."""
+"""Frames that may wait where silence is allowed: a displaced frame could not be classified as late."""
 
 PATIENCE: Final = 0.5
-"""How much of a period a frame may take longer than the fastest did, before its tick is silent."""
+"""Share of a period by which a frame may be later than the fastest before its tick is silent."""
 
 OWN_PATIENCE: Final = 0.1
-"""The same on a grid of one's own: a silent tick that is taken a tick later is displaced by a frame."""
+"""The same on a grid of its own: a silent tick that is taken a tick later is displaced by a frame."""
 
 
 class PlantTick(NamedTuple):
-    """One tick of the plant, or a frame that came when its tick was over.
+    """One tick of the plant, or a frame that arrived when its tick was over.
 
     Attributes:
-        tick: The session tick that it is of.
-        frame: The measurement; SILENCE if its levels are what they were.
-        received_as: What it is; of a late frame only the levels are still of use, and it is no tick of its own.
-        due_ns: Since when it could be answered, on `time.monotonic_ns()`.
+        tick: The session tick.
+        frame: The measurement; SILENCE if its levels have not changed.
+        received_as: Classification. A late frame is no tick; only its levels are used.
+        due_ns: From when it could be answered, on `time.monotonic_ns()`.
         at_ns: When the frame arrived, or the tick was found silent, on the same clock.
         late_ns: How much later than the fastest the frame arrived [ns]; 0 for silence.
         missed: Ticks between the last one and this that were not received in time.
@@ -60,10 +60,10 @@ class TickSource:
     The plant counts its measurements from 0 at the grant, so its counter is the law's tick, even after a gap.
 
     Args:
-        link: Where its frames come from.
+        link: Receives the frames.
         loop: The grid.
-        wire: How frames are read, and whether every tick has one.
-        own_grid: Whether to tick on a grid of one's own.
+        wire: Format of the frames, and whether every tick has one.
+        own_grid: Whether to tick on a grid of its own.
         stale_s: A frame that arrives later than this is not answered [s].
 
     Attributes:
@@ -79,12 +79,12 @@ class TickSource:
         self._sparse = wire.transmit.measurement == "on_change" and not loop.lockstep
         self._patience_ns = round((OWN_PATIENCE if own_grid else PATIENCE) * loop.period_ns)
         self._stale_ns = round(stale_s * 1e9)
-        self._goes_on = False  # whether what was taken last was no tick
-        self._framed = -1  # tick of the last frame that could be read
+        self._no_tick = False  # whether the last frame taken was no tick
+        self._last_read = -1  # tick of the last frame that could be read
         self.tick = -1
 
     def next(self, timeout_s: float) -> PlantTick | None:
-        """The next tick, or None if there is none within a while.
+        """The next tick, or None if there is none in time.
 
         Args:
             timeout_s: The longest to wait [s].
@@ -98,36 +98,36 @@ class TickSource:
         tick = self._ticks.advance(counter, arrival.at_ns)
         if tick is None:
             return None
-        self._framed = tick
+        self._last_read = tick
         late_ns = self._ticks.late_ns(tick, arrival.at_ns)
         stale = late_ns > self._stale_ns
-        # In time, what is newer wins, a frame or silence: then the tick of this one is missed.
+        # The newer frame or silence wins: then the tick of this frame is missed.
         if stale or (self._sparse and (tick <= self.tick or self._link.pending or self._is_over(tick))):
-            return self._in_passing(tick, arrival, Received.LATE, late_ns, fresh=not stale)
-        return self._took(tick, arrival, Received.FRAME, late_ns, fresh=True)
+            return self._not_a_tick(tick, arrival, Received.LATE, late_ns, fresh=not stale)
+        return self._as_tick(tick, arrival, Received.FRAME, late_ns, fresh=True)
 
     def _without_counter(self, arrival: Arrival) -> PlantTick:
         """An empty frame in lockstep, or a malformed one, which counts as the measurement that was due."""
         if self._sparse:
-            return self._in_passing(self.tick, arrival, Received.MALFORMED, 0, fresh=False)
+            return self._not_a_tick(self.tick, arrival, Received.MALFORMED, 0, fresh=False)
         tick = self.tick + 1
         if self._lockstep:
             self._ticks.tick = tick
         empty = arrival.frame == SILENCE and self._lockstep
-        return self._took(tick, arrival, Received.SILENT if empty else Received.MALFORMED, 0, fresh=empty)
+        return self._as_tick(tick, arrival, Received.SILENT if empty else Received.MALFORMED, 0, fresh=empty)
 
     def _receive(self, timeout_s: float) -> Arrival | None:
         if self._grid is not None:
-            if not self._goes_on:
+            if not self._no_tick:
                 self._grid.wait()
-            self._goes_on = False
+            self._no_tick = False
             return self._link.take()
         if self._sparse and self._ticks.known:
             timeout_s = min(timeout_s, 1e-9 * max(0, self._over_ns(self.tick + 1) - time.monotonic_ns()))
         return self._link.wait(timeout_s)
 
     def _over_ns(self, tick: int) -> int:
-        """When a tick without a frame is silent."""
+        """When a tick without a frame becomes silent."""
         return self._ticks.due_ns(tick) + self._patience_ns
 
     def _last_over(self) -> int:
@@ -135,28 +135,28 @@ class TickSource:
         return self._ticks.tick_at(time.monotonic_ns() - self._patience_ns)
 
     def _is_over(self, tick: int) -> bool:
-        """Whether it is too late for the frame of the next tick, too."""
+        """Whether the next tick's time for a frame is over, too."""
         return self._last_over() > tick
 
-    def _in_passing(
+    def _not_a_tick(
         self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool
     ) -> PlantTick:
-        self._goes_on = True
+        self._no_tick = True
         return PlantTick(tick, arrival.frame, received_as, arrival.at_ns, arrival.at_ns, late_ns, fresh=fresh)
 
     def _silence(self) -> PlantTick | None:
-        """The last tick that is silent now; those before it, if it is not the next, are missed."""
+        """The last tick that is silent now; those before it, back to the last one taken, are missed."""
         if not (self._sparse and self._ticks.known):
             return None
-        # A frame that was taken in passing may be of a later tick, by its counter: its levels are not of one before.
-        tick = max(self._last_over(), self._framed)
+        # A frame not taken as a tick may be of a later one, by its counter: its levels are not of an earlier one.
+        tick = max(self._last_over(), self._last_read)
         if tick <= self.tick:
             return None
         missed, self.tick = tick - self.tick - 1, tick
         due_ns = self._over_ns(tick)
         return PlantTick(tick, SILENCE, Received.SILENT, due_ns, due_ns, missed=missed)
 
-    def _took(self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool) -> PlantTick:
+    def _as_tick(self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool) -> PlantTick:
         missed, self.tick = max(0, tick - self.tick - 1), tick
         due_ns = self._grid.due_ns if self._grid else arrival.at_ns
         return PlantTick(tick, arrival.frame, received_as, due_ns, arrival.at_ns, late_ns, missed, fresh)

@@ -1,1 +1,1 @@
-"""Host."""
+"""Operator commands, host checks, the soak test, systemd units and the payload rate."""

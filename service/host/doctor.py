@@ -1,7 +1,7 @@
-"""Will this machine hold the configured rate? Looks at what the kernel allows, then tries it for a few seconds.
+"""Doctor: checks whether this machine holds the configured rate, by the kernel's settings and a trial of a few seconds.
 
-A finding is good or names what to change. The trial is a bare loop on the grid, with everything asked for that the
-daemons ask for; what it shows is the machine's part of the jitter, to which Zenoh adds its own.
+A finding is good or names what to change. The trial is a bare loop on the grid, with the same real-time set-up as the
+daemons; it shows the machine's part of the jitter, to which Zenoh adds its own.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from aeroloop.protocol.wire.loop import LoopSettings
 TRIAL_S: Final = 5.0
 GOOD_CLOCKS: Final = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page")
 SHARE_OF_PERIOD: Final = 0.25
-"""A wake-up later than this part of the period leaves too little of it for two crossings of the network."""
+"""Latest wake-up, as a share of the period; after it too little time is left for two crossings of the network."""
 
 
 class Finding(BaseModel):
-    """One thing that was looked at."""
+    """One thing that was checked."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -50,15 +50,15 @@ class Diagnosis(BaseModel):
 
 
 def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None) -> Diagnosis:
-    """Look, then try.
+    """Check the settings, then run the trial.
 
     Args:
-        loop: The grid, and what is asked of the machine.
-        progress: Called now and then with the seconds of the trial that are over.
+        loop: The grid and the real-time set-up.
+        progress: Called five times a second with the elapsed time of the trial [s].
     """
     findings = [_clock(), _priority_limit(), _memory_limit(), _throttling(), _governor()]
-    refused = prepare_process(loop.model_copy(update={"realtime": "try"}))
-    findings += [Finding(what="asked for", good=False, found=line, advice="run it as a service") for line in refused]
+    refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
+    findings += [Finding(what="set-up", good=False, found=line, advice="run it as a service") for line in refusals]
     timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
     ticks, report_every = loop.ticks(TRIAL_S), max(1, loop.ticks(0.2))
     while grid.tick < ticks:
@@ -95,7 +95,7 @@ def _clock() -> Finding:
     return Finding(
         what="clock source",
         good=source in GOOD_CLOCKS,
-        found=source or "not told by this kernel",
+        found=source or "not reported by this kernel",
         advice="reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
     )
 
@@ -127,8 +127,8 @@ def _throttling() -> Finding:
     return Finding(
         what="real-time throttling",
         good=runtime is not None,
-        found="off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not told",
-        advice="the kernel does not say how much time real-time tasks may take",
+        found="off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not reported",
+        advice="the kernel does not report how much time real-time tasks may take",
     )
 
 

@@ -1,7 +1,7 @@
-"""An operator's verbs: look at every role on the network, arm a plant, stop it, change what a controller follows.
+"""Operator commands: status of every role on the network, arm, stop, release, gains and reference.
 
-Each is a question over Zenoh, answered by the role it is put to. Status is answered by the role's network thread from
-what it last said, so asking never stalls a loop; the other verbs are taken between two ticks.
+Each is a Zenoh query that the addressed role answers. Status is answered by the role's network thread from the last
+published one, so it never stalls a loop; the other commands are taken between two ticks.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from aeroloop.protocol.messages.operator import Answer, Ask, Gains, Message, Poi
 from aeroloop.protocol.transport.network import NetworkSettings, join
 
 GATHER_S: Final = 1.0
-"""How long to look for roles. Gossip links a newcomer to all of them in some 50 ms."""
+"""How long to query for roles [s]. Gossip links a new peer to all others in some 50 ms."""
 ANSWER_S: Final = 1.0
 
 Statuses = dict[str, dict[str, Status]]
 
 
 class OperatorError(AeroloopError):
-    """Nobody answered, or the answer was no; one line."""
+    """No role answered, or the command was refused; one line."""
 
 
 def gather(network: NetworkSettings) -> Statuses:
     """Status of every role of every vehicle on the network, by vehicle and role.
 
-    Of several controllers of one vehicle it is the one that has it, if any does.
+    Of several controllers of one vehicle it is the one with the session, if any.
 
     Raises:
         NetworkError: The network cannot be joined.
-        OperatorError: Nobody is there.
+        OperatorError: No role answers.
     """
     with join(network) as session:
         found: Statuses = {}
@@ -58,48 +58,48 @@ def gather(network: NetworkSettings) -> Statuses:
                 found.setdefault(vehicle, {}).update(roles)
             time.sleep(0.1)
     if not found:
-        raise OperatorError(f"nobody answers at {network.rendezvous}; is an emulator or a controller running?")
+        raise OperatorError(f"no role answers at {network.rendezvous}; is an emulator or a controller running?")
     return found
 
 
 def arm(network: NetworkSettings, vehicle: str) -> str:
-    """Arm a plant, so that the next claim is granted, and recall controllers that hold or are faulted.
+    """Arm a plant, so that the next claim is granted, and recall controllers that are holding or faulted.
 
     Returns:
-        What was done, in a line.
+        What was done, in one line.
 
     Raises:
         NetworkError: The network cannot be joined.
         OperatorError: No plant answers, or a controller holds it.
     """
     with join(network) as session:
-        text = _ask(session, network, vehicle, "arm", Ask())
+        text = _query(session, network, vehicle, "arm", Ask())
         recalled = [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
         return "; ".join([text, *recalled])
 
 
 def stop(network: NetworkSettings, vehicle: str) -> str:
     """Stop a plant: 0 V at its next tick, and no claim until it is armed. Raises as `arm` does."""
-    return _tell(network, vehicle, "stop", Ask())
+    return _send(network, vehicle, "stop", Ask())
 
 
 def release(network: NetworkSettings, vehicle: str) -> str:
-    """Let the controller that has a vehicle give it back and hold until `arm`. Raises as `arm` does."""
-    return _tell(network, vehicle, "stand_down", Ask())
+    """Let the controller of a vehicle release it and hold until `arm`. Raises as `arm` does."""
+    return _send(network, vehicle, "stand_down", Ask())
 
 
 def set_gains(network: NetworkSettings, vehicle: str, gains: Gains) -> str:
-    """Let the controller that has a vehicle use other gains from its next tick on. Raises as `arm` does."""
-    return _tell(network, vehicle, "set_gains", gains)
+    """Let the controller of a vehicle use other gains from its next tick on. Raises as `arm` does."""
+    return _send(network, vehicle, "set_gains", gains)
 
 
 def track(network: NetworkSettings, vehicle: str, track: Track) -> str:
-    """Let the controller that has a vehicle follow another reference. Raises as `arm` does."""
-    return _tell(network, vehicle, "track", track)
+    """Let the controller of a vehicle follow another reference. Raises as `arm` does."""
+    return _send(network, vehicle, "track", track)
 
 
 def read_points(path: Path) -> Points:
-    """Attitudes over time out of a CSV file: columns time [s], roll, pitch, yaw [deg], with or without a heading.
+    """Attitudes over time from a CSV file: columns time [s], roll, pitch, yaw [deg], with or without a heading.
 
     Raises:
         OperatorError: It cannot be read, or is no such table; names the line.
@@ -112,7 +112,7 @@ def read_points(path: Path) -> Points:
             rows = csv.reader(file)
             first = True
             while True:
-                number = rows.line_num + 1  # of the row that is tried next, if it cannot even be read
+                number = rows.line_num + 1  # of the next row, should it be unreadable
                 if (row := next(rows, None)) is None:
                     break
                 number, heading = rows.line_num, first and bool(row) and not _is_number(row[0])
@@ -134,7 +134,7 @@ def read_points(path: Path) -> Points:
 
 
 def _problem(row: list[str], times: list[float]) -> str | None:
-    """What is wrong with a row of a table of points, if anything is."""
+    """The error in a row of a table of points, if there is one."""
     if len(row) != 4 or not all(_is_number(cell) for cell in row):
         return f"expected four numbers (time [s], roll, pitch, yaw [deg]), not {','.join(row)!r}"
     values = [float(cell) for cell in row]
@@ -155,13 +155,13 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _tell(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+def _send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
     with join(network) as session:
-        return _ask(session, network, vehicle, topic, message)
+        return _query(session, network, vehicle, topic, message)
 
 
-def _ask(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Put a question until somebody answers, since a newcomer's links take a moment; one yes is enough."""
+def _query(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+    """Query until a role answers, as a new peer's links take a moment. Of several answers one success is enough."""
     deadline = time.monotonic() + ANSWER_S
     while time.monotonic() < deadline:
         if answers := _answers(session, topic, vehicle, message):
@@ -170,8 +170,8 @@ def _ask(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: 
                     return answer.text
             raise OperatorError("; ".join(answer.text for answer in answers))
         time.sleep(0.02)
-    who = "plant" if topic in ("arm", "stop") else "controller"
-    raise OperatorError(f"no {who} of {vehicle} answers at {network.rendezvous}")
+    role = "plant" if topic in ("arm", "stop") else "controller"
+    raise OperatorError(f"no {role} of {vehicle} answers at {network.rendezvous}")
 
 
 def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:

@@ -1,6 +1,6 @@
-"""The soak: the three processes for as long as one likes, and whether anything grows, drifts or is lost meanwhile.
+"""Soak test: runs the three processes for long and reports growth of memory, threads and files, and lost sessions.
 
-What a process uses is read from /proc, what the loop does from the roles' own status.
+The usage of a process is read from /proc, the figures of the loop from the roles' statuses.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from aeroloop.service.testing.process_group import (
 
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 WARM_UP: Final = 0.1
-"""Share of the time that is left to the processes to settle before growth is judged."""
+"""Share of the time before growth is measured."""
 MAX_GROWTH: Final = 0.05
-"""Memory may grow by this share after warm-up and still count as steady."""
+"""Largest growth of memory after warm-up that counts as steady, as a share."""
 PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 
 
 class Usage(BaseModel):
-    """What a process uses."""
+    """Usage of a process."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -46,26 +46,26 @@ class Usage(BaseModel):
 
 
 class Minute(BaseModel):
-    """How the loop did up to some time."""
+    """Sample of a soak: counters since the start, latencies of the last 10 s, usage."""
 
     model_config = ConfigDict(frozen=True)
 
     at_s: float
-    skipped: int = Field(description="ticks the plant's grid has missed so far")
-    unanswered: int = Field(description="measurements so far that no command has answered")
+    skipped: int = Field(description="ticks missed by the plant's grid so far")
+    unanswered: int = Field(description="measurements without a command so far")
     latency_us: Percentiles | None = Field(description="from measurement to command, last 10 s [µs]")
     wake_us: Percentiles | None = Field(description="the plant's wake-up latency, last 10 s [µs]")
     usage: dict[str, Usage]
 
 
 class Soak(BaseModel):
-    """What a soak has shown."""
+    """Result of a soak."""
 
     model_config = ConfigDict(frozen=True)
 
     rate_hz: float
     minutes: list[Minute]
-    findings: list[str] = Field(description="what was not as it should be, a line each; empty if all was")
+    findings: list[str] = Field(description="deviations, a line each; empty if there were none")
     log: str
     log_mb: float
 
@@ -73,7 +73,7 @@ class Soak(BaseModel):
 def run_soak(
     settings: Settings, minutes: float, log: Path, progress: Callable[[float, Minute], None] | None = None
 ) -> Soak:
-    """Run controller, emulator and recorder for a while and watch them.
+    """Run controller, emulator and recorder and sample them.
 
     Args:
         settings: The configuration; the rendezvous is replaced by a free one.
@@ -156,7 +156,7 @@ def _usage(pid: int) -> Usage:
 def _findings(samples: list[Minute], sessions: list[str]) -> list[str]:
     found = []
     if len(sessions) != 1:
-        found.append(f"{len(sessions)} sessions instead of one: the log's events say why")
+        found.append(f"{len(sessions)} sessions instead of one: see the log's events")
     settled = samples[int(len(samples) * WARM_UP) :]
     for role in ROLES:
         first, last = settled[0].usage[role], settled[-1].usage[role]

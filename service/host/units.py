@@ -1,7 +1,7 @@
-"""systemd units for the daemons: written from one template, so that the three cannot drift apart.
+"""systemd units for the daemons, written from one template, so that the three stay alike.
 
-`Type=notify`: a daemon tells systemd when it is ready, once a second that it lives, and when it stops. The sandbox
-leaves it the network, its configuration and, to the recorder, its logs.
+`Type=notify`: a daemon notifies systemd when it is ready, once a second while it runs, and when it stops. The sandbox
+allows the network, the configuration and, for the recorder, its logs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ UNITS: Final = {
     "plant": ("the plant end that plant.via names", "plant", True),
     "recorder": ("the recorder of everything on the network", "recorder --set recorder.directory=%L/aeroloop", False),
 }
-"""What each is, its command, and whether its loop is timed."""
+"""By unit: description, command, and whether its loop is timed."""
 
 _TEMPLATE: Final = """\
 [Unit]

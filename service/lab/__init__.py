@@ -1,1 +1,1 @@
-"""The theory and the bench, in lockstep: experiments, the paper's tables, calibration, and what bits cost."""
+"""Experiments in lockstep: one loop, the paper's tables, calibration, error against bits, the demo."""

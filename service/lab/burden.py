@@ -1,9 +1,9 @@
-"""What a loop costs and what it gains by it: a grid of bits, quantizers, transmit policies and sensors.
+"""Burden of a loop: error against bits over a grid of bits, quantizers, transmit policies and sensors.
 
-Each cell is one lockstep experiment through real frames. Both policies give the same run, to the last bit, because who
-is sent nothing holds what it has; so a cell is run once, and its frames tell what either policy would have sent. Every
-figure stands beside that of float64 at every tick, under the same sensors. Of all points under the same sensors the
-Pareto front has those that no other beats in error without more bits, or in bits without more error.
+Each cell is one lockstep experiment through real frames. Both policies give the same run to the last bit, because an
+end that receives no frame holds its last levels; so a cell runs once, and its frames give the traffic of both policies.
+Every figure is compared with that of float64 at every tick under the same sensors. The Pareto front of the points under
+the same sensors holds those that no other point beats in error without more bits, or in bits without more error.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class LinkRates(BaseModel):
 
 
 class Point(BaseModel):
-    """One cell under one policy. What could not be had is null, with the reason."""
+    """One cell under one policy. Missing figures are null, with the reason."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -72,17 +72,17 @@ class Point(BaseModel):
 
     @property
     def bits(self) -> str:
-        """Bits out and in, as they are asked for."""
+        """Bits out and in, as `--bits` takes them."""
         return "/".join("cont" if bits is None else str(bits) for bits in (self.bits_out, self.bits_in))
 
     @property
     def label(self) -> str:
-        """What to call it for short: its bits, or float64."""
+        """Short label: the bits, or float64."""
         return self.bits if self.quantizer else "float64"
 
     @property
     def is_baseline(self) -> bool:
-        """Whether it is what the others stand beside: float64 at every tick."""
+        """Whether it is the baseline: float64 at every tick."""
         return self.quantizer is None and self.transmit == "periodic"
 
 
@@ -95,7 +95,7 @@ class Burden(BaseModel):
     rate_hz: float = Field(description="ticks a second [Hz]")
     heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
     counter_bits: int = Field(description="bits of the counter in each frame")
-    sensors: dict[str, str] = Field(description="what each name stands for")
+    sensors: dict[str, str] = Field(description="meaning of each name")
     points: list[Point]
 
     def under(self, sensors: str) -> list[Point]:
@@ -104,7 +104,7 @@ class Burden(BaseModel):
 
 
 class Observation(NamedTuple):
-    """What a cell's experiment has shown.
+    """Result of a cell's experiment.
 
     Attributes:
         figures: Its figures of merit; None if the loop ended early.
@@ -128,21 +128,21 @@ def measure_burden(
     """Run a grid on every core.
 
     Args:
-        settings: The configuration; what a cell says stands in its place.
-        cells: What to run; float64 is among them, for each of the sensors.
+        settings: The configuration; each cell overrides its own fields.
+        cells: Cells to run, with float64 for each of the sensors.
         duration_s: Length of each experiment [s].
         progress: Called with experiments done and experiments in all.
 
     Raises:
-        BurdenError: Float64 itself does not keep the loop running, or makes no error at all; or a cell does not fit the
+        BurdenError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
             configuration.
     """
     jobs = [(cell_settings(settings, cell).description(), duration_s, cell.counted) for cell in cells]
-    told = progress or (lambda _done, _total: None)
-    told(0, len(jobs))
+    report = progress or (lambda _done, _total: None)
+    report(0, len(jobs))
     with Workers() as workers:
-        seen = workers.each(observe, jobs, lambda done: told(done, len(jobs)))
-    points = [point for cell, found in zip(cells, seen, strict=True) for point in _points(cell, found)]
+        results = workers.each(observe, jobs, lambda done: report(done, len(jobs)))
+    points = [point for cell, result in zip(cells, results, strict=True) for point in _points(cell, result)]
     return Burden(
         duration_s=duration_s,
         rate_hz=settings.loop.rate_hz,
@@ -157,9 +157,9 @@ def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observa
     """Run one cell.
 
     Args:
-        config: A configuration's dump, which sends at every tick.
-        duration_s: How long [s].
-        counted: Whether its frames go over a Zenoh link, too.
+        config: Dump of a configuration that sends at every tick.
+        duration_s: Length of the run [s].
+        counted: Whether its bytes on a Zenoh link are counted, too.
     """
     settings = Settings.model_validate(config)
     measurements: list[bytes] = []
@@ -175,19 +175,22 @@ def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observa
         return Observation(None, {}, {}, str(error))
     wire, period = settings.wire, settings.loop.period
     heartbeat, counters = _heartbeat(settings), wire.measurement.counters
-    seen, said = codes_of(measurements, wire.measurement), codes_of(commands, wire.command)
+    measured, commanded = codes_of(measurements, wire.measurement), codes_of(commands, wire.command)
     rates: dict[Policy, tuple[Traffic, Traffic]] = {}
     zenoh: dict[Policy, LinkBytes] = {}
     for policy in POLICIES:
-        out, inp = (sent_ticks(codes, policy, heartbeat, counters) for codes in (seen, said))
-        rates[policy] = traffic(seen, wire.measurement, out, period), traffic(said, wire.command, inp, period)
+        out, inp = (sent_ticks(codes, policy, heartbeat, counters) for codes in (measured, commanded))
+        rates[policy] = (
+            traffic(measured, wire.measurement, out, period),
+            traffic(commanded, wire.command, inp, period),
+        )
         if counted:
             zenoh[policy] = count_bytes(settings.network, [measurements[k] for k in out], [commands[k] for k in inp])
     return Observation(figures, rates, zenoh)
 
 
 def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
-    """SessionKey of these pairs no other is as good as in both, and better in one; less is better."""
+    """Which pairs no other pair beats: as low in both and lower in one."""
     pairs = list(costs)
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
 
@@ -236,9 +239,9 @@ def _beside_float64(points: Sequence[Point], sensors: str) -> list[Point]:
     if baseline.reason is not None:
         raise BurdenError(f"float64 itself does not keep the loop running, sensors {sensors}: {baseline.reason}")
     if not (baseline.z_track and baseline.u_total):
-        raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing compares with that; let the body move")
+        raise BurdenError(f"float64 makes no error, sensors {sensors}: nothing to compare with; let the reference move")
     done = [point for point in mine if point.reason is None]
-    front = pareto_front((_known(point.bits_per_s), _known(point.z_track)) for point in done)
+    front = pareto_front((_figure(point.bits_per_s), _figure(point.z_track)) for point in done)
     on_front = {id(point) for point, best in zip(done, front, strict=True) if best}
     return [
         point.model_copy(update={"pareto": id(point) in on_front, "against_float64": _ratios(point, baseline)})
@@ -250,10 +253,10 @@ def _ratios(point: Point, baseline: Point) -> Ratios | None:
     if point.reason is not None:
         return None
     names = Ratios.model_fields
-    return Ratios(**{name: _known(getattr(point, name)) / _known(getattr(baseline, name)) for name in names})
+    return Ratios(**{name: _figure(getattr(point, name)) / _figure(getattr(baseline, name)) for name in names})
 
 
-def _known(figure: float | None) -> float:
-    """A figure that is there, because its point has no reason why it should not be."""
+def _figure(figure: float | None) -> float:
+    """A figure of a point without a `reason`, which has all of them."""
     assert figure is not None
     return figure

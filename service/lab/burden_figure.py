@@ -1,6 +1,6 @@
-"""The figure of `lab burden`: error against payload bits a second, a panel for each of the sensors.
+"""Figure of `lab burden`: error against payload bits a second, one panel for each of the sensors.
 
-Both axes are logarithmic. Colour and shape say which quantizer; a full marker sends on change, a hollow one at every
+Both axes are logarithmic. Colour and shape mark the quantizer; a full marker is sent on change, a hollow one at every
 tick. A line joins the Pareto front, its points labelled with bits out/in; dotted lines mark float64 at every tick.
 """
 
@@ -20,7 +20,7 @@ from aeroloop.service.lab.burden_grid import BurdenError
 from aeroloop.service.lab.burden_table import short_name
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
-# Colours that differ in brightness as well, for print and for eyes that see no red.
+# Colours that differ in brightness as well, for print and for red-blind readers.
 _STYLES: Final = {
     "uniform": ("#1f5fa8", "o"),
     "hysteresis-uniform": ("#d9731a", "s"),
@@ -35,7 +35,7 @@ _TICKS: Final = [digit * 10**power for power in range(-1, 6) for digit in (1, 2,
 
 
 def check_path(path: Path) -> Path:
-    """The path of a figure. Raises BurdenError if it could not be written."""
+    """The path of a figure. Raises BurdenError if its suffix or folder is wrong."""
     if path.suffix not in SUFFIXES:
         raise BurdenError(f"a figure ends in {', '.join(SUFFIXES)}, not {path.name!r}")
     if not path.absolute().parent.is_dir():
@@ -47,7 +47,7 @@ def draw_burden(burden: Burden, path: Path) -> None:
     """Draw the grid into a file.
 
     Raises:
-        BurdenError: It cannot be written.
+        BurdenError: The file cannot be written.
     """
     check_path(path)
     names = list(burden.sensors)
@@ -114,19 +114,19 @@ def _draw(panel: Axes, points: list[Point]) -> None:
 
 
 def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
-    """Label places on a front, to the lower left, where there is nothing; leave out what would cover another label."""
-    there: list[tuple[float, float]] = []
+    """Label places on a front to the lower left, where no point is; skip labels that would overlap another."""
+    placed: list[tuple[float, float]] = []
     for label, (x, y) in labels:
         if any(
-            abs(log10(x / other)) < _LABEL_WIDTH and abs(log10(y / above)) < _LABEL_HEIGHT for other, above in there
+            abs(log10(x / other)) < _LABEL_WIDTH and abs(log10(y / above)) < _LABEL_HEIGHT for other, above in placed
         ):
             continue
-        there.append((x, y))
+        placed.append((x, y))
         panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
 
 
 def _legend(burden: Burden) -> list[Line2D]:
-    """What colours, markers and lines mean; three columns, filled downwards."""
+    """Entries of the legend; three columns, filled downwards."""
     drawn = dict.fromkeys(point.quantizer for point in burden.points if point.quantizer is not None)
     quantizers = [_key(_STYLES[kind][0], _STYLES[kind][1], short_name(kind)) for kind in drawn]
     color, marker = _STYLES[None]

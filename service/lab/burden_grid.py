@@ -1,8 +1,8 @@
-"""The grid of `lab burden`: what is tried, and the configuration of each cell.
+"""Grid of `lab burden`: its cells and the configuration of each.
 
-Bits run from where the loop begins to shake to where more of them gain nothing. Sensors run from none at all to a gyro
-whose noise is wider than a step: noise, more than motion, is what changes a level from one tick to the next. So besides
-one kind of quantizer for all signals there is hysteresis on the rate alone, which is where the noise is.
+Bits range from those at which the loop begins to shake to those beyond which more gain nothing. Sensors range from
+perfect ones to a gyro with noise wider than a step: noise, more than motion, changes a level from one tick to the
+next. So besides one kind of quantizer for all signals, one choice has hysteresis on the noisy signal alone, the rate.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from aeroloop.service.config import Settings
 BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
 FLOAT64: Final = (None, None)
 COUNTED: Final = ((8, 6), FLOAT64)
-"""Bits out and in of the cells whose bytes are counted on a Zenoh link: the paper's case, and the baseline."""
+"""Bits out and in of the cells counted on a Zenoh link: the paper's case, and the baseline."""
 QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
     **{kind: (kind, kind, kind) for kind in get_args(Kind)},
     "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
 }
-"""Kinds for ε, ω and u, by what to call them together."""
+"""Kinds for ε, ω and u, by the name of the choice."""
 
 
 class BurdenError(AeroloopError):
-    """The grid cannot be run; one line that says why."""
+    """The grid cannot be run; one line with the reason."""
 
 
 class SensorChoice(NamedTuple):
-    """What measures.
+    """A choice of sensors.
 
     Attributes:
-        text: In words.
+        text: Description for a person.
         changes: Fields of `plant.sensors`.
     """
 
@@ -63,7 +63,7 @@ SENSORS: Final = {
         {"attitude": "encoders", "rate": "gyro", "gyro_noise": 0.02},
     ),
 }
-"""Whatever else `plant.sensors` says stays as configured."""
+"""Other fields of `plant.sensors` stay as configured."""
 
 
 class BurdenCell(NamedTuple):
@@ -79,7 +79,7 @@ class BurdenCell(NamedTuple):
 def grid(
     settings: Settings, bits: Sequence[str] = (), quantizers: Sequence[str] = (), sensors: Sequence[str] = ()
 ) -> list[BurdenCell]:
-    """The cells of a grid; float64 is always among them. What is left empty is all there is.
+    """The cells of a grid, always with float64. An empty argument selects all.
 
     Args:
         settings: The configuration.
@@ -88,10 +88,10 @@ def grid(
         sensors: Names out of SENSORS.
 
     Raises:
-        BurdenError: Something that there is not, or a cell that the configuration does not allow.
+        BurdenError: An unknown name, or a cell that the configuration does not allow.
     """
     if settings.plant.ideal:
-        raise BurdenError("plant.ideal has no sensors to choose: leave it out, and take --sensors perfect")
+        raise BurdenError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
     pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
     kinds = [_one_of("--quantizer", name, tuple(QUANTIZERS)) for name in dict.fromkeys(quantizers)] or list(QUANTIZERS)
     levels = [_one_of("--sensors", name, tuple(SENSORS)) for name in dict.fromkeys(sensors)] or list(SENSORS)
@@ -108,10 +108,10 @@ def grid(
 
 
 def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
-    """The configuration of a cell, which sends at every tick.
+    """The configuration of a cell, sending at every tick.
 
     Raises:
-        BurdenError: The quantizer does not take so few bits, or the plant has no such sensors.
+        BurdenError: The bits are too few for the quantizer, or the plant has no such sensors.
     """
     wire, plant = settings.wire, settings.plant
     out, inp = cell.bits_out, cell.bits_in
@@ -135,7 +135,7 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
 
 
 def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> SignalSpec:
-    """A signal with other bits and another quantizer; parameters stay where they are that quantizer's."""
+    """A signal with other bits and another quantizer; parameters stay if the kind stays."""
     if kind in (None, signal.kind):
         return signal.with_bits(bits)
     return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
@@ -153,7 +153,7 @@ def _is_bits(word: str) -> bool:
     return word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS)
 
 
-def _one_of(option: str, name: str, known: Sequence[Any]) -> Any:
-    if name not in known:
-        raise BurdenError(f"{option} takes {', '.join(known)}, not {name!r}")
+def _one_of(option: str, name: str, choices: Sequence[Any]) -> Any:
+    if name not in choices:
+        raise BurdenError(f"{option} takes {', '.join(choices)}, not {name!r}")
     return name

@@ -1,7 +1,7 @@
-"""What a person sees of `lab burden`: a table for each of the sensors, in the terminal or as Markdown.
+"""Tables of `lab burden`: one for each of the sensors, in the terminal or as Markdown.
 
-A row is one experiment, with its cost under either policy, beside float64 at every tick. What could not be had is a
-dash, with the reason below. In the terminal a column folds where it must; in a pipe or a file, lines stay whole.
+A row is one experiment with its traffic under both policies, compared with float64 at every tick. A missing figure is a
+dash, with the reason below. Columns fold in the terminal; in a pipe or a file lines stay whole.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ HEADER: Final = (
     "CAN kbit/s",
 )
 STAMP_BYTES: Final = 47
-"""What Zenoh's time of publication (26) and source info (21) take; counted with Zenoh 1.10."""
+"""Zenoh's time of publication (26 bytes) and source info (21 bytes); counted with Zenoh 1.10."""
 _PIPE_WIDTH: Final = 160
 _SPLIT: Final = "†"
 
@@ -40,7 +40,7 @@ def burden_table(burden: Burden) -> None:
     """Print the grid."""
     console = Console()
     if not console.is_terminal:
-        console.width = _PIPE_WIDTH  # nobody folds a file's lines back
+        console.width = _PIPE_WIDTH  # folded lines cannot be unfolded in a file
     for name, text in burden.sensors.items():
         table = Table(
             title=f"sensors {name}: {text}", title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
@@ -59,7 +59,7 @@ def burden_table(burden: Burden) -> None:
 
 
 def markdown(burden: Burden) -> str:
-    """Write the grid as Markdown."""
+    """Format the grid as Markdown."""
     lines: list[str] = []
     for name, text in burden.sensors.items():
         lines += [f"**Sensors `{name}`**: {text}", "", f"| {' | '.join(HEADER)} |"]
@@ -70,7 +70,7 @@ def markdown(burden: Burden) -> str:
 
 
 def short_name(quantizer: str) -> str:
-    """What a table or a legend calls a quantizer."""
+    """Name of a quantizer in a table or a legend."""
     return "hysteresis on ω" if quantizer == "hysteresis-rate" else quantizer.removesuffix("-uniform")
 
 
@@ -113,7 +113,7 @@ def _payload(point: Point) -> str:
 
 
 def _bus(point: Point) -> str:
-    """Bits a second on the bus, and its load; a split is marked, and so is what no bus carries."""
+    """Bits a second on the bus, and its load; marks a split frame and a load above 1."""
     if point.can_bits_per_s is None or point.can_load is None or point.measurement is None or point.command is None:
         return "–"
     split = _SPLIT if max(point.measurement.can_frames, point.command.can_frames) > 1 else ""
@@ -130,7 +130,7 @@ def _ms(interval: float | None, digits: str = ".1f") -> str:
 
 
 def _counted(burden: Burden, sensors: str) -> Iterator[str]:
-    """What was counted on a Zenoh link, and why a row is empty."""
+    """Bytes counted on a Zenoh link, and the reason of each empty row."""
     points = burden.under(sensors)
     when = {"periodic": "every tick", "on_change": "on change"}
     counted = [
@@ -150,7 +150,7 @@ def _name(point: Point) -> str:
 
 
 def _counted_kbit(burden: Burden, bits: int) -> str:
-    """What both directions carry of a counter of so many bits at every tick [kbit/s]."""
+    """Rate of a counter of `bits` bits at every tick, both directions together [kbit/s]."""
     return f"{2 * bits * burden.rate_hz / 1e3:g}"
 
 

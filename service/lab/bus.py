@@ -1,20 +1,20 @@
-"""What a frame costs on a classic CAN bus, at the worst.
+"""Frame sizes on a classic CAN bus, with worst-case bit stuffing.
 
-A data frame with an 11-bit identifier has 34 bits under stuffing besides its data, and 13 that are not stuffed: the
-CRC's delimiter, the acknowledgement, the end of the frame, and the three bits of silence before the next. After five
-equal bits the sender stuffs an opposite one, so at the worst one bit in four after the first is added (Davis, Burns,
-Bril and Lukkien 2007). A frame of more than eight bytes fits only CAN FD, which is what this project sends it in; here
-it is reckoned as the classic frames that its bytes would fill, without the header that telling them apart would take.
+A data frame with an 11-bit identifier has, besides its data, 34 bits under stuffing and 13 without: CRC delimiter,
+acknowledgement, end of frame and the three bits of interframe space. After five equal bits the sender stuffs an
+opposite one, so at worst one bit is added for every four after the first (Davis, Burns, Bril and Lukkien 2007). A frame
+of more than eight bytes goes as one CAN FD frame in this project; here it counts as the classic frames that its bytes
+fill, without a header that distinguishes them.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from aeroloop.protocol.transport.can_link import CLASSIC_BYTES
+from aeroloop.protocol.transport.can_format import CLASSIC_BYTES
 
 BITRATE: Final = 1_000_000
-"""Bits a second of the bus whose load is reckoned, the most that classic CAN has."""
+"""Bit rate for the load, the highest of classic CAN [bit/s]."""
 _STUFFED: Final = 34
 _UNSTUFFED: Final = 13
 
@@ -35,15 +35,15 @@ def classic_frame_bits(data_bytes: int) -> int:
 
 
 def classic_frames(size: int) -> list[int]:
-    """Data bytes of each classic frame that one of our frames fills.
+    """Data bytes of each classic frame that a frame of the loop fills.
 
     Args:
-        size: Bytes of our frame, ≥ 1.
+        size: Bytes of the loop's frame, ≥ 1.
     """
     full, rest = divmod(size, CLASSIC_BYTES)
     return [CLASSIC_BYTES] * full + [rest] * (rest > 0)
 
 
 def bus_bits(size: int) -> int:
-    """Bits on a classic bus, at the worst, of one of our frames of so many bytes."""
+    """Worst-case bits on a classic bus of a frame of the loop of `size` bytes."""
     return sum(classic_frame_bits(data_bytes) for data_bytes in classic_frames(size))

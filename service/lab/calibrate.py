@@ -1,9 +1,9 @@
-"""Calibration: two numbers of the plant from one calm cell, the wind from one windy cell.
+"""Calibration: fits two plant parameters to one calm cell, and the wind to one windy cell.
 
-The calm cell cont/cont gives two figures, and two physical parameters answer to them: Coulomb friction of the yaw axis
-(chiefly z_track) and the height of the centre of mass (chiefly u_total). The windy cell cont/cont gives the wind's
-steady torque about pitch and yaw. Everything else stays as measured by others, and no other cell is looked at. Two
-equations with two unknowns are solved by Newton's method with a finite-difference Jacobian.
+The calm cell cont/cont has two figures and determines two parameters: Coulomb friction of the yaw axis (chiefly from
+z_track) and the height of the centre of mass (chiefly from u_total). The windy cell cont/cont determines the wind's
+steady torque about pitch and yaw. All other parameters keep their published measurements, and no other cell is used.
+Each pair of equations is solved by Newton's method with a finite-difference Jacobian.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ TABLE_C1_HEIGHT: Final = -0.0038
 """Height of the centre of mass in the paper's Table C.1 [m]."""
 MAX_ROUNDS: Final = 8
 TOLERANCE: Final = 1e-3
-"""A figure is met when it is this close, relatively: the published ones have two to four digits."""
+"""Relative tolerance of a fitted figure; the published ones have two to four digits."""
 
 
 class Calibration(BaseModel):
-    """Fitted parameters, what they reach, and how they compare with independent measurements."""
+    """Fitted parameters, the figures they reach, and independent measurements of them."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -41,22 +41,22 @@ class Calibration(BaseModel):
     calm: dict[str, float] = Field(description="z_track [1e-4 s] and u_total [V²·s] reached in the calm cell")
     windy: dict[str, float] = Field(description="the same in the windy cell")
     residuals: dict[str, float] = Field(description="relative residual of each of the four figures")
-    runs: int = Field(description="experiments that it took")
+    runs: int = Field(description="number of experiments")
 
 
 class CalibrationError(AeroloopError):
-    """Newton's method did not arrive; one line."""
+    """Newton's method did not converge; one line."""
 
 
 def calibrate(settings: Settings, progress: Callable[[int], None] | None = None) -> Calibration:
     """Fit the plant, then the wind.
 
     Args:
-        settings: The configuration; its values of the fitted parameters are where the search starts.
+        settings: The configuration; the search starts from its values of the fitted parameters.
         progress: Called with the number of experiments done.
 
     Raises:
-        CalibrationError: The figures cannot be reached.
+        CalibrationError: A cell is not reached within MAX_ROUNDS.
     """
     runs = 0
     published = paper.WIND["continuous"]

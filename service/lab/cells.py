@@ -1,7 +1,6 @@
-"""Cells of the paper's experiment, run side by side on every core.
+"""Cells of the paper's tables, run in parallel on every core.
 
-A cell is one lockstep experiment: bits out, bits in, wind or calm, a seed. Cells know nothing of each other, so they go
-to a pool of processes.
+A cell is one lockstep experiment: bits out, bits in, wind or calm, a seed. Cells are independent of each other.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ class Cell(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a cell gave, in the units of the paper's tables."""
+    """Figures of a cell, in the units of the paper's tables."""
 
     z_track: float  # [1e-4 s]
     u_total: float  # [V²·s]
@@ -51,5 +50,5 @@ class Pool(Workers):
     """Processes that run cells, one a core. A context."""
 
     def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:
-        """Results of cells in their order; `progress` hears how many are done."""
+        """Results of cells in their order; `progress` is called with the number done."""
         return self.each(run_cell, ((settings.description(), cell) for settings, cell in jobs), progress)

@@ -1,4 +1,4 @@
-"""The demo: controller, emulator and recorder as three processes on loopback, and the figures out of their log."""
+"""Demo: runs controller, plant and recorder as processes on loopback and reviews their log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REFRESH_S = 0.1
 
 @dataclass
 class Progress:
-    """What the demo shows while it runs, gathered from the network."""
+    """Values that the demo shows while it runs, from received telemetry and statuses."""
 
     settings: Settings
     time_s: float = 0.0
@@ -37,7 +37,7 @@ class Progress:
     payload: PayloadRate = field(default_factory=PayloadRate)
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """Take in a telemetry or status message."""
+        """Update from a telemetry or status message."""
         address = topics.read_key(str(sample.key_expr))
         if address is None:
             return
@@ -54,7 +54,7 @@ class Progress:
 
     @property
     def rate_hz(self) -> float:
-        """Ticks a second of the controller, as it last said."""
+        """Ticks a second in the controller's last status."""
         return self.statuses["controller"].rate_hz if "controller" in self.statuses else 0.0
 
     @property
@@ -64,7 +64,7 @@ class Progress:
 
     @property
     def bits_per_s(self) -> tuple[float, float]:
-        """Payload bits a second of measurements and commands, now."""
+        """Payload bits a second of measurements and of commands."""
         return self.payload.bits_per_s(self.settings.wire)
 
 
@@ -75,16 +75,16 @@ def run_demo(
 
     Args:
         settings: The configuration; the rendezvous is replaced by a free one.
-        duration_s: How long, on the law's clock [s].
-        log: Where the log goes; None for a new file in the recorder's directory.
-        show: Called ten times a second with what is known.
+        duration_s: Length on the law's clock [s].
+        log: Path of the log; None for a new file in the recorder's directory.
+        show: Called ten times a second with the progress.
 
     Returns:
-        The figures, and whether it ran to the end (False after ^C).
+        The figures, and whether the run is complete (False after ^C).
 
     Raises:
         ProcessGroupError: A process did not start, or failed, or the log exists.
-        ReviewError: The log cannot be judged.
+        ReviewError: The log cannot be reviewed.
     """
     path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
     if parts(path):
@@ -119,7 +119,7 @@ def run_demo(
 
 @contextmanager
 def _on_interrupt(event: threading.Event) -> Iterator[None]:
-    """Let ^C and SIGTERM set an event. KeyboardInterrupt could strike, and be lost, in any line of any library."""
+    """Set an event at ^C and SIGTERM. Why not KeyboardInterrupt: a library may catch and drop it at any line."""
     previous = {which: signal.signal(which, lambda *_: event.set()) for which in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield

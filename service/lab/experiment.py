@@ -1,7 +1,7 @@
-"""Controller and plant end in one process, in lockstep, through real frames.
+"""Experiment: runs controller and plant end in one process, in lockstep, through real frames.
 
-No network and no clock: a `for` loop over the two ticks. What it computes repeats bit for bit, and a demo in lockstep
-over Zenoh gives the very same figures.
+A `for` loop over the two ticks, without network or clock. It repeats bit for bit, and a demo in lockstep over Zenoh
+gives the same figures.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from aeroloop.service.figures import Figures, Score
 NO_CLOCK = "lockstep without a network has no latency"
 
 Watch: TypeAlias = Callable[[int, bytes, bytes], None]
-"""Sees every tick: k, the measurement, the command that answers it; SILENCE where a frame is not sent."""
+"""Called at every tick with k, the measurement and the command that answers it; SILENCE where none is sent."""
 
 
 class LoopEndedError(ValueError):
-    """The loop ended before its time: the plant tripped. One line that says when and why."""
+    """The plant tripped before the end; one line with time and cause."""
 
 
 def run_experiment(
@@ -33,22 +33,27 @@ def run_experiment(
     duration_s: float,
     progress: Callable[[float], None] | None = None,
     watch: Watch | None = None,
+    *,
+    plant: Plant | None = None,
+    controller: Controller | None = None,
 ) -> Figures:
     """Run the closed loop for `duration_s` of the law's time and return its figures.
 
     Args:
         settings: The configuration.
-        duration_s: How long [s].
-        progress: Called now and then with the time reached [s].
-        watch: Called at every tick with the frames of both directions, for whoever counts them.
+        duration_s: Length of the run [s].
+        progress: Called once a second of the run with the time reached [s].
+        watch: Called at every tick with the frames of both directions.
+        plant: Plant to control; the emulated one of the configuration if None.
+        controller: Controller to run; the configuration's if None.
 
     Raises:
-        LoopEndedError: The plant tripped on the way.
-        ValueError: The configuration does not make a loop, such as a law that commands 3 motors of a plant with 2.
+        LoopEndedError: The plant tripped.
+        ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2.
     """
     loop, wire = settings.loop, settings.wire
-    plant = _plant(settings)
-    controller = Controller(wire, settings.law, settings.reference, loop.period)
+    plant = plant or _plant(settings)
+    controller = controller or Controller(wire, settings.law, settings.reference, loop.period)
     guard = settings.plant.guard(loop.period_ns, wire.voltage.quantizer().outermost)
     endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, guard=guard)
     score = Score(wire, loop.period, settings.plant.watchdog_s)
@@ -81,7 +86,7 @@ def run_experiment(
 
 
 def _plant(settings: Settings) -> Plant:
-    """The plant, with the faults that were asked for; frames cannot fail where they cross no network."""
+    """The plant with its configured faults; faults of frames need a network."""
     plant: Plant = settings.plant.build(settings.loop.period)
     if not settings.plant.faults:
         return plant
@@ -94,7 +99,7 @@ def _plant(settings: Settings) -> Plant:
 
 
 def _undisturbed(ticks: int) -> Iterator[int]:
-    """Tick indices, with the garbage collector off until they are used up: the loop makes no cycles to collect."""
+    """Tick indices, with the garbage collector off meanwhile: the loop makes no cycles to collect."""
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""The paper's published results, Tables C.2–C.4: what a prediction is held against.
+"""Published results of the paper, Tables C.2–C.4.
 
 Rows are bits of the input, columns bits of the output; None is the paper's "cont.".
 """

@@ -1,7 +1,7 @@
-"""The paper's Tables C.2–C.4, predicted: every cell through real frames in lockstep, ours beside the paper's.
+"""Tables C.2–C.4 of the paper, predicted: one experiment per cell, in lockstep through real frames.
 
-The plant was calibrated on two cells, both without quantization: calm (C.2, C.3) and windy (C.4). All others are
-predictions, and only they count in the mean absolute relative error.
+The plant was calibrated on two cells without quantization: calm (C.2, C.3) and windy (C.4). All others are predictions,
+and only these count in the mean absolute relative error.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Rows = list[list[float]]
 
 
 class Table(BaseModel):
-    """A table, ours and the paper's."""
+    """A predicted table and the published one."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -32,7 +32,7 @@ class Table(BaseModel):
 
 
 class Tables(BaseModel):
-    """All three, with units as in the paper."""
+    """The three tables, in the paper's units."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -45,8 +45,8 @@ def predict(settings: Settings, seeds: int = 1, progress: Callable[[int, int], N
     """Run every cell, `seeds` times each with seeds from 0 up.
 
     Args:
-        settings: The configuration; bits and wind are the cells'.
-        seeds: How many runs a cell's mean is taken over.
+        settings: The configuration; each cell sets bits and wind.
+        seeds: Number of runs per cell; a figure is their mean.
         progress: Called with cells done and cells in all.
     """
     calm = [(out, inp, False) for inp in paper.INPUT_BITS for out in paper.OUTPUT_BITS]
@@ -117,7 +117,7 @@ def _wind(runs: _Runs) -> Table:
 
 
 def markdown(tables: Tables) -> str:
-    """Write the tables as Markdown: ours, with the paper's in brackets."""
+    """Format the tables as Markdown: ours, with the paper's in brackets."""
     lines: list[str] = []
     for title, table, digits in (
         ("z_track, 10⁻⁴ s (Table C.2)", tables.C2, 1),

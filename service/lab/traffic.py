@@ -1,7 +1,7 @@
-"""What one direction of a loop sends: frames, changes, the time between them, and what they cost.
+"""Traffic of one direction of a loop: frames, changes, intervals, bits on the wire and on CAN.
 
-It is reckoned from the frames of every tick. Sending on change keeps back those that say what the last one said, and
-the other end then holds the same levels, so one run tells what either policy sends.
+Computed from the frames of every tick. Sending on change withholds frames that repeat the last one, and the other end
+holds the same levels, so one run gives the traffic of either policy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Codes: TypeAlias = tuple[float, ...]
 
 
 class Traffic(StreamFigures):
-    """Traffic of one direction under one policy, over the time that was judged."""
+    """Traffic of one direction under one policy, over the whole run."""
 
     frames_per_s: float
     bits_per_s: float = Field(description="payload bits, padding included")
@@ -38,37 +38,37 @@ class Traffic(StreamFigures):
 
 
 def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> list[Codes]:
-    """What frames say.
+    """Codes of frames.
 
     Raises:
-        ValueError: A frame is malformed, which no end sends.
+        ValueError: A frame is malformed.
     """
-    read = [kind.unpack(frame) for frame in frames]
-    if any(one is None for one in read):
+    unpacked = [kind.unpack(frame) for frame in frames]
+    if None in unpacked:
         raise ValueError("a frame is malformed")
-    return [one[1] for one in read if one is not None]
+    return [content[1] for content in unpacked if content is not None]
 
 
 def sent_ticks(codes: Sequence[Codes], policy: Policy, heartbeat: int, counters: int) -> list[int]:
     """The ticks at which a policy sends.
 
     Args:
-        codes: What there is to say at every tick from 0 on.
-        policy: When frames are sent.
+        codes: Codes at every tick from 0 on. Shape (ticks, components).
+        policy: The transmit policy.
         heartbeat: The most ticks from one frame to the next.
-        counters: How many values the counter of frames has.
+        counters: Number of values of the frame counter.
     """
     sender = Sender(policy, heartbeat, counters)
-    return [k for k, said in enumerate(codes) if sender.due(k, said)]
+    return [k for k, current in enumerate(codes) if sender.due(k, current)]
 
 
 def traffic(codes: Sequence[Codes], kind: FrameFormat, sent: Sequence[int], period: float) -> Traffic:
     """The traffic of one direction.
 
     Args:
-        codes: What there was to say at every tick from 0 on. Shape (ticks, components).
-        kind: Frames of it.
-        sent: The ticks at which one was sent.
+        codes: Codes at every tick from 0 on. Shape (ticks, components).
+        kind: Format of the frames.
+        sent: Ticks at which a frame was sent.
         period: Time between ticks [s].
 
     Raises:

@@ -1,7 +1,7 @@
-"""Work spread over processes, one a core: experiments that know nothing of each other, run side by side.
+"""Worker processes, one per core, for independent experiments.
 
-What is asked and what is answered travels between processes, so both are plain data: a configuration goes as its dump,
-and only figures come back.
+Arguments and results cross process boundaries, so both are plain data: a configuration goes as its dump, and only
+figures return.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Self, TypeVar, TypeVarTuple
 
-Asked = TypeVarTuple("Asked")
-Answered = TypeVar("Answered")
+Arguments = TypeVarTuple("Arguments")
+Result = TypeVar("Result")
 
 
 class Workers:
-    """Processes that wait for work. A context."""
+    """A pool of processes. A context."""
 
     def __init__(self) -> None:
-        # Spawned, not forked: a fork would inherit threads of whatever the caller has open.
+        # Spawned, not forked: a fork would inherit the locks of the caller's threads.
         self._executor = ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
 
     def __enter__(self) -> Self:
@@ -31,19 +31,19 @@ class Workers:
 
     def each(
         self,
-        work: Callable[[*Asked], Answered],
-        jobs: Iterable[tuple[*Asked]],
+        work: Callable[[*Arguments], Result],
+        jobs: Iterable[tuple[*Arguments]],
         progress: Callable[[int], None] | None = None,
-    ) -> list[Answered]:
-        """What a function of a module answers to each of these arguments, in their order.
+    ) -> list[Result]:
+        """Results of a function for each tuple of arguments, in their order.
 
         Args:
-            work: The function.
-            jobs: Its arguments, one tuple a call.
-            progress: Hears how many are done.
+            work: A function at the top level of a module.
+            jobs: Its arguments, one tuple per call.
+            progress: Called with the number done.
 
         Raises:
-            Exception: Whatever the function raised first.
+            Exception: The first exception that the function raised.
         """
         futures = [self._executor.submit(work, *job) for job in jobs]
         for done, future in enumerate(as_completed(futures), 1):

@@ -1,9 +1,8 @@
-"""Bytes that frames take on a Zenoh link, counted where they pass.
+"""Bytes that frames take on a Zenoh link, counted by a relay.
 
-Two sessions, configured as the roles' are, speak through a relay on loopback, and the relay counts what TCP carries:
-the payload and all that Zenoh puts around it (lengths, key, quality of service), without the headers of TCP and IP.
-What joins the two is not counted. A link keeps itself alive with 3 bytes, four times a lease, in a direction that says
-nothing else; frames leave no time for that.
+Two sessions, configured like those of the roles, connect through a TCP relay on loopback. The relay counts the bytes
+that TCP carries: payload and Zenoh's envelope (lengths, key, quality of service), without the headers of TCP and IP.
+The handshake is not counted. An idle direction carries a keep-alive of 3 bytes four times a lease; frames replace it.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ from aeroloop.protocol.transport.network import NetworkSettings, join
 
 _VEHICLE: Final = "aero"
 _SESSION: Final = "1ab0ra70"
-"""As long as the names that controllers make up: a key's length can tell in the bytes."""
+"""As long as a controller's session names: the length of a key counts in the bytes."""
 _PATIENCE_S: Final = 20.0
 _POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
 
 
 class CountError(AeroloopError):
-    """The link over loopback did not carry what it was given; one line."""
+    """The link over loopback did not carry every frame; one line."""
 
 
 class LinkBytes(NamedTuple):
@@ -44,15 +43,15 @@ class LinkBytes(NamedTuple):
 
 
 class CountingRelay:
-    """Passes one TCP connection on, and counts. A context; the connection may come at any time within it.
+    """Forwards one TCP connection on loopback and counts its bytes. A context.
 
     Args:
-        port: Where it is passed on to, on loopback.
+        port: Port to forward to.
 
     Attributes:
-        port: Where it is taken from, on loopback.
-        there: Bytes from who connected, so far.
-        back: Bytes to who connected, so far.
+        port: Port to connect to.
+        there: Bytes from the connecting side, so far.
+        back: Bytes to the connecting side, so far.
     """
 
     def __init__(self, port: int) -> None:
@@ -72,7 +71,7 @@ class CountingRelay:
     ) -> None:
         for one in self._sockets:
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)  # wakes who waits in it; close alone does not
+                one.shutdown(socket.SHUT_RDWR)  # wakes a thread blocked in it; close alone does not
         for thread in self._threads:
             thread.join()
         for one in self._sockets:
@@ -105,20 +104,20 @@ class CountingRelay:
 def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], commands: Sequence[bytes]) -> LinkBytes:
     """Send frames over a Zenoh link, first all of one direction, then all of the other, and count their bytes.
 
-    Express messages each go in a batch of their own, so what they take does not depend on the pace at which they are
-    sent. They are sent as in lockstep, blocking rather than dropped; that is one bit of a byte that is there anyway.
+    Express messages go one per batch, so their size does not depend on the rate. They are sent as in lockstep, blocking
+    rather than dropping; that sets one bit and adds no byte.
 
     Args:
-        network: All that is not an address.
-        measurements: The frames of one direction, in their order.
-        commands: The frames of the other.
+        network: Settings of both sessions; their addresses are replaced.
+        measurements: Frames of the plant, in order.
+        commands: Frames of the controller, in order.
 
     Raises:
         CountError: A frame did not arrive.
         NetworkError: A session cannot be opened.
     """
     port = _free_port()
-    here = {"rendezvous": "", "gossip": False}  # two need neither, and they would be counted
+    here = {"rendezvous": "", "gossip": False}  # two peers need neither, and their bytes would count
     plant_side = network.model_copy(update={**here, "listen": [f"tcp/127.0.0.1:{port}"], "connect": []})
     with CountingRelay(port) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})
@@ -128,7 +127,7 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
             link = partial(ZenohLink, lossless=True)
             plant_end = link(plant, keys[0], keys[1], mailbox=to_plant)
             controller_end = link(controller, keys[1], keys[0], mailbox=to_controller)
-            _meet(plant, controller)
+            _await_declarations(plant, controller)
             before = relay.back
             _send(plant_end, measurements, to_controller)
             measured = relay.back - before
@@ -145,8 +144,8 @@ def _send(link: ZenohLink, frames: Sequence[bytes], other: Mailbox) -> None:
             raise CountError(f"a Zenoh link over loopback did not carry {len(frames)} frames")
 
 
-def _meet(plant: zenoh.Session, controller: zenoh.Session) -> None:
-    """Return once each knows what the other has declared: a claim and its grant, as Zenoh keeps the order on a link."""
+def _await_declarations(plant: zenoh.Session, controller: zenoh.Session) -> None:
+    """Wait until each session has the other's declarations: a query and its reply, since a link keeps the order."""
     key = topics.key("claim", _VEHICLE)
     plant.declare_queryable(key, lambda query: query.reply(key, b""))
     deadline = time.monotonic() + _PATIENCE_S

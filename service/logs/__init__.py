@@ -1,1 +1,1 @@
-"""Logs: their files, the runs in them, replay, review and export."""
+"""Reading of logs: MCAP files, joined traces, recomputed ticks, replay, recovery and export."""

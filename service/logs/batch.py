@@ -1,8 +1,8 @@
-"""The controller over thousands of ticks at once, bit for bit what it computes a tick at a time.
+"""Controller over thousands of ticks at once, bit for bit what it computes tick by tick.
 
-A log has all the measurements, so only the attitude's sign and θ̂ go from tick to tick. The law and the reference are
-the loop's own CasADi instructions, run over columns with a row a tick (symbolic.py, `law_of_many`), so the
-bits are the loop's (tests/service/logs/test_batch.py); a tick costs a microsecond instead of 15.
+All measurements are in the log, so only the attitude's sign and θ̂ carry over from tick to tick. The law and the
+reference are the loop's own CasADi instructions, run over columns with a row per tick (`law_of_many`,
+protocol/wire/symbolic.py), so the bits are the loop's (tests/service/logs/test_batch.py); a tick costs 1 µs, not 15.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from aeroloop.service.logs.codes import encoded_by, levels
 from aeroloop.service.logs.traces import Array, Integers
 
 ROWS: Final = 1024
-"""Ticks that CasADi is given at once: so many that calls cost little, so few that columns stay in the cache."""
+"""Ticks per CasADi call: enough to make calls cheap, few enough for columns to stay in the CPU cache."""
 
 _DESIRED: Final = ("q_d", "omega_d", "omega_d_dot")
 
 
 class Computed(NamedTuple):
-    """What the controller made of measurements, a row each; NaN throughout where one had no valid value.
+    """What the controller computed, a row per measurement; all NaN where a measurement has no valid value.
 
     Attributes:
         attitude: q^Q [1]. Shape (n, 4).
@@ -40,10 +40,10 @@ class Computed(NamedTuple):
         rate: ω^Q [rad/s]. Shape (n, 3).
         attitude_error: ε̃ [1]. Shape (n, 3).
         rate_error: ω_e [rad/s]. Shape (n, 3).
-        voltages: u before quantization [V]; NaN where the law gave no number. Shape (n, actuators).
+        voltages: u before quantization [V]; NaN where the law gives no number. Shape (n, actuators).
         sign: ±1, the equilibrium approached. Shape (n, 1).
         gain: C₁'s diagonal [1/s]. Shape (n, 3).
-        damping_estimate: θ̂ that the law went by [N·m·s/rad]. Shape (n, 3).
+        damping_estimate: θ̂ that the law used [N·m·s/rad]. Shape (n, 3).
     """
 
     attitude: Array
@@ -58,11 +58,11 @@ class Computed(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """What the controller answers, a row a tick.
+    """The controller's commands, a row per tick.
 
     Attributes:
-        codes: Of each command, sent or not. Shape (n, actuators).
-        sent: Whether it is sent; otherwise silence stands for it. Shape (n,).
+        codes: Codes of each command, sent or not. Shape (n, actuators).
+        sent: Whether it is sent as a frame; otherwise it is silent. Shape (n,).
     """
 
     codes: Array
@@ -70,14 +70,14 @@ class Commands(NamedTuple):
 
 
 class BatchController:
-    """A controller that takes many measurements at once.
+    """Computes many measurements per call.
 
     Args:
-        wire: How frames are read and written.
+        wire: Format of the frames.
         law: Parameters and gains.
-        reference: What the body shall do from tick 0 on.
+        reference: Reference from tick 0 on.
         period: Time between ticks [s].
-        rows: Ticks that CasADi is given at once; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
+        rows: Ticks per CasADi call; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
 
     Raises:
         ValueError: The law's B cannot be inverted.
@@ -88,7 +88,7 @@ class BatchController:
         self._law = Compiled(law_of_many(law, period, rows))
         desired = {name: self._law.inputs[name] for name in _DESIRED}
         self._reference = Compiled(in_columns(reference_function(), rows), desired)
-        # Their memory as arrays, a column a tick.
+        # CasADi's buffers as arrays, a column per tick.
         self._given = {name: _table(memory, rows) for name, memory in self._law.inputs.items()}
         self._found = {name: _table(memory, rows) for name, memory in self._law.outputs.items()}
         self._piece = {name: _table(memory, rows) for name, memory in self._reference.inputs.items()}
@@ -102,34 +102,34 @@ class BatchController:
 
     @property
     def state(self) -> ControllerSnapshot:
-        """After the last measurement computed and the last command encoded; `held` is of the last row."""
-        said, at = self._sender.memory
-        codes = None if said is None else tuple(map(float, said))
+        """State after the last computed measurement and the last encoded command; `held` has the last row's codes."""
+        last, at = self._sender.memory
+        codes = None if last is None else tuple(map(float, last))
         return self._state.model_copy(update={"sent_codes": codes, "sent_tick": at})
 
     def restore(self, state: ControllerSnapshot) -> None:
-        """Go on as the controller that had this state, given the same reference and gains."""
+        """Continue from a recorded state; reference and gains stay as they are."""
         self._state = state
         resume(self._voltage, state.voltage_codes)
         self._sender.resume(state.sent_codes, state.sent_tick)
 
     def follow(self, other: BatchController) -> None:
-        """Stand where another of the same configuration does: its state, its gains, its reference."""
+        """Copy state, gains and reference of another controller with the same configuration."""
         self.restore(other.state)
         self._gains = dict(other._gains)
         self._motion.plan = other._motion.plan
 
     def compute_all(self, k: Integers, codes: Array, changes: deque[Change]) -> Computed:
-        """What `Controller.compute` makes of measurements, one after another.
+        """Results of `Controller.compute` for measurements in order.
 
         Args:
-            k: Ticks, rising. Shape (n,).
-            codes: Of each measurement. Shape (n, 6).
-            changes: What is followed from which tick on, in order; those that it has come to follow are taken out.
+            k: Ticks, ascending. Shape (n,).
+            codes: Codes of each measurement. Shape (n, 6).
+            changes: Changes of gains and reference in order of tick; those that take effect are removed.
         """
         if not len(k):
             return self._nothing(0)
-        with np.errstate(all="ignore"):  # a float64 wire may say 1e200
+        with np.errstate(all="ignore"):  # a float64 wire may carry 1e200
             vectors, rates = levels(self._wire.attitude, codes[:, :3]).T, levels(self._wire.rate, codes[:, 3:]).T
             valid = np.flatnonzero(~(np.isnan(vectors).any(axis=0) | np.isnan(rates).any(axis=0)))
             computed = self._nothing(len(k))
@@ -144,11 +144,11 @@ class BatchController:
         return computed
 
     def commands(self, k: Integers, voltages: Array) -> Commands:
-        """What `Controller.answer` sends, one after another.
+        """Commands of `Controller.answer` for ticks in order.
 
         Args:
-            k: Ticks, rising. Shape (n,).
-            voltages: What the law commands [V]; rows of NaN for no valid value. Shape (n, actuators).
+            k: Ticks, ascending. Shape (n,).
+            voltages: The law's output [V]; rows of NaN for no valid value. Shape (n, actuators).
         """
         pairs = zip(self._voltage, voltages.T, strict=True)
         codes = np.stack([encoded_by(quantizer, column) for quantizer, column in pairs], axis=1)
@@ -157,15 +157,15 @@ class BatchController:
         if self._wire.transmit.command == "periodic":
             return Commands(codes, np.ones(len(k), dtype=np.bool_))
         due = self._sender.due
-        sent = [due(tick, said) for tick, said in zip(k.tolist(), codes.tolist(), strict=True)]
+        sent = [due(tick, row) for tick, row in zip(k.tolist(), codes.tolist(), strict=True)]
         return Commands(codes, np.array(sent, dtype=np.bool_))
 
     def _nothing(self, n: int) -> Computed:
-        # The values of one element lie side by side in memory: readers take them by element.
+        # The values of one element are contiguous in memory, since readers take them by element.
         return Computed(*(np.full((columns, n), nan).T for columns in (4, 4, 3, 3, 3, self._wire.actuators, 1, 3, 3)))
 
     def _compute(self, k: Integers, vectors: Array, rates: Array, changes: deque[Change]) -> Sequence[Array]:
-        """`Computed`, a column a tick, of as many as there are rows, or fewer; all of them valid."""
+        """`Computed` with a column per tick, for at most `rows` ticks, all of them valid."""
         n, given, found, state = len(k), self._given, self._found, self._state
         given["eps"][:, :n], given["omega"][:, :n] = vectors, rates
         given["last"][:, 0], given["theta"][:, 0] = state.attitude, state.damping_estimate
@@ -180,7 +180,7 @@ class BatchController:
         self._reference()
         given["s"][:] = state.sign or 1
         self._law()
-        if not state.sign and not found["eta_e"][0, 0] >= 0:  # Assumption 3, as the loop's first measurement
+        if not state.sign and not found["eta_e"][0, 0] >= 0:  # Assumption 3, as at the loop's first measurement
             given["s"][:] = -1
             self._law()
         self._state = state.model_copy(
@@ -211,11 +211,11 @@ class BatchController:
         self._motion.change(change, self._period)
 
     def _lay_out(self, t: Array, rows: slice) -> None:
-        """The gains of now, and of the plan of now the pieces that hold at times t [s]."""
+        """Fill in the current gains, and the pieces of the current reference plan at times t [s]."""
         for name, diagonal in self._gains.items():
             self._given[name][:, rows] = diagonal[:, np.newaxis]
         plan = self._motion.plan
-        # One piece for all, if there is but one.
+        # A plan of one piece needs no search.
         piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1) if len(plan.starts) > 1 else [0]
         self._piece["t"][0, rows] = t
         for name in ("start", "quintic", "amplitude", "frequency"):
@@ -224,6 +224,6 @@ class BatchController:
 
 
 def _table(memory: Buffer, rows: int) -> Array:
-    """Memory as an array, a column a tick; one column where it has no row a tick. Shape (n, rows) or (n, 1)."""
+    """A buffer as an array, a column per tick; one column if it has no row per tick. Shape (n, rows) or (n, 1)."""
     width = rows if len(memory) % rows == 0 else 1
     return np.asarray(memory).reshape(-1, width)

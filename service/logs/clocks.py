@@ -4,8 +4,8 @@
     backward = received by the plant − sent by the controller      = delay of the command     − offset
 
 The offset (controller's monotonic clock minus the plant's) is half their difference if both ways are equally fast. It
-is fitted by a straight line over windows of 512 ticks, through the half with the shortest round trips: queues and
-hitches make a way slow, never fast. What is unequal at the median stays in both delays, with opposite signs.
+is fitted by a straight line over windows of 512 ticks, through the half with the shortest round trips. Why: queues and
+hitches only lengthen a delay. A difference of the medians stays in both delays, with opposite signs.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from aeroloop.service.logs.traces import Array
 
 WINDOW: Final = 512
-"""Ticks of a fit; two crystals part by less than a microsecond in a second."""
+"""Ticks per fit; two crystals drift apart by less than 1 µs per second."""
 _LEAST: Final = 16
 
 
 class ClockOffset:
-    """Estimates the offset between two ends' clocks as their ticks come.
+    """Estimates the offset between both ends' clocks, block by block.
 
     Attributes:
         first_ns: The offset at the first tick [ns]; NaN before any.
@@ -35,7 +35,7 @@ class ClockOffset:
         self.first_ns = self.last_ns = nan
 
     def at(self, forward: Array, backward: Array) -> Array:
-        """The offset at ticks in order [ns]; NaN while nothing is known. Shapes (n,).
+        """The offset at ticks in order [ns]; NaN before the first estimate. Shapes (n,).
 
         Args:
             forward: As above, NaN where a time is unknown [ns].
@@ -47,7 +47,7 @@ class ClockOffset:
             there, back = forward[begin:end], backward[begin:end]
             known = np.flatnonzero(~np.isnan(there + back))
             if len(known) >= _LEAST:
-                # Differences of the base stay small: times since a boot have more digits than a product of them keeps.
+                # Differences to a base are small; products of times since boot would exceed a double's digits.
                 base = there[known[0]]
                 trip = (there - base) + (back + base)
                 quick = known[trip[known] <= np.median(trip[known])]

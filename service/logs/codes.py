@@ -1,6 +1,6 @@
-"""Frames, codes and levels, thousands at once, to the last bit what protocol/wire makes of each.
+"""Packing, unpacking and quantizing of thousands of frames at once, bit for bit as protocol/wire does it.
 
-Codes stand in rows of doubles, which hold those of 16 bits and those that are not quantized alike.
+Codes are doubles, which hold codes of 16 bits and values that are not quantized alike.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from aeroloop.service.logs.traces import Array
 
 
 def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array:
-    """What `unpack` says of frames that it does not refuse: the codes of each.
+    """Codes of well-formed frames, as `unpack` returns them.
 
     Args:
         kind: Their format.
-        frames: Bytes each; or an array with a frame in each element, dtype V, or with a frame in each row, dtype uint8.
+        frames: Bytes of each; or an array with a frame per element, dtype V, or per row, dtype uint8.
 
     Returns:
-        Codes, those of one signal side by side in memory. Shape (n, codes).
+        Codes, contiguous in memory per signal. Shape (n, codes).
     """
     octets = frames if isinstance(frames, np.ndarray) else np.frombuffer(b"".join(frames), dtype=np.uint8)
     octets = np.ascontiguousarray(octets).view(np.uint8).reshape(len(frames), kind.size)
-    # A code begins within a byte and ends at most 16 bits, or for a double 64, later; past the end there are zeros.
+    # A code starts within a byte and spans at most 16 bits, or 64 for a double; zeros pad the end.
     columns = np.zeros((kind.size + 9, len(frames)), dtype=np.uint8)
     columns[: kind.size] = octets.T
     codes = np.empty((len(kind.widths), len(frames)))
@@ -51,15 +51,15 @@ def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array
 
 
 def frames_of(kind: FrameFormat, counters: NDArray[np.int64], codes: Array) -> NDArray[np.uint8]:
-    """What `pack` makes of counters and codes.
+    """Frames of counters and codes, as `pack` builds them.
 
     Args:
-        kind: The format.
-        counters: One a frame. Shape (n,).
+        kind: Their format.
+        counters: One per frame. Shape (n,).
         codes: Shape (n, codes).
 
     Returns:
-        A frame in each row. Shape (n, size).
+        A frame per row. Shape (n, size).
     """
     bits = np.zeros((8 * kind.size, len(counters)), dtype=np.uint8)
     bits[: kind.counter_bits] = counters >> np.arange(kind.counter_bits - 1, -1, -1)[:, np.newaxis] & 1
@@ -75,7 +75,7 @@ def frames_of(kind: FrameFormat, counters: NDArray[np.int64], codes: Array) -> N
 
 
 def levels(signal: SignalSpec, codes: Array) -> Array:
-    """The level of each code, in the signal's unit; NaN of one that says "no valid value". Any shape."""
+    """Level of each code, in the signal's unit; NaN for the code of "no valid value". Any shape."""
     table = _levels(signal)
     return codes if table is None else table[codes.astype(np.intp)]  # a negative index counts from the end
 
@@ -87,12 +87,12 @@ def _levels(signal: SignalSpec) -> Array | None:
 
 
 def encoded_by(quantizer: Quantizer, values: Array) -> Array:
-    """The code of each value, one after another; the one that says "no valid value" of NaN. Shape (n,).
+    """Code of each value, in order; NaN gives the code of "no valid value". Shape (n,).
 
-    What a quantizer remembers goes on from block to block. It counts no saturations.
+    The quantizer keeps its state from block to block, and counts no saturations.
     """
     if isinstance(quantizer, HysteresisQuantizer):
-        # Each code depends on the one before, so this is no twin but the quantizer itself; a value that holds is cheap.
+        # Each code depends on the one before, so the quantizer itself computes it; a held value is cheap.
         saturated, encode = quantizer.saturated, quantizer.encode
         codes = np.array([encode(y) if y == y else nan for y in values.tolist()], dtype=np.float64)
         quantizer.saturated = saturated

@@ -1,7 +1,7 @@
-"""A log with everything in it decoded, at full rate: what viewers show, beside the raw messages that it was made from.
+"""Export of a log with every message decoded at full rate, beside the raw messages.
 
-The recorder decodes at a bounded rate, to keep its files small. Here each message is decoded, and what the recorder had
-decoded is left out. Everything else is copied; the files of a rotated run become one.
+The recorder decodes at a bounded rate to keep its files small. This export decodes every message, drops what the
+recorder decoded, copies everything else, and merges the files of a rotated run into one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from aeroloop.service.viewers.channels import Decoder
 
 
 class Written(NamedTuple):
-    """What was written, and what of the log could not be read."""
+    """Messages and topics written, and damages of the log by file."""
 
     messages: int
     topics: list[str]
@@ -33,11 +33,11 @@ def write_decoded(files: LogFiles, out: Path, progress: Callable[[float], None])
 
     Args:
         files: The run.
-        out: The new file; what is there is overwritten.
-        progress: Called now and then with the share that is done, 0…1.
+        out: The new file; an existing one is overwritten.
+        progress: Called repeatedly with the share done, 0…1.
 
     Raises:
-        OSError: It cannot be read, or not be written.
+        OSError: A file cannot be read or written.
     """
     decoder = Decoder(rate_hz=None)
     for description in files.descriptions.values():
@@ -48,7 +48,7 @@ def write_decoded(files: LogFiles, out: Path, progress: Callable[[float], None])
         copy = McapCopy(file, "aeroloop log export")
 
         def follow(topic: str) -> Follow | None:
-            """None for what the recorder decoded: topics of ours that begin with a slash, as no key can."""
+            """None for topics that the recorder decoded: they begin with a slash, as no key can."""
             return None if topic.startswith("/") else partial(_decode, copy, decoder, topics.read_key(topic))
 
         for i, path in enumerate(files.paths):
@@ -62,7 +62,7 @@ def write_decoded(files: LogFiles, out: Path, progress: Callable[[float], None])
 
 
 def _decode(copy: McapCopy, decoder: Decoder, address: topics.Address | None, message: Message) -> None:
-    """Add what a message gives decoded, as the recorder does: its log time is that message's publication."""
+    """Add the decoded forms of a message, with its time of publication as log time, as the recorder does."""
     if address is None:
         return
     for decoded in decoder.take(address, message.data, message.publish_time):

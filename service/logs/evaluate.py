@@ -1,8 +1,7 @@
-"""What the controller computed, from its own rows: every tick again, bit for bit.
+"""Recomputation of the controller from its own rows, bit for bit.
 
-A row says what the controller had at a tick: a frame; silence, for which the levels of the last frame stand; or a frame
-that came late, whose levels hold from the next tick on. Where rows are missing, the next batch has the controller's
-state.
+A row states what the controller received for a tick: a frame; silence, which repeats the levels of the last frame; or a
+late frame, whose levels hold from the next tick on. After missing rows, the next batch has the controller's state.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ class Used(NamedTuple):
     Attributes:
         rows: Indices of their rows in the block. Shape (n,).
         k: The ticks. Shape (n,).
-        codes: Of the measurements that it used. Shape (n, 6).
+        codes: Codes of the measurements that it used. Shape (n, 6).
     """
 
     rows: Integers
@@ -38,13 +37,13 @@ class Used(NamedTuple):
 
 
 class Evaluator:
-    """Computes the rows of one session's controller again.
+    """Recomputes one session's controller.
 
     Args:
         settings: Its configuration.
-        own_gains: Keep the gains of the configuration, whatever the log's changes say.
-        own_reference: The same of the reference.
-        resumes: Go on from the recorded state where rows are missing within the session.
+        own_gains: Keep the configuration's gains and ignore the log's changes of them.
+        own_reference: The same for the reference.
+        resumes: Continue from the recorded state where rows are missing within the session.
     """
 
     def __init__(
@@ -61,7 +60,7 @@ class Evaluator:
         self._begun = False
 
     def used(self, block: Block) -> Used:
-        """What the controller used at the ticks of the next block; `compute` is to be called with it next."""
+        """What the controller used in the next block; pass it to `compute` next."""
         if block.state is not None and (self._resumes or not self._begun):
             state = ControllerSnapshot.model_validate(block.state)
             self._controller.restore(state)
@@ -85,19 +84,19 @@ class Evaluator:
         return Used(computed, rows["tick"][computed], held[computed])
 
     def compute(self, used: Used) -> Computed:
-        """What the controller made of it."""
+        """What the controller computed from it."""
         return self._controller.compute_all(used.k, used.codes, self._changes)
 
     def commands(self, used: Used, computed: Computed) -> Commands:
-        """What it sent then; to be called for every block, or for none."""
+        """The commands that it sent; call it for every block or for none."""
         return self._controller.commands(used.k, computed.voltages)
 
     def beside(self, k: Integers, codes: Array) -> Computed:
-        """What it would make of other measurements from here on; it goes on as if not asked. Its θ̂ means nothing.
+        """What it would compute from other measurements; its own state stays. The θ̂ is meaningless.
 
         Args:
-            k: Ticks, rising. Shape (n,).
-            codes: Of the measurements. Shape (n, 6).
+            k: Ticks, ascending. Shape (n,).
+            codes: Codes of the measurements. Shape (n, 6).
         """
         self._beside = self._beside or self._new_controller()
         self._beside.follow(self._controller)
@@ -112,9 +111,9 @@ def held_codes(framed: npt.NDArray[np.bool_], codes: Array, before: Codes | None
     """Codes that hold at each row: its frame's, or those of the last frame before it.
 
     Args:
-        framed: SessionKey rows have a frame. Shape (n,).
-        codes: Of their frames. Shape (frames, columns).
-        before: Those that hold before the first row; None for none.
+        framed: Whether each row has a frame. Shape (n,).
+        codes: Codes of these frames. Shape (frames, columns).
+        before: Codes that hold before the first row; None if there are none.
 
     Returns:
         Codes, NaN before the first frame, of shape (n, columns); and those that hold after the last row.

@@ -1,7 +1,6 @@
-"""Export: a log for programs that know nothing of frames, as a table or as a log with everything decoded.
+"""Export of a log as a table, or as a log with everything decoded.
 
-What is exported as a table is what is judged: the review's own reader gives every tick, block by block, and each block
-is written as it comes.
+A table has the ticks that a review judges: both use `TickReader`. Each block is written as soon as it is read.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ ENDINGS: Final[dict[Format, str]] = {
     "mat": ".mat",
     "mcap": "-decoded.mcap",
 }
-"""What the name of a new file ends in."""
+"""Ending of a new file's name."""
 
 
 class Exported(BaseModel):
@@ -64,10 +63,10 @@ def export(
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
-        to: What kind of file.
+        to: Format.
         out: The file, which must not exist; the first log's name with another ending if None.
-        session: Whose ticks: a name, alone or as `vehicle/session`; `all`; the longest session if None.
-        progress: Called now and then with the share that is done, 0…1.
+        session: Name of a session, alone or as `vehicle/session`; `all`; the longest session if None.
+        progress: Called repeatedly with the share done, 0…1.
 
     Raises:
         ExportError: There is nothing to export, or it cannot be written.
@@ -157,7 +156,7 @@ class _Writer:
             self.rows += len(judged.k)
 
     def _true_at(self, k: Integers) -> TruthColumns:
-        """Of each tick the last truth by then. Shapes (n, columns)."""
+        """Latest truth at each tick. Shapes (n, columns)."""
         columns = 8 + self._actuators
         known = np.array(self.truths, dtype=np.float64).reshape(-1, columns)
         at = np.searchsorted(known[:, 0], k, side="right")
@@ -169,14 +168,14 @@ class _Writer:
 def beside(log: Path, ending: str) -> Path:
     """A log's name, or its folder's, with another ending."""
     if log.is_dir():
-        log = log.resolve()  # of "." there is no name
+        log = log.resolve()  # "." has no name
         return log.with_name(log.name + ending)
     return log.with_name(log.stem + ending)
 
 
 @contextmanager
 def writing(out: Path) -> Iterator[Path]:
-    """What a new file is called until it is whole; half of one is removed.
+    """Temporary path of a new file: renamed on success, removed on failure.
 
     Raises:
         ExportError: It exists, or cannot be written.
@@ -194,7 +193,7 @@ def writing(out: Path) -> Iterator[Path]:
 
 
 def facts(files: LogFiles, settings: Settings, sessions: Sequence[str]) -> dict[str, Any]:
-    """What a file tells of itself as a whole."""
+    """Metadata of an exported file."""
     return {
         "config": settings.description(),
         "sessions": list(sessions),

@@ -1,4 +1,4 @@
-"""A run's files: one, a folder, or those of a rotated run, read as one; and what they say of themselves."""
+"""Files of a run (one, a folder, or those of a rotated run) read as one: descriptions, metadata, messages in order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aeroloop.protocol.messages.operator import Change
 from aeroloop.service.config import Settings, from_description
 from aeroloop.service.logs.mcap_file import (
     CHANGE_METADATA,
-    CONTRACT_METADATA,
+    DESCRIPTION_METADATA,
     Damage,
     Logged,
     NotMcapError,
@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 class ReviewError(AeroloopError):
-    """A log cannot be judged; one line that says why."""
+    """A log cannot be reviewed; one line with the reason."""
 
 
 class LogFiles:
@@ -47,14 +47,14 @@ class LogFiles:
 
     Attributes:
         paths: The files, in the order of their first messages.
-        descriptions: Who took part, by vehicle and role; the last of each.
+        descriptions: Descriptions by vehicle and role; the last of each.
         first_descriptions: The first of each.
-        changes: What controllers followed when a file began, by vehicle and session.
+        changes: Changes in force when a file began, by vehicle and session.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
-        metadata: What else the files say of themselves, by name (`aeroloop.recorder` is `recorder`); the last of each.
+        metadata: Other metadata, by name without prefix (`aeroloop.recorder` is `recorder`); the last of each.
 
     Raises:
-        ReviewError: Nothing is there, no log can be read, or it is of another version of the protocol.
+        ReviewError: There is no log, it cannot be read, or it has another version of the protocol.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -65,10 +65,10 @@ class LogFiles:
         self.metadata: dict[str, dict[str, Any]] = {}
         starts = {path: self._prelude(path) for path in _files(paths)}
         self.paths = sorted(starts, key=lambda path: starts[path])
-        if not self.descriptions:  # one that is damaged may have a copy; where none can be read, it is not damage
+        if not self.descriptions:  # a damaged one may have a copy; if none can be read, the version differs
             for path, damages in self.damages.items():
                 for damage in damages:
-                    if CONTRACT_METADATA in damage.what:
+                    if DESCRIPTION_METADATA in damage.what:
                         raise ReviewError(f"{path} is not a log of this version: {damage.what}")
         self._size = sum(path.stat().st_size for path in self.paths)
 
@@ -93,19 +93,18 @@ class LogFiles:
 
     @property
     def name(self) -> str:
-        """What to call the run."""
+        """Name of the run."""
         first = str(self.paths[0])
         return first if len(self.paths) == 1 else f"{first} and {len(self.paths) - 1} more"
 
     def routed(
         self, route: Callable[[topics.Address], T | None], progress: Progress | None = None
     ) -> Iterator[Logged[T]]:
-        """Messages of every key that `route` answers for, in the order of recording.
+        """Messages of the keys that `route` selects, in the order of recording.
 
         Args:
-            route: Called once for every key of a file, such as for a method that takes its messages; None leaves them
-                out.
-            progress: Called now and then with the share that is done, 0…1.
+            route: Called once per key of a file; its result comes with each message of the key, None drops the key.
+            progress: Called repeatedly with the share done, 0…1.
         """
 
         def wanted(channel: Channel) -> T | None:
@@ -159,7 +158,7 @@ class LogFiles:
 
     def _add_metadata(self, record: Metadata, path: Path) -> None:
         text = record.metadata.get("json", "{}")
-        if record.name == CONTRACT_METADATA:
+        if record.name == DESCRIPTION_METADATA:
             self._add_description(text.encode(), path)
         elif record.name == CHANGE_METADATA:
             change, address = Change.model_validate_json(text), topics.read_key(record.metadata["key"])
@@ -167,17 +166,17 @@ class LogFiles:
             if change not in known:  # every file of a rotated run repeats it
                 known.append(change)
         elif record.name.startswith(METADATA_PREFIX):
-            said = json.loads(text)
-            self.metadata[record.name.removeprefix(METADATA_PREFIX)] = said if isinstance(said, dict) else {}
+            content = json.loads(text)
+            self.metadata[record.name.removeprefix(METADATA_PREFIX)] = content if isinstance(content, dict) else {}
 
     def _add_description(self, text: bytes, path: Path) -> None:
-        said = json.loads(text)
-        old = isinstance(said, dict) and said.keys() <= Description.model_fields.keys() - {"protocol"}
-        if old or said["protocol"] != PROTOCOL_VERSION:
-            version = 1 if old else said["protocol"]
+        content = json.loads(text)
+        old = isinstance(content, dict) and content.keys() <= Description.model_fields.keys() - {"protocol"}
+        if old or content["protocol"] != PROTOCOL_VERSION:
+            version = 1 if old else content["protocol"]
             written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
             raise ReviewError(f"{path} is a log of protocol version {version}; read it with {written_by} wrote it")
-        description = Description.model_validate(said)
+        description = Description.model_validate(content)
         self.descriptions[description.vehicle, description.role] = description
         self.first_descriptions.setdefault((description.vehicle, description.role), description)
 
@@ -192,7 +191,7 @@ def _share_of(progress: Progress | None, before: int, size: int) -> Callable[[in
 
 
 def _logs_in(folder: Path) -> list[Path]:
-    """The logs in a folder, but for those that `log export --to mcap` has written beside them."""
+    """Logs in a folder, without those that `log export --to mcap` wrote there."""
     return sorted(path for path in folder.glob("*.mcap") if not path.stem.endswith("-decoded"))
 
 

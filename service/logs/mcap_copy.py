@@ -1,7 +1,7 @@
-"""Copies the records of MCAP files, whole or broken, into one new file, with ids of its own.
+"""Copying of MCAP records, from whole or broken files, into one new file with its own ids.
 
-Messages keep their topic, schema, times and sequence. What several files repeat is written once: schemas, channels,
-attachments, and a metadata record that says what the last one of its name and key has said.
+Messages keep their topic, schema, times and sequence. Repetitions are written once: schemas, channels, attachments, and
+a metadata record that equals the last one of its name and key.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ Follow = Callable[[Message], None]
 
 
 def _only_copy(_: Message) -> None:
-    """Nothing follows a message."""
+    """Do nothing after copying a message."""
 
 
 class McapCopy:
-    """A new file, and what has been copied into it.
+    """Copies records into a new file.
 
     Args:
         out: The file, empty.
-        library: Its writer's name.
+        library: Name of the writing program.
 
     Attributes:
         messages: Messages written.
@@ -59,10 +59,10 @@ class McapCopy:
             path: The file.
             damages: What could not be read is appended.
             progress: Called after each chunk with the bytes read so far.
-            follow: Called with the topic of each channel: what follows its messages, or None to leave them out.
+            follow: Called with the topic of each channel; returns a callback for its messages, or None to drop them.
 
         Raises:
-            NotMcapError: It is no MCAP file.
+            NotMcapError: It is not an MCAP file.
             OSError: It cannot be read, or the new one cannot be written.
         """
         schemas = {0: 0}  # of the new file, by the ids of this one

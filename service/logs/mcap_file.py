@@ -1,11 +1,12 @@
 """Reads one MCAP file, whole or broken: https://mcap.dev/spec. Files are written by `mcap.writer.Writer`.
 
-`records` reads from the front: it yields every complete record, checks each chunk against its checksum, steps over what
-is damaged and names it. A file cut at any byte yields all that was complete before the cut; where the index at the end
-is whole, reading goes on behind a damaged head. `messages` reads hours of a few channels and makes no object of the
-others. `skim` reads, by the index, the little that a reader needs first.
+`records` reads from the front: it yields every complete record, checks each chunk against its checksum, skips damage
+and reports it. A file cut at any byte yields all that was complete before the cut; if the index at the end is whole,
+reading resumes after a damaged record. `messages` is fast: it parses a few channels and skips the others. `skim` reads
+metadata and a few topics by the index.
 
-Memory is bounded: what claims more than `MAX_RECORD` or `MAX_CHUNK` is damage, and a chunk must hold what it claims.
+Memory is bounded: a record over `MAX_RECORD` or a chunk over `MAX_CHUNK` is damage, and so is a chunk of another size
+than it claims.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Metada
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-CONTRACT_METADATA: Final = "aeroloop.description"
+DESCRIPTION_METADATA: Final = "aeroloop.description"
 """Name of the metadata record with a role's description, as JSON under `json`, and its key under `key`."""
 
 CHANGE_METADATA: Final = "aeroloop.change"
-"""Name of a metadata record with what a controller followed when the file began: a Change as JSON, and its key."""
+"""Name of a metadata record with a change in force when the file began: a Change as JSON, and its key."""
 
 RECORDER_METADATA: Final = "aeroloop.recorder"
 """Name of the metadata record about the file itself: its run, its part, when it was begun."""
@@ -60,7 +61,7 @@ _DESCRIBING: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
 _IN_CHUNKS: Final = _DESCRIBING | {Opcode.MESSAGE}
 _READ: Final = _IN_CHUNKS | {Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT}
 _STARTS: Final[dict[int, int]] = {Opcode.CHUNK_INDEX: 25, Opcode.METADATA_INDEX: 9, Opcode.ATTACHMENT_INDEX: 9}
-"""Where a record of the index has the offset of what it points at."""
+"""Position, in a record of the index, of the offset that it points to."""
 
 _MALFORMED: Final = (struct.error, ValueError, OverflowError, RuntimeError, McapError, zstandard.ZstdError)
 
@@ -75,7 +76,7 @@ class Damage(NamedTuple):
 
 
 class Logged(NamedTuple, Generic[T]):
-    """A message: what `wanted` answered for its channel, its content, times [ns], and its publisher's number."""
+    """A message: what `wanted` returned for its channel, its content, times [ns], and its publisher's number."""
 
     answer: T
     data: bytes
@@ -93,8 +94,8 @@ def records(
 ) -> Iterator[McapRecord]:
     """Header, schemas, channels, messages, metadata and attachments, in the file's order; damaged ones are left out.
 
-    Schemas and channels of the index come first, so that a damaged chunk costs no other its description; those in the
-    chunks follow in their place. A message comes only after its channel.
+    Schemas and channels of the index come first, so that a damaged chunk loses no other chunk's description; those in
+    the chunks follow in their place. A message comes only after its channel.
 
     Args:
         path: The file.
@@ -136,7 +137,7 @@ def messages(
 
     Args:
         path: The file.
-        wanted: Called at the first message of a channel; None leaves all of them out.
+        wanted: Called at the first message of a channel; None drops the channel.
         damages: What could not be read is appended.
         progress: Called after each chunk with the bytes read so far.
 
@@ -178,15 +179,15 @@ def messages(
 def skim(path: Path, wanted: Callable[[str], bool]) -> list[McapRecord] | None:
     """Schemas, channels, metadata, the file's first message, and every message of some topics, by way of the index.
 
-    The index is believed if it matches its checksum, lacks nothing that the statistics beside it count, and points at
-    what it says. A damaged chunk is left out silently: `messages` names it.
+    The index is used if it matches its checksum, has everything that the statistics count, and points to the right
+    records. A damaged chunk is skipped silently: `messages` reports it.
 
     Args:
         path: The file.
         wanted: Whether a topic's messages are wanted.
 
     Returns:
-        The records, each kind in the file's order; None if there is no index to be relied on.
+        The records, each kind in the file's order; None without a usable index.
 
     Raises:
         OSError: The file cannot be read.
@@ -216,7 +217,7 @@ def skim(path: Path, wanted: Callable[[str], bool]) -> list[McapRecord] | None:
 
 
 def opening(path: Path) -> Metadata | None:
-    """The record behind a file's header if it is metadata. Reads no further. Raises OSError."""
+    """The record after a file's header if it is metadata. Reads no further. Raises OSError."""
     with path.open("rb") as file, suppress(*_MALFORMED):
         if file.read(len(MAGIC)) == MAGIC:
             for _, opcode, block in islice(_blocks(file, [], []), 1, 2):
@@ -226,7 +227,7 @@ def opening(path: Path) -> Metadata | None:
 
 
 def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] | None) -> Iterator[tuple[int, bytes]]:
-    """Offsets, and the records that stand there: of a chunk all that it holds, else one."""
+    """Offset and bytes of each piece: all records of a chunk, or one record outside of chunks."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise NotMcapError(f"{path} does not begin as an MCAP file")
@@ -240,8 +241,8 @@ def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] |
         chunked = False
         for offset, opcode, block in _blocks(file, sorted(starts), damages):
             if opcode != Opcode.CHUNK:
-                if chunked and opcode in _IN_CHUNKS:  # a flipped bit makes one of a message index
-                    damages.append(Damage(offset, "what stands in chunks everywhere else stands outside of them"))
+                if chunked and opcode in _IN_CHUNKS:  # a flipped bit turns a message index into this
+                    damages.append(Damage(offset, "a schema, channel or message outside of the chunks"))
                 else:
                     yield offset, block
                 continue
@@ -255,16 +256,16 @@ def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] |
 
 
 def _blocks(file: BinaryIO, starts: list[int], damages: list[Damage]) -> Iterator[tuple[int, int, bytes]]:
-    """Offset, opcode and bytes of each record as it stands in the file, up to the end of the data section.
+    """Offset, opcode and bytes of each record in the file, up to the end of the data section.
 
     Args:
         file: The file.
-        starts: Where records begin by the index, in order: behind a damaged head, reading goes on at the next.
+        starts: Offsets of records by the index, in order; after a damaged record, reading resumes at the next.
         damages: What could not be read is appended.
     """
     size = os.fstat(file.fileno()).st_size
     named, checksum = len(damages), zlib.crc32(MAGIC)
-    last = offset = len(MAGIC)  # `last`: the last record that was yielded, whose length may be what is damaged
+    last = offset = len(MAGIC)  # `last`: the last record that was yielded, whose length may be damaged
     while True:
         file.seek(offset)
         head = file.read(_HEAD.size)
@@ -327,7 +328,7 @@ def _is_complete(index: list[McapRecord], chunks: list[ChunkIndex], metadata: li
 
 
 def _at(file: BinaryIO, offset: int, opcode: int) -> bytes:
-    """The record at a place in the file. Raises ValueError if it is not of that kind, or not whole."""
+    """The record at an offset in the file. Raises ValueError if it is not of that kind, or not whole."""
     file.seek(offset)
     head = file.read(_HEAD.size)
     there, length = _HEAD.unpack(head)
@@ -374,8 +375,8 @@ def _scan(data: bytes, offset: int, damages: list[Damage]) -> Iterator[tuple[int
 
 
 def _parsed(record: bytes) -> McapRecord:
-    """A record taken apart. Raises one of `_MALFORMED`."""
-    if record[0] == _MESSAGE_OPCODE:  # mcap reads it field by field, in 5 µs
+    """A parsed record. Raises one of `_MALFORMED`."""
+    if record[0] == _MESSAGE_OPCODE:  # mcap's own parser takes 5 µs
         channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(record)
         return Message(channel, log_time, record[_MESSAGE.size :], publish_time, sequence)
     if record[0] == Opcode.ATTACHMENT:

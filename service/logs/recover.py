@@ -1,7 +1,6 @@
-"""Recovery: everything that is whole in a broken log, written into a new one with its index.
+"""Recovery of a broken log: copies every whole record into a new log with an index.
 
-A log without its end, such as a recorder that was killed leaves behind, is read from the front. What could not be read
-is named.
+A log without its end, as a killed recorder leaves it, is read from the front. Damage is reported.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from aeroloop.service.logs.mcap_file import Damage, NotMcapError
 
 
 class RecoverError(AeroloopError):
-    """Nothing can be recovered; one line that says why."""
+    """Nothing can be recovered; one line with the reason."""
 
 
 class Recovery(BaseModel):
@@ -37,10 +36,10 @@ def recover(broken: Path, out: Path, progress: Callable[[float], None] | None = 
     Args:
         broken: The log; it is not changed.
         out: The new file, which must not exist; it is removed again on any error.
-        progress: Called now and then with the share that is done, 0…1.
+        progress: Called repeatedly with the share done, 0…1.
 
     Raises:
-        RecoverError: It is no MCAP file, or the new one cannot be written.
+        RecoverError: It is not an MCAP file, or the new one cannot be written.
     """
     damages: list[Damage] = []
     try:

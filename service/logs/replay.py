@@ -1,10 +1,9 @@
-"""Replay: what both ends did, computed again from a log's traces and compared byte for byte.
+"""Replay of both ends from a log's traces, compared byte for byte.
 
-The controller is sans-I/O, and its rows hold all that it had, so the same rows must give the same commands: which were
-sent, which silence stood for, and every bit of them. The emulated plant is replayed from its own rows
-(plant_emulator/hosts/replay.py).
-With another configuration it says what would have been commanded instead; the plant of the log does not follow that, so
-it is no simulation.
+The controller is sans-I/O and its rows hold all its inputs, so the same rows must give the same commands: which were
+sent, which were silent, and every bit of them. The emulated plant is replayed from its own rows
+(plant_emulator/hosts/replay.py). With another configuration, replay computes what would have been commanded instead;
+the log's plant does not respond to that, so it is no simulation.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ from aeroloop.service.logs.files import Progress, ReviewError
 from aeroloop.service.logs.runs import Block, Run, Taker, TraceJoin
 from aeroloop.service.logs.traces import Array, SessionKey, Source
 
-_NOT_ASKED: Final = "only the other end was replayed"
+_NOT_SELECTED: Final = "only the other end was replayed"
 
 
 class TickDifference(BaseModel):
-    """The first row that was computed otherwise than it was logged."""
+    """The first row whose computed command differs from the logged one."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -46,7 +45,7 @@ class TickDifference(BaseModel):
 
 
 class SessionReplay(BaseModel):
-    """What replaying one session's controller has shown."""
+    """Result of replaying one session's controller."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -63,20 +62,20 @@ class SessionReplay(BaseModel):
 
 
 class EndReplay(BaseModel):
-    """What replaying one end has shown, over all sessions."""
+    """Result of replaying one end, over all sessions."""
 
     model_config = ConfigDict(frozen=True)
 
     ticks: int = Field(description="ticks that were computed again")
-    differ: int = Field(description="of them, how many gave another result, to the last bit")
+    differ: int = Field(description="how many of them differ in any bit")
 
 
 class Replay(BaseModel):
-    """What replaying a run has shown."""
+    """Result of replaying a run."""
 
     model_config = ConfigDict(frozen=True)
 
-    controller: EndReplay | None = Field(description="null: it could not be replayed; `reasons` says why")
+    controller: EndReplay | None = Field(description="null: it could not be replayed, see `reasons`")
     plant: EndReplay | None
     reasons: dict[str, str] = Field(description="why an end could not be replayed, or not to its end")
     sessions: list[SessionReplay]
@@ -84,7 +83,7 @@ class Replay(BaseModel):
 
     @property
     def differs(self) -> bool:
-        """Whether anything does."""
+        """Whether any end differs."""
         return any(end is not None and end.differ > 0 for end in (self.controller, self.plant))
 
 
@@ -93,8 +92,8 @@ class Replayer:
 
     Args:
         which: The session.
-        evaluator: Computes its rows.
-        settings: The configuration that it computes with.
+        evaluator: Recomputes its rows.
+        settings: The configuration that the evaluator uses.
     """
 
     def __init__(self, which: SessionKey, evaluator: Evaluator, settings: Settings) -> None:
@@ -129,8 +128,8 @@ class Replayer:
             self._first = TickDifference(
                 tick=int(rows["tick"][i]),
                 time_s=round(int(rows["tick"][i]) * self._period, 9),
-                logged=_said(rows["sent_as"][i], logged[i]),
-                computed=_said(expected["sent_as"][i], expected["command"][i]),
+                logged=_text(rows["sent_as"][i], logged[i]),
+                computed=_text(expected["sent_as"][i], expected["command"][i]),
             )
         self._differ += int(differ.sum())
         self._ticks += len(used.k)
@@ -140,20 +139,20 @@ class Replayer:
         held, self._held = held_codes(framed, codes_in(wire.command, rows["command"][framed]), self._held)
         self._compare(held[used.rows], commands.codes)
 
-    def _compare(self, theirs: Array, ours: Array) -> None:
+    def _compare(self, logged: Array, computed: Array) -> None:
         """Compare voltages."""
         signal = self._wire.voltage
-        known = ~np.isnan(theirs).all(axis=1) if signal.bits else np.ones(len(theirs), dtype=np.bool_)
+        known = ~np.isnan(logged).all(axis=1) if signal.bits else np.ones(len(logged), dtype=np.bool_)
         if not known.any():
             return
-        theirs, ours = _volts(signal, theirs[known]), _volts(signal, ours[known])
-        self._logged = added(self._logged, squares(theirs))
-        self._computed = added(self._computed, squares(ours))
-        self._square = added(self._square, squares(ours - theirs))
-        self._largest = max(self._largest, float(np.abs(ours - theirs).max()))
+        logged, computed = _volts(signal, logged[known]), _volts(signal, computed[known])
+        self._logged = added(self._logged, squares(logged))
+        self._computed = added(self._computed, squares(computed))
+        self._square = added(self._square, squares(computed - logged))
+        self._largest = max(self._largest, float(np.abs(computed - logged).max()))
 
     def result(self) -> SessionReplay:
-        """What has been found."""
+        """Result of all blocks so far."""
         return SessionReplay(
             vehicle=self._which[0],
             session=self._which[1],
@@ -168,12 +167,12 @@ class Replayer:
         )
 
 
-def _said(sent_as: int, frame: Array) -> str:
+def _text(sent_as: int, frame: Array) -> str:
     return frame.tobytes().hex() if sent_as == Sent.FRAME else Sent(int(sent_as)).name.lower()
 
 
 def _volts(signal: SignalSpec, codes: Array) -> Array:
-    """What a plant makes of commands; 0 V of a code without a valid value."""
+    """Voltages that a plant applies; 0 V for a code of no valid value."""
     volts = levels(signal, codes)
     return np.where(np.isnan(volts), 0.0, volts)
 
@@ -191,7 +190,7 @@ class Plants:
         self._reason = "the log has no trace of a plant"
 
     def route(self, address: Address) -> Taker | None:
-        """Contracts, since a process is replayed with what it began with."""
+        """Takes descriptions: a process is replayed with the configuration that it started with."""
         return self._description if address.topic.name == "description" else None
 
     def take(self, source: Source, batch: Batch) -> None:
@@ -209,7 +208,7 @@ class Plants:
         self._replays[source].feed(batch)
 
     def results(self) -> tuple[list[PlantReplayed], str | None]:
-        """What has been found of each process, and why there is none, or it ends early."""
+        """Result of each process, and the reason if there is none or one ends early."""
         results = [replay.result() for replay in self._replays.values()]
         stopped = next((result.stopped for result in results if result.stopped is not None), None)
         return results, stopped if results else self._reason
@@ -230,9 +229,9 @@ def replay(
     Args:
         paths: Logs, folders of logs, or a rotated run.
         overrides: `section.key=value`, to compute with another law instead of the logged one. An override of the gains
-            or of the reference stands in for every change that the log has of them. The plant is not replayed then.
-        progress: Called now and then with the share that is done, 0…1.
-        ends: SessionKey ends to replay; the plant takes most of the time.
+            or of the reference replaces every logged change of them. The plant is not replayed then.
+        progress: Called repeatedly with the share done, 0…1.
+        ends: Ends to replay; the plant takes most of the time.
 
     Raises:
         ReviewError: It cannot be read, or has no controller's configuration.
@@ -278,11 +277,9 @@ def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Repl
     reasons = {} if sessions else {"controller": "the log has no trace of a controller"}
     if overrides:
         reason = "the plant of a log does not follow another configuration"
-    reasons |= {end: _NOT_ASKED for end in ENDS if end not in ends}
-    if "plant" not in ends:
-        reason = _NOT_ASKED
     if reason is not None:
         reasons["plant"] = reason
+    reasons |= {end: _NOT_SELECTED for end in ENDS if end not in ends}
     return Replay(
         controller=_sum(sessions),
         plant=_sum([result for result in results if result.ticks]),

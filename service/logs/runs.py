@@ -1,4 +1,4 @@
-"""A run as its two ends recorded it: sessions in blocks of ticks, each tick with the rows of both ends.
+"""Join of both ends' traces: sessions as blocks of ticks, each tick with the rows of both ends.
 
 The join key is (vehicle, session, session tick). The files are read twice: first the headers of the trace's batches
 (traces.py), then the rows. A block is yielded once both ends have reached its last tick, so memory stays bounded
@@ -23,20 +23,20 @@ from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
 from aeroloop.service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, SessionKey, TraceIndex
 
 BLOCK: Final = 4096
-"""Ticks of a block, about: numpy is quick with so many, and they stay in the cache."""
+"""Approximate ticks of a block: enough for numpy to be fast, few enough for the CPU cache."""
 
 ANSWER_S: Final = 1.2
-"""A command acts this long after the measurement that it answers at the latest: a session's first has a second [s]."""
+"""Longest time from a measurement until its command acts; a session's first may take a second [s]."""
 
 _INDEXING: Final = 0.15
 """Share of reading that the first pass takes."""
 
 Taker = Callable[[bytes, int], None]
-"""Takes a JSON message: its content, and when it was published [ns]."""
+"""Callback for a JSON message: its content, and its time of publication [ns]."""
 
 Rows = dict[str, npt.NDArray[Any]]
-"""Rows of one end, by column: those of its trace, but times in ns on its monotonic clock, −1 for none; and `wall`, what
-to add to such a time for its wall clock [ns]."""
+"""Rows of one end, by column: those of its trace, with times in ns on its monotonic clock, −1 for none; and `wall`, the
+offset from such a time to its wall clock [ns]."""
 
 
 class Block(NamedTuple):
@@ -44,13 +44,13 @@ class Block(NamedTuple):
 
     Attributes:
         which: The session.
-        k: Session ticks that an end has a row of. Shape (n,).
-        controller: The controller's rows in their order, those that are no tick of their own included.
-        plant: The plant's rows; behind those of this block, rows that act on commands that answer its ticks.
+        k: Session ticks with a row of either end. Shape (n,).
+        controller: The controller's rows in order, including those that compute no tick, such as late frames.
+        plant: The plant's rows of this block, then later ones, which may act on commands that answer its ticks.
         at_controller: Index of the row that computed each tick, or −1. Shape (n,).
         at_plant: Index of the plant's row of each tick, or −1. Shape (n,).
         acted: Index of the plant's row that first acted on the command that answers each tick, or −1. Shape (n,).
-        changes: What the controller followed from which tick on, up to here.
+        changes: Changes of gains and reference since the block before.
         state: Where rows before this block's are missing, the controller's state before its first row; else None.
     """
 
@@ -70,14 +70,14 @@ class Run:
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
-        progress: Called now and then with the share of everything that is done, 0…1.
+        progress: Called repeatedly with the share done, 0…1.
 
     Attributes:
-        files: What the files say of themselves.
-        extents: What there is of each session.
-        missing: What is not.
-        reached: The last tick of each session that `read` has come to.
-        open_sessions: The session of each vehicle that has begun there and not ended.
+        files: The files.
+        extents: Recorded extent of each session.
+        missing: Missing rows.
+        reached: The last tick of each session that `read` has reached.
+        open_sessions: The session of each vehicle that is open at that point of the files.
 
     Raises:
         ReviewError: Not a log of this version.
@@ -112,7 +112,7 @@ class Run:
         """Batches of the traces, each end's in the order of its rows and none twice.
 
         Args:
-            route: Who takes the messages of a key that is no trace's; called once for every key of a file.
+            route: Called once per key that is not a trace's; returns a callback for its messages, or None.
         """
         order = InOrder(self._index)
 
@@ -138,9 +138,9 @@ class Run:
         """Blocks of some sessions; those of one session in order.
 
         Args:
-            sessions: SessionKey.
+            sessions: Sessions to read.
             route: As for `batches`.
-            block: Ticks of a block, about.
+            block: Approximate ticks of a block.
         """
         joins = {which: self.join(which, block) for which in sessions}
         for arrived in self.batches(route):
@@ -152,12 +152,12 @@ class Run:
             yield from join.blocks(finished=True)
 
     def join(self, which: SessionKey, block: int = BLOCK, *, alone: bool = False) -> TraceJoin:
-        """What joins the rows of a session.
+        """The join of a session.
 
         Args:
             which: The session.
-            block: Ticks of a block, about.
-            alone: TraceJoin the controller's rows with none of the plant.
+            block: Approximate ticks of a block.
+            alone: Leave the plant's rows out.
         """
         extent = self.extents[which]
         begins = extent.first["controller"]
@@ -166,7 +166,7 @@ class Run:
         return TraceJoin(which, margin, extent.of("controller") if alone else extent, block, before)
 
     def _follow(self, which: SessionKey, arrived: Arrived) -> None:
-        """Keep how far the plant's trace has come; the controller's, where the log has none of the plant."""
+        """Track the last tick of the plant's trace; of the controller's, if the log has none of the plant."""
         vehicle, session = which
         header = arrived.header
         if header.end == "controller" and which in self.extents and self.extents[which].rows["plant"]:
@@ -182,10 +182,10 @@ class Run:
 
 
 class _Segment:
-    """Rows of one end that wait, with none missing between them.
+    """Waiting rows of one end, without a gap.
 
     Args:
-        end: SessionKey end.
+        end: The end.
         state: The controller's state before the first of them, where rows before that are missing.
     """
 
@@ -196,12 +196,12 @@ class _Segment:
         self._rows: Rows = {}
 
     def add(self, arrived: Arrived) -> None:
-        """Rows that follow."""
+        """Append a batch."""
         self._batches.append((arrived.header, arrived.payload))
 
     @property
     def rows(self) -> Rows:
-        """All of them; empty if there are none."""
+        """All rows; empty if there are none."""
         if self._batches:
             known = [self._rows] if self._rows else []
             parts = [*known, _joined(self._batches)]
@@ -211,26 +211,26 @@ class _Segment:
 
     @property
     def ticks(self) -> Integers:
-        """The tick that each has reached, which a late row does not lower. Shape (rows,)."""
+        """Highest tick up to each row; a late row is of a lower one. Shape (rows,)."""
         rows = self.rows
         return np.maximum.accumulate(rows[self._column]) if rows else np.empty(0, dtype=np.int64)
 
     def drop(self, n: int) -> None:
-        """Forget the first."""
+        """Drop the first n rows."""
         self._rows = {name: column[n:] for name, column in self.rows.items()}
         if n:
             self.state = None
 
 
 class TraceJoin:
-    """Puts the rows of one session's two ends together.
+    """Joins the rows of one session's two ends.
 
     Args:
         which: The session.
-        margin: Ticks of the plant to wait for after a tick, before it is known whether a command acts on its answer.
-        extent: What there is of it.
-        block: Ticks of a block, about.
-        changes: What the controller followed before its first row.
+        margin: Ticks of the plant to wait for after a tick, in which the command that answers it may act.
+        extent: Its recorded extent.
+        block: Approximate ticks of a block.
+        changes: Changes in force before its first row.
     """
 
     def __init__(
@@ -249,7 +249,7 @@ class TraceJoin:
         self._yielded: float = min(self._settled.values())
 
     def add(self, arrived: Arrived) -> bool:
-        """A batch of it. Whether a block is complete now."""
+        """Add a batch; returns whether a block is complete."""
         end, has_rows = arrived.source.end, arrived.header.rows > 0
         if end == "controller":
             if has_rows:
@@ -264,11 +264,11 @@ class TraceJoin:
 
     @property
     def _limit(self) -> float:
-        """Up to where both ends have been read."""
+        """The tick up to which both ends have been read."""
         return min(self._settled["controller"], self._settled["plant"] - self._margin)
 
     def blocks(self, *, finished: bool = False) -> Iterator[Block]:
-        """Blocks that are complete; all that is left where no more is to come."""
+        """Complete blocks; with `finished`, all remaining rows."""
         limit = inf if finished else self._limit
         while len(self._controller) > 1:  # a block has no gap within it
             last = float(self._controller[0].ticks[-1])
@@ -312,7 +312,7 @@ def _block(
 
 
 def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
-    """Of each k, the place of the row with that tick, or −1. Ticks rise."""
+    """Index of the row of each tick k, or −1. Ticks ascend."""
     if not len(ticks):
         return np.full(len(k), -1)
     at = np.minimum(np.searchsorted(ticks, k), len(ticks) - 1)
@@ -320,7 +320,7 @@ def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
 
 
 def _joined(batches: Sequence[tuple[Header, bytes]]) -> Rows:
-    """Rows of batches of one end, one after another."""
+    """Rows of one end's batches, concatenated."""
     rows = join_columns(batches)
     headers = [header for header, _ in batches]
     counts = [header.rows for header in headers]

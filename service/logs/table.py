@@ -1,8 +1,7 @@
-"""A session as a table: one row a tick, one column a number, with the unit in its name.
+"""Table of a session: a row per tick, a column per number, with the unit in the column's name.
 
-The rows are what the controller saw and computed at each tick (see `Ticks`). Beside them stands the emulator's truth,
-the last that was published by then. What the log does not have is NaN here, and becomes whatever says "nothing" in a
-file.
+A row has what the controller received and computed at a tick (see `Ticks`), and the emulator's latest truth. A value
+that the log lacks is NaN here, and the file format's own null in a file.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ EULER: Final = ("roll", "pitch", "yaw")
 
 
 class TruthColumns(NamedTuple):
-    """What was true as measurements were taken, a row each, in order. Shapes (n,), (n, 4), (n, 3), (n, actuators)."""
+    """True states at measurements, a row each, in order. Shapes (n,), (n, 4), (n, 3), (n, actuators)."""
 
     k: Array
     attitude: Array
@@ -38,7 +37,7 @@ class Rows(NamedTuple):
 
     Attributes:
         ticks: The ticks.
-        truth: Of each the last truth that was published by then; NaN before the first.
+        truth: The latest truth at each tick; NaN before the first.
     """
 
     vehicle: str
@@ -48,13 +47,13 @@ class Rows(NamedTuple):
 
 
 class Column(NamedTuple):
-    """What a column is.
+    """A column.
 
     Attributes:
         name: With its unit at the end, if it has one.
-        unit: `1` of a number without one, empty of what is no quantity.
+        unit: `1` for a number without one, empty for what is not a quantity.
         description: What it is, in a sentence.
-        kind: What its values are.
+        kind: Type of its values.
     """
 
     name: str
@@ -68,7 +67,7 @@ class Group:
     """Columns that are computed together.
 
     Attributes:
-        of: Their values in some rows; NaN where there is none, unless they are of integers or text. Shape (n, columns).
+        of: Their values in some rows; NaN where there is none, except for integers and text. Shape (n, columns).
     """
 
     columns: Sequence[Column]
@@ -179,7 +178,7 @@ def _vector(
     axes: Sequence[str] = AXES,
     kind: Kind = "double",
 ) -> Group:
-    """A column an axis, which stands for the braces in name and description."""
+    """A column per axis, which replaces the braces in name and description."""
     return Group([Column(name.format(axis), unit, description.format(axis), kind) for axis in axes], of)
 
 
@@ -194,7 +193,7 @@ def _text(rows: Rows, text: str) -> Array:
 
 
 def _sent(rows: Rows) -> Array:
-    """ε as it came. Where ‖ε‖ > 1 it was scaled to unit length, with η = 0 (Remark 2), and the levels are gone."""
+    """ε as received; NaN where ‖ε‖ > 1: it was scaled to unit length, with η = 0 (Remark 2), so its levels are lost."""
     q = rows.ticks.attitude
     return np.where(q[:, :1] == 0.0, np.nan, q[:, 1:])
 

@@ -1,9 +1,9 @@
-"""Files that a table is written into: Parquet, CSV, MATLAB.
+"""Table files: Parquet, CSV and MATLAB.
 
 All have the same columns by the same names. Parquet has each column's unit and description in its field's metadata,
 and the configuration in the file's; a MATLAB file has them in the fields `units`, `descriptions` and `config` of its
-struct; CSV has a header row, and nothing else. Parquet and CSV are written batch by batch; scipy wants all of a MATLAB
-file in memory at once.
+struct; CSV has a header row only. Parquet and CSV are written batch by batch; scipy needs all of a MATLAB file in
+memory.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ _ARROW: Final = {
 
 
 class ExportError(AeroloopError):
-    """A log cannot be exported; one line that says why."""
+    """A log cannot be exported; one line with the reason."""
 
 
 class TableFile(ABC):
-    """A table on its way into a file.
+    """Writer of a table.
 
     Args:
-        path: Where; what is there is overwritten.
-        groups: The columns it has.
-        facts: What is to be known of it as a whole, such as `config`; JSON in the file.
+        path: The file; an existing one is overwritten.
+        groups: Its columns.
+        facts: Metadata of the file, such as `config`; written as JSON.
 
     Raises:
         OSError: It cannot be written.
@@ -66,7 +66,7 @@ class TableFile(ABC):
 
 
 class ArrowFile(TableFile):
-    """What Arrow writes, a batch at a time; a batch is a row group of a Parquet file."""
+    """Writer by Arrow, batch by batch; a batch is a row group of a Parquet file."""
 
     def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None:
         self._groups = groups
@@ -81,7 +81,7 @@ class ArrowFile(TableFile):
         """See `TableFile.write`."""
         arrays = []
         for group in self._groups:
-            # A row a column: Arrow takes only what is contiguous without copying it.
+            # A row per column: Arrow copies values unless they are contiguous.
             matrix = np.ascontiguousarray(group.of(rows).T)
             missing = np.isnan(matrix) if matrix.dtype == np.float64 else None
             for i, column in enumerate(group.columns):
@@ -106,7 +106,7 @@ class ParquetFile(ArrowFile):
 
 
 class CsvFile(ArrowFile):
-    """By RFC 4180. A number has as many digits as give it again; nothing is where the log has nothing."""
+    """CSV by RFC 4180. A number has enough digits to be read back exactly; a missing one is empty."""
 
     def _open(self, path: Path, schema: pa.Schema) -> Any:
         options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
@@ -114,9 +114,9 @@ class CsvFile(ArrowFile):
 
 
 class MatFile(TableFile):
-    """A struct `aeroloop`; each column is a column vector of doubles in it, with NaN where the log has nothing.
+    """A struct `aeroloop`; each column is a column vector of doubles in it, with NaN for missing values.
 
-    `published_ns` is int64, for a double does not hold it. `vehicle` and `session` are numbers, from 1, into the lists
+    `published_ns` is int64, as a double does not hold it. `vehicle` and `session` are numbers, from 1, into the lists
     `vehicles` and `sessions`.
     """
 
@@ -145,7 +145,7 @@ class MatFile(TableFile):
 
     def close(self) -> None:
         """See `TableFile.close`."""
-        import scipy.io  # slow, and not for the others
+        import scipy.io  # slow to import, and needed here only
 
         if self._bytes > MAT_LIMIT:
             raise ExportError(

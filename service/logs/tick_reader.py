@@ -1,7 +1,7 @@
-"""Joined rows become ticks: what the controller computed, what was commanded, and how long each way took.
+"""Tick reader: turns joined rows into ticks with what was computed and commanded, and the delay of each way.
 
-A tick counts once a command has answered it or a later one: what the controller never used, it does not answer for. An
-error at a tick that the controller did not compute is that of the plant's own measurement.
+A tick counts once a command has answered it or a later one; ticks after the last answer are not judged. The error at a
+tick that the controller did not compute is that of the plant's own measurement.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Judged(NamedTuple):
         judged: Ticks with a valid measurement, up to the last that was answered; the rest comes with a later block.
         answered: Ticks that a command answered, be it one without a valid value. Shape (m,).
         voltages: What was commanded at them [V]. Shape (m, actuators).
-        missed: Ticks that the plant measured, the controller did not compute, and neither will. Shape (n,).
-        unsent: Of the judged measurements and of the answers, how many silence stood for.
+        missed: Judged ticks that the plant measured and the controller did not compute. Shape (n,).
+        unsent: How many of the judged measurements, and of the answers, were silent.
         measurements: Codes of all measurement frames of the block. Shape (n, 6).
-        commands: Of all command frames. Shape (n, actuators).
+        commands: Codes of all command frames. Shape (n, actuators).
     """
 
     judged: Ticks
@@ -53,7 +53,7 @@ class TickReader:
         settings: The configuration of its controller.
 
     Attributes:
-        offset: Of the two ends' clocks.
+        offset: Offset between both ends' clocks.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -65,7 +65,7 @@ class TickReader:
         self._later: list[tuple[Ticks, Flags, Flags]] = []  # ticks after the last answer, as in `_ticks`
 
     def take(self, block: Block) -> Judged:
-        """The next block."""
+        """Read the next block."""
         measurements, plants_codes = self._measurements(block)
         commands, commanded = self._commands(block)
         seen, over, sent = self._ticks(block, plants_codes, commanded)
@@ -95,7 +95,7 @@ class TickReader:
         )
 
     def _measurements(self, block: Block) -> tuple[Array, Array]:
-        """Codes of the measurement frames; and of every row of the plant in the block, those that hold at it."""
+        """Codes of the measurement frames; and the codes that hold at every row of the plant in the block."""
         rows, plant = block.controller, block.plant
         if not plant:
             frames = rows["measurement"][rows["received_as"] == Received.FRAME]
@@ -192,7 +192,7 @@ def _column(rows: Rows, at: Integers, name: str) -> Integers:
 
 
 def _is(rows: Rows, at: Integers, name: str, *kinds: int) -> Flags:
-    """Whether a column's value at places of rows is one of these; not where the place is −1. Shape (n,)."""
+    """Whether a column's value at places of rows is one of these; false where the place is −1. Shape (n,)."""
     values = _column(rows, at, name)
     found = np.zeros(len(at), dtype=np.bool_)
     for kind in kinds:

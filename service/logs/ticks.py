@@ -1,4 +1,4 @@
-"""Ticks of a session as the controller saw them, in columns: what the review judges, draws and exports."""
+"""Ticks of a session in columns, as the controller received and computed them; review, figures and export use them."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class Ticks(NamedTuple):
 
     @classmethod
     def joined(cls, blocks: Sequence[Self]) -> Self:
-        """Blocks, at least one, as one."""
+        """Concatenation of blocks, at least one."""
         return blocks[0] if len(blocks) == 1 else cls(*map(np.concatenate, zip(*blocks, strict=True)))
 
     def where(self, chosen: npt.NDArray[np.bool_] | Integers | slice) -> Self:
-        """Some of them, by mask, index or slice."""
+        """The ticks that a mask, index or slice selects."""
         return type(self)(*(column[chosen] for column in self))  # type: ignore[arg-type]  # as they were

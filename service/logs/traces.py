@@ -1,7 +1,7 @@
 """Index of a run's traces: which batches its files hold and which rows they lack, from the batches' headers alone.
 
-Rows are numbered over the life of an end's process. So a gap in the numbers says how many rows are missing, a batch
-that was recorded twice is known by its first row, and every session's length is known before any of it is read.
+Rows are numbered per process of an end. So a gap in the numbers is the number of missing rows, the first row identifies
+a batch that was recorded twice, and every session's length is known before its rows are read.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Missing(BaseModel):
     session: str
     end: Literal["controller", "plant"]
     first_tick: int = Field(description="the first tick of the session that may lack its row")
-    last_tick: int | None = Field(description="the last; null where the log does not say how long the session lasted")
+    last_tick: int | None = Field(description="the last; null where the session's length is not known")
     rows: int = Field(description="how many are known to be missing; 0 where only the session's last batch is")
 
     def __str__(self) -> str:
@@ -76,7 +76,7 @@ class Batches:
     """Batches of one source.
 
     Attributes:
-        table: A row a batch, sorted and without duplicates, with the columns of `_FIELDS`; complete after `finish`.
+        table: A row per batch, sorted and without duplicates, with the columns of `_FIELDS`; complete after `finish`.
     """
 
     def __init__(self) -> None:
@@ -84,12 +84,12 @@ class Batches:
         self.table: Integers = np.empty((0, len(_FIELDS)), dtype=np.int64)
 
     def add(self, header: Header, payload: bytes, session: int) -> None:
-        """One batch that a file holds, of a session by its number."""
+        """Add a batch, with its session by number."""
         first, last, proof = _ticks(header, payload)
         self._values.extend((*key_of(header, payload), session, header.rows, header.final, first, last, proof))
 
     def finish(self) -> None:
-        """No more is to come."""
+        """Sort the batches and drop duplicates, once all are added."""
         table = np.array(self._values, dtype=np.int64).reshape(-1, len(_FIELDS))
         self._values = array("q")
         table = np.unique(table, axis=0)  # sorted by the key, which comes first
@@ -105,7 +105,7 @@ _FIELDS: Final = ("first_row", "has_rows", "time", "checksum", "session", "rows"
 
 
 class Extent(NamedTuple):
-    """What a log has of a session: the first and last tick and the rows of each end; a last tick of −1 is none."""
+    """Recorded extent of a session: first tick, last tick (−1 for none) and rows of each end."""
 
     first: dict[End, int]
     last: dict[End, int]
@@ -117,7 +117,7 @@ class Extent(NamedTuple):
         return self.last["controller"] - self.first["controller"] + 1 if self.rows["controller"] else 0
 
     def of(self, end: End) -> Extent:
-        """The same of one end alone."""
+        """The same with the rows of one end only."""
         return self._replace(rows={other: rows if other == end else 0 for other, rows in self.rows.items()})
 
 
@@ -126,8 +126,8 @@ class TraceIndex:
 
     Attributes:
         sources: Batches by source.
-        extents: What there is of each session, in the order of recording; complete after `finish`.
-        missing: What is not; likewise.
+        extents: Extent of each session, in the order of recording; complete after `finish`.
+        missing: Missing rows; likewise.
         malformed: Batches that cannot be read.
     """
 
@@ -139,7 +139,7 @@ class TraceIndex:
         self._names: dict[str, int] = {"": 0}
 
     def add(self, vehicle: str, payload: bytes) -> None:
-        """A batch that a file holds."""
+        """Add a batch."""
         header = read_header(payload)
         if header is None or len(payload) != batch_bytes(header):
             self.malformed += 1
@@ -148,7 +148,7 @@ class TraceIndex:
         batches.add(header, payload, self._names.setdefault(header.session, len(self._names)))
 
     def finish(self) -> None:
-        """No more is to come: find sessions, and what is missing of them."""
+        """Find sessions and their missing rows, once all batches are added."""
         proofs: dict[tuple[SessionKey, End], int] = {}
         ended: set[tuple[SessionKey, End]] = set()
         names = list(self._names)
@@ -195,7 +195,7 @@ class TraceIndex:
                 self._lacks(source, session[i], ends + 1, None, rows)
 
     def _find_end(self, which: SessionKey, end: End, last: int, proof: int, ended: bool) -> None:
-        """What the other end proves to be missing after the last row, or that the session's end is."""
+        """Report rows after the last one, if the other end proves them, or a missing end of the session."""
         known = any((m.vehicle, m.session) == which and m.end == end and m.last_tick is None for m in self.missing)
         if known:
             return
@@ -213,15 +213,15 @@ class TraceIndex:
 
 
 class Arrived(NamedTuple):
-    """A batch in its place.
+    """A batch in order.
 
     Attributes:
-        source: Whose.
-        header: What it says of all its rows.
+        source: The process that published it.
+        header: Its header.
         payload: Its bytes.
         after_gap: Whether rows before it are missing.
         last_tick: Tick of its last row; −1 without rows.
-        next_tick: No row of its session that comes later is of a tick before this one; −1 if none comes.
+        next_tick: Lowest tick of all later rows of its session; −1 if there are none.
     """
 
     source: Source
@@ -233,7 +233,7 @@ class Arrived(NamedTuple):
 
     @property
     def tail(self) -> Tail:
-        """What belongs to its rows; nothing where that is malformed."""
+        """Its tail; empty if malformed."""
         text = self.payload[len(self.payload) - self.header.tail_bytes :]
         try:
             return Tail.model_validate_json(text) if text else Tail()
@@ -247,17 +247,17 @@ class Arrived(NamedTuple):
 
 
 class InOrder:
-    """Puts batches in the order of their rows as they are read again, and drops those that come twice.
+    """Puts batches in the order of their rows as they are read again, and drops duplicates.
 
     Args:
-        index: Of the same files.
+        index: Index of the same files.
     """
 
     def __init__(self, index: TraceIndex) -> None:
         self._queues = {source: _Queue(batches) for source, batches in index.sources.items()}
 
     def take(self, vehicle: str, payload: bytes) -> Iterator[Arrived]:
-        """A batch as a file holds it; then every batch whose turn it is."""
+        """Add a batch; yields every batch that is next in order."""
         header = read_header(payload)
         if header is None or len(payload) != batch_bytes(header):
             return
@@ -269,7 +269,7 @@ class InOrder:
 
 
 class _Queue:
-    """Batches of one source that wait for those before them."""
+    """Batches of one source, waiting for those before them."""
 
     def __init__(self, batches: Batches) -> None:
         self._keys: list[Key] = list(zip(*(column.tolist() for column in batches.table[:, :4].T), strict=True))
@@ -278,17 +278,17 @@ class _Queue:
         self._at = self._row = 0
 
     def put(self, header: Header, payload: bytes) -> None:
-        """A batch of it, known or not."""
+        """Add a batch, unless it is a duplicate."""
         key, keys = key_of(header, payload), self._keys
         place = self._at
         if place == len(keys) or keys[place] != key:
             place = bisect_left(keys, key, lo=place)
             if place == len(keys) or keys[place] != key:
-                return  # it was taken before
+                return  # a duplicate
         self._waiting[key] = header, payload
 
     def next(self, source: Source) -> Arrived | None:
-        """The batch whose turn it is; None if it has not been read yet."""
+        """The next batch in order; None if it has not been read yet."""
         at = self._at
         if at == len(self._keys) or (found := self._waiting.pop(self._keys[at], None)) is None:
             return None
@@ -299,14 +299,14 @@ class _Queue:
 
 
 def key_of(header: Header, payload: bytes) -> Key:
-    """Where a batch stands among those of its source; one without rows stands before the one that goes on there."""
+    """Sort key of a batch within its source; one without rows precedes the batch that starts at the same row."""
     return header.first_row, header.rows > 0, header.monotonic_ns, 0 if header.rows else crc32(payload)
 
 
 def _ticks(header: Header, payload: bytes) -> tuple[int, int, int]:
-    """The first and last tick of a batch, and a tick of which it proves that the other end had it, too.
+    """First and last tick of a batch, and a tick that it proves of the other end.
 
-    Ticks are steps, whose sum is the last row's.
+    Ticks are stored as steps, whose sum is the last row's tick.
     """
     rows = header.rows
     if not rows:

@@ -1,7 +1,8 @@
-"""Frames as the recorder took them from the wire, compared with what the ends have in their traces.
+"""Comparison of recorded frames with the ends' traces.
 
-They are evidence that does not depend on the ends; no figure is computed from them. A frame carries a counter and no
-tick, so ticks are counted up in the order of recording, from where the traces were when the first frame was recorded.
+Recorded frames are evidence that does not depend on the ends; no figure is computed from them. A frame carries a
+counter and no tick, so ticks are counted in the order of recording, from the tick that the traces had reached when the
+first frame was recorded.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ class WireCheck:
 
     Args:
         which: The session.
-        wire: How frames are read.
-        reached: The last tick that the traces have come to, by session.
+        wire: Format of the frames.
+        reached: The last tick that the traces have reached, by session.
     """
 
     def __init__(self, which: SessionKey, wire: WireSpec, reached: Mapping[SessionKey, int]) -> None:
@@ -36,14 +37,14 @@ class WireCheck:
         self._counts = {name: {"recorded": 0, "differ": 0} for name in self._formats}
 
     def route(self, address: Address) -> Taker | None:
-        """Who takes the messages of a key."""
+        """Callback for the messages of a key; None unless they are frames of the session."""
         name = address.topic.name
         if name not in self._formats or (address.vehicle, address.session) != self._which:
             return None
         return lambda frame, _: self._add(name, frame)
 
     def take(self, block: Block) -> None:
-        """The next block: frames up to its end are compared."""
+        """Compare the frames up to the end of the next block."""
         at, plant = block.at_controller, block.at_plant
         self._compare("measurement", block.plant, block.k[plant >= 0], plant[plant >= 0])
         self._compare("command", block.controller, block.k[at >= 0], at[at >= 0])

@@ -1,1 +1,1 @@
-"""Recording: the recorder process and the files that it writes."""
+"""The recorder process and the MCAP files that it writes."""

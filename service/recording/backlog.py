@@ -1,4 +1,4 @@
-"""Messages that were taken and are not yet written, mostly because the disk refuses: bounded, the oldest are kept."""
+"""Backlog of messages taken and not yet written, mostly while the disk refuses: bounded, drops the newest."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from aeroloop.protocol.transport.publication import Delivery
 
 MOST_MESSAGES: Final = 200_000
 MOST_BYTES: Final = 128_000_000
-"""Payloads; with what Python adds to 200 000 messages the recorder grows by some 200 MB at the most."""
+"""Bytes of payload. With Python's overhead for 200 000 messages the recorder grows by some 200 MB at most."""
 
 
 class Backlog:
     """A queue of messages with their times of arrival [ns since 1970].
 
     Attributes:
-        refused: Messages that found no room, by key.
+        refused: Messages dropped because there was no room, by key.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Backlog:
             self.refused[received.key] += 1
 
     def next(self) -> tuple[Delivery, int] | None:
-        """Take out the message that has waited longest; None if there is none."""
+        """Remove and return the oldest message; None if there is none."""
         if not self._queue:
             return None
         received, at_ns = self._queue.popleft()

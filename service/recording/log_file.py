@@ -1,7 +1,7 @@
-"""One file of a log: raw messages on a channel per key, decoded ones beside them, and what is needed to read it alone.
+"""Log file: one MCAP file with raw messages on a channel per key, decoded ones beside them, and all a reader needs.
 
-Messages gather in a chunk in memory. A chunk that is closed is compressed and goes to the disk whole: what cannot be
-written is taken back, stays in memory and can be tried again, so that a full disk never leaves half a record behind.
+Messages are collected in a chunk in memory. A closed chunk is compressed and written whole: a failed write is undone,
+and the chunk stays in memory for the next try, so a full disk never leaves half a record behind.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from typing import Final
 from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import model_of
 from aeroloop.protocol.runtime.host_facts import versions
 from aeroloop.protocol.transport.publication import Delivery
 from aeroloop.service.logs.mcap_file import CHUNK_BYTES
-from aeroloop.service.viewers.channels import Decoded
-from aeroloop.service.viewers.schemas import Shape, json_shape
+from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
 TRACE_ENCODING: Final = "x-aeroloop-trace"
@@ -33,7 +31,7 @@ MESSAGE_HEAD: Final = 31
 
 
 class _WholeChunks:
-    """A stream for `Writer`, and a file that grows by what `flush` can write whole."""
+    """A stream for `Writer`; its file grows only by what `flush` has written whole."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -48,7 +46,7 @@ class _WholeChunks:
         return self.size + len(self._pending)
 
     def flush(self) -> None:
-        """Write what is pending to the disk itself, or leave the file as it was and raise OSError."""
+        """Write the pending bytes through to the disk, or leave the file as it was and raise OSError."""
         if not self._pending:
             return
         try:
@@ -84,7 +82,7 @@ class LogFile:
         path: The same.
 
     Raises:
-        OSError: It exists already, or cannot be made.
+        OSError: It exists already, or cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -103,12 +101,12 @@ class LogFile:
 
     @property
     def full(self) -> bool:
-        """Whether the chunk has grown as large as one should be."""
+        """Whether the chunk has reached its size."""
         return self._gathered >= CHUNK_BYTES
 
     @property
     def replaced(self) -> bool:
-        """Whether the file is no longer where it was made: somebody has moved or removed it."""
+        """Whether the file was moved or removed while it was written."""
         return not self._out.stands_at(self.path)
 
     def add(self, received: Delivery, at_ns: int) -> None:
@@ -116,7 +114,7 @@ class LogFile:
 
         Args:
             received: The message.
-            at_ns: When it was received; when it was published, too, where that is not said [ns since 1970].
+            at_ns: When it was received [ns since 1970]; also its publish time where it carries none.
         """
         channel = self._channels.get(received.key)
         if channel is None:
@@ -125,7 +123,7 @@ class LogFile:
         self._add(channel, at_ns, published_ns, received.payload, received.sequence)
 
     def add_decoded(self, decoded: Decoded) -> None:
-        """Add what was made from a message, under a topic of its own; its log time is that message's publication."""
+        """Add a decoded message under its own topic; its log time is the raw message's publish time."""
         channel = self._channels.get(decoded.topic)
         if channel is None:
             shape = self._schema(decoded.shape)
@@ -138,23 +136,23 @@ class LogFile:
         self._writer.add_metadata(name, entries)
 
     def attach_specification(self, at_ns: int) -> None:
-        """Attach the wire's specification, by which frames are read."""
+        """Attach the wire's specification, which a reader of frames needs."""
         text = files("aeroloop.protocol").joinpath("SPEC.md").read_bytes()
         self._writer.add_attachment(at_ns, at_ns, "protocol/SPEC.md", "text/markdown", text)
 
     def commit(self) -> None:
-        """Close the chunk and write it. Raises OSError; what could not be written is written with the next."""
+        """Close the chunk and write it. Raises OSError; then it is written with the next."""
         self._gathered = 0
         self._writer.flush()
 
     def end(self) -> None:
-        """Write the last chunk and the index, and close the file. After an OSError it can only be abandoned."""
+        """Write the last chunk and the index, and close the file. After an OSError only `abandon` is allowed."""
         self._writer.finish()
         self._out.flush()
         self._out.close()
 
     def abandon(self) -> None:
-        """Close the file as it is on the disk, without what was not written."""
+        """Close the file as it is on the disk; drop what is not written."""
         self._out.close()
 
     def remove(self) -> None:
@@ -183,7 +181,7 @@ def _raw_shape(topic: topics.Topic) -> Shape:
     if topic.carries == "trace":
         text = "batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's description"
         return Shape("aeroloop.Trace", TRACE_ENCODING, text.encode(), TRACE_ENCODING)
-    if topic.carries == "frame":
-        text = f"{topic.model} frame: bits as in the attachment protocol/SPEC.md, by the plant's wire spec"
-        return Shape(f"aeroloop.{topic.model}", FRAME_ENCODING, text.encode(), FRAME_ENCODING)
-    return json_shape(f"aeroloop.{topic.model}", model_of(topic))
+    if topic.model is None:
+        text = f"{topic.title} frame: bits as in the attachment protocol/SPEC.md, by the plant's wire spec"
+        return Shape(f"aeroloop.{topic.title}", FRAME_ENCODING, text.encode(), FRAME_ENCODING)
+    return json_shape(f"aeroloop.{topic.title}", topic.model)

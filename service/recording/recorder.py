@@ -1,11 +1,11 @@
-"""The recorder process: what both ends and all others publish, into MCAP files.
+"""Recorder process: writes what every role publishes into MCAP files.
 
-It only subscribes. Traces, messages and descriptions are published from caches, so a recorder that starts late or again
-recovers the last minute. Twice a second it takes what was received and writes it, so log times are exact
-to 0.5 s. A channel per key holds the raw payloads, decoded channels stand beside them at a bounded rate, and what was
-lost is published and recorded.
+It only subscribes. Traces, messages and descriptions are published from caches, so a recorder that starts late or is
+restarted recovers the last minute. Twice a second it takes the received messages and writes them, so log times are
+exact to 0.5 s. A channel per key holds the raw payloads, decoded channels are written at a bounded rate, and losses
+are published and recorded.
 
-A crash costs this process what the open chunk holds and 0.5 s; its successor recovers that from the caches.
+A crash costs the open chunk and 0.5 s; the restarted recorder recovers them from the caches.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from functools import lru_cache
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import ValidationError
 
@@ -26,7 +26,10 @@ from aeroloop.service.recording.backlog import Backlog
 from aeroloop.service.recording.rolling import RollingLog
 from aeroloop.service.recording.subscriptions import Subscriptions
 from aeroloop.service.settings import RecorderSettings
-from aeroloop.service.viewers.channels import Decoded, Decoder
+from aeroloop.service.viewers.schemas import Decoded
+
+if TYPE_CHECKING:
+    from aeroloop.service.viewers.channels import Decoder
 
 WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
@@ -34,16 +37,16 @@ WORK_EVERY_S: Final = 0.5
 STATUS_EVERY_S: Final = 1.0
 
 AT_ONCE: Final = 2000
-"""Messages written before the rings are looked at again."""
+"""Messages written before messages are taken from the rings again."""
 
 QUIET_S: Final = 0.3
-"""A network from which nothing was received for so long has nothing more on its way [s]."""
+"""After this long without a message the network counts as quiet [s]."""
 
 ANSWER_S: Final = 5.0
-"""How long a role may take to answer before recording ends without its last messages [s]."""
+"""Longest wait for a role's answer at the end; after it recording ends without the role's last messages [s]."""
 
 GOES_ON_S: Final = 1.0
-"""A network that does not become quiet in this time goes on for good [s]."""
+"""Longest wait for a quiet network at the end [s]."""
 
 _address = lru_cache(maxsize=4096)(topics.read_key)
 
@@ -53,10 +56,10 @@ class Recorder:
 
     Args:
         role: Its presence on the network.
-        settings: Where the log goes.
+        settings: Where the log is written.
 
     Attributes:
-        log: What is written.
+        log: The files.
 
     Raises:
         RecorderError: The log cannot be written.
@@ -71,10 +74,18 @@ class Recorder:
         self._status_written = 0
         self._status_at = time.monotonic()
         self.log = RollingLog(settings, self._report)
-        self._decoder = Decoder(settings.decoded_hz) if settings.decoded_hz else None
+        self._decoder = self._make_decoder(settings.decoded_hz) if settings.decoded_hz else None
+
+    def _make_decoder(self, rate_hz: float) -> Decoder | None:
+        try:
+            from aeroloop.service.viewers.channels import Decoder
+        except ModuleNotFoundError:
+            self._role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
+            return None
+        return Decoder(rate_hz)
 
     def run(self) -> None:
-        """Record until the role's `stop` is set; then take what is still on its way and close the log."""
+        """Record until the role's `stop` is set; then take the messages in transit and close the log."""
         self._subscriptions = Subscriptions(self._role.zenoh, frames=self._frames)
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
@@ -92,17 +103,17 @@ class Recorder:
             self._take_all()
             self._publish_losses()
             self._take_all()
-            self._publish_losses()  # and those of which the publisher was not known a moment ago
+            self._publish_losses()  # and those of publishers without a known key in the first call
             self._publish_status()
             self._take_all()
             self.log.close(len(self._backlog))
 
     def reconfigure(self, settings: RecorderSettings) -> None:
-        """Take over what can change while recording."""
+        """Take over the settings that may change while recording."""
         self.log.settings = settings
 
     def _settle(self) -> None:
-        """Take what is on its way. A role's answer follows all that it published before, as a link keeps the order."""
+        """Take messages in transit. A role's answer follows its earlier messages, because a link keeps the order."""
         for _ in self._role.zenoh.get(topics.key("description", "*"), timeout=ANSWER_S):
             pass
         now = last = time.monotonic()
@@ -115,7 +126,7 @@ class Recorder:
 
     @property
     def _behind(self) -> bool:
-        """Whether there is something to write, and it can be."""
+        """Whether messages wait and the disk accepts them."""
         return self.log.writable and len(self._backlog) > 0
 
     def _take_all(self) -> None:
@@ -124,13 +135,13 @@ class Recorder:
             self._write()
 
     def _take(self, *, held: bool = False) -> int:
-        """Take what was received, and write some of what waits. How many messages were received."""
+        """Take the received messages and write some of those waiting. Returns the number received."""
         count, now = 0, time.time_ns()
         for received in self._subscriptions.take(held=held):
             count += 1
             address = _address(received.key)
             if address is not None and address.topic.name == "description":
-                self._configure(received)  # at once: without it the rest cannot be read
+                self._configure(received)  # at once: other messages are decoded by it
             if not self._backlog.room(received):
                 self._write()
             self._backlog.put(received, now)
@@ -138,7 +149,7 @@ class Recorder:
         return count
 
     def _write(self) -> None:
-        """Write what has waited longest, `AT_ONCE` messages at the most, unless the disk refuses."""
+        """Write the oldest messages, at most `AT_ONCE`, unless the disk refuses."""
         for _ in range(AT_ONCE):
             if not self.log.writable or (entry := self._backlog.next()) is None:
                 return
@@ -167,7 +178,7 @@ class Recorder:
             self._decoder.configure(description)
 
     def _publish_losses(self) -> None:
-        """Publish, and thereby record, what was lost; what found no room once the disk has some again."""
+        """Publish, and thereby record, losses; those of the full backlog once the disk accepts writes again."""
         for lost in self._subscriptions.losses():
             self._lose(lost.key, lost.messages, lost.reason)
         if self.log.writable:

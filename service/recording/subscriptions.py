@@ -1,7 +1,7 @@
-"""What the recorder receives: traces and JSON messages of all vehicles, and which of them it will never receive.
+"""Subscriptions of the recorder: traces and JSON messages of all vehicles, and the count of those lost.
 
 Messages wait in rings that Zenoh's own threads fill, until they are taken. A publisher numbers its messages; the
-subscriber asks its cache for those that it lacks and reports what the cache no longer holds. A number that is neither
+subscriber queries its cache for missing ones and reports those that the cache no longer holds. A number that is neither
 taken nor reported was dropped by a full ring.
 """
 
@@ -44,7 +44,7 @@ class Subscriptions:
 
     Args:
         session: An open session; it outlives the subscriptions.
-        frames: Receive the loop's frames, too; these have no numbers, so their losses are not known.
+        frames: Receive the loop's frames, too; these have no numbers, so their losses are not counted.
         waiting: Messages of one topic that may wait to be taken.
     """
 
@@ -58,9 +58,9 @@ class Subscriptions:
         ]
         self._keys: dict[_Source, str] = {}
         self._following: dict[_Source, int] = {}  # the number that comes next
-        self._gaps: Counter[_Source] = Counter()  # numbers that were skipped since losses were last asked for
+        self._gaps: Counter[_Source] = Counter()  # numbers skipped since `losses` was last called
         self._unnamed: list[tuple[_Source, str, int]] = []  # losses of publishers of which nothing was taken yet
-        self._reported: Counter[_Source] = Counter()  # numbers that were reported missing, and not yet skipped
+        self._reported: Counter[_Source] = Counter()  # numbers reported missing and not yet skipped
 
     @property
     def joining(self) -> bool:
@@ -68,10 +68,10 @@ class Subscriptions:
         return any(subscriber.joining for subscriber in self._topics.values())
 
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
-        """What was received and not yet taken, topic by topic, descriptions first. Never waits.
+        """Messages received and not yet taken, topic by topic, descriptions first. Never waits.
 
         Args:
-            held: Also take what is held back.
+            held: Also take messages that are held back.
         """
         for subscriber in self._topics.values():
             for received in islice(subscriber.take(held=held), self._waiting):
@@ -85,9 +85,9 @@ class Subscriptions:
                 yield read_sample(sample)
 
     def losses(self) -> list[Lost]:
-        """What was found lost since this was last called.
+        """Losses found since the last call.
 
-        Messages of a publisher of which nothing was taken yet wait for the next call: by then their key may be known.
+        Losses of a publisher of which nothing was taken yet are reported at the next call, when its key may be known.
         """
         found = [Lost(self._keys.get(source, key), count, "network") for source, key, count in self._unnamed]
         self._unnamed.clear()

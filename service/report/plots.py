@@ -1,6 +1,6 @@
-"""The paper's Figures C.4–C.14, drawn from a log into PNG files; and one of what the theorem bounds.
+"""Figures C.4–C.14 of the paper, drawn from a log into PNG files; and one of the theorem's bounds.
 
-All five quantities are drawn whatever the case; which of them is which of the paper's figures, panels.py says.
+All five quantities are drawn in every case; `NUMBERS` of review/panels.py has the paper's number of each.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def draw_figures(settings: Settings, blocks: Sequence[Ticks], folder: Path) -> l
     Args:
         settings: The configuration of its controller.
         blocks: Its ticks.
-        folder: Where; made if need be.
+        folder: Target folder; created if missing.
 
     Raises:
         ReviewError: The session has no ticks, or the folder cannot be written.
@@ -42,7 +42,7 @@ def draw_figures(settings: Settings, blocks: Sequence[Ticks], folder: Path) -> l
     first_motor = 3 - wire.actuators + 1
 
     attitude, desired = ticks.attitude, ticks.desired
-    attitude = attitude * np.sign(np.sum(attitude * desired, axis=1, keepdims=True))  # of ±q, the one beside q_d
+    attitude = attitude * np.sign(np.sum(attitude * desired, axis=1, keepdims=True))  # of ±q, the nearer to q_d
     rate, desired_rate = ticks.rate, ticks.desired_rate
     drawings = {
         "attitude": _stack(
@@ -83,7 +83,7 @@ def draw_theorem(report: Report, folder: Path) -> list[Path]:
 
     Args:
         report: The run.
-        folder: Where; made if need be.
+        folder: Target folder; created if missing.
 
     Raises:
         ReviewError: The folder cannot be written.
@@ -96,10 +96,10 @@ def draw_theorem(report: Report, folder: Path) -> list[Path]:
     axes: list[Axes] = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0].tolist()
     for axis, panel in zip(axes, drawn, strict=True):
         for line in panel.lines:
-            told = np.isfinite(line.values)  # true states come less often than ticks
+            known = np.isfinite(line.values)  # true states are published less often than ticks
             color, style = ("#c8401e", ":") if line.desired else (None, "-")
             axis.plot(
-                report.time[told], line.values[told], linewidth=0.9, label=line.label, color=color, linestyle=style
+                report.time[known], line.values[known], linewidth=0.9, label=line.label, color=color, linestyle=style
             )
         axis.set_ylabel(f"{panel.label}{f' [{panel.unit}]' if panel.unit != '1' else ''}")
         axis.grid(visible=True, color="0.9")
@@ -116,7 +116,7 @@ def draw_theorem(report: Report, folder: Path) -> list[Path]:
 
 
 def _stack(title: str, t: Array, values: Array, desired: Array | None, labels: Sequence[str], unit: str) -> Figure:
-    """One panel a component, with a shared time axis; the desired value, where there is one, is dotted."""
+    """A panel per component, with a shared time axis; the desired value, where there is one, is dotted."""
     n = values.shape[1]
     figure = Figure(figsize=(8, 1.5 + 1.4 * n), layout="constrained", label=title)
     panels: list[Axes] = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0].tolist()

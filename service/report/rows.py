@@ -1,6 +1,6 @@
-"""Figures of merit as rows of a table: a name, a unit, and what each run has, in digits that mean something.
+"""Rows of figures of merit: a name, a unit, and each run's value in significant digits.
 
-The page and the terminal show the same rows, so that a figure reads the same wherever it is looked up.
+The page and the terminal show the same rows, so that a figure reads the same in both.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from aeroloop.service.review.report import Findings
 
 
 class Value(NamedTuple):
-    """A figure of one run: its digits, or why there are none."""
+    """A figure of one run: its digits, or the reason why there are none."""
 
     text: str
     why: str | None = None
@@ -23,10 +23,10 @@ class Row(NamedTuple):
 
     Attributes:
         key: Its name in `--json`.
-        name: Its name for a person.
+        name: Its name for display.
         unit: Empty if it has none.
-        values: One a run.
-        main: Whether it is among the first that one looks for.
+        values: One per run.
+        main: Whether it is a main figure.
     """
 
     key: str
@@ -53,12 +53,12 @@ def micros(value: float) -> str:
 
 
 def seconds(value: float) -> str:
-    """A time on the law's clock or its length, to the millisecond: `12.346`."""
+    """A time on the law's clock or a duration, to the millisecond: `12.346`."""
     return f"{round(value, 3) + 0.0:,.3f}".replace("-", "−")  # + 0.0: no minus before a zero
 
 
 def percent(share: float) -> str:
-    """A share 0…1 in percent: two digits that count, and `0` only for none at all."""
+    """A share 0…1 in percent: two significant digits under 1 %, and `0` only for exactly 0."""
     value = 100 * share
     return "0" if not value else f"{value:.2g}" if value < 1 else f"{value:.1f}"
 
@@ -87,7 +87,7 @@ _whole, _tenth, _hundredth = _digits(",.0f"), _digits(",.1f"), _digits(",.2f")
 _z_track = _digits(",.2f", 1e4)
 
 THEOREM: Final = "theorem."
-"""Keys of what the theorem promises and what became of it begin with this."""
+"""Prefix of the theorem's keys."""
 
 FIGURES: Final = (
     _Figure("z_track", "z_track", "10⁻⁴ s", lambda f: _z_track(f.z_track), main=True),
@@ -125,7 +125,7 @@ FIGURES: Final = (
 
 
 def figure_rows(runs: Sequence[Findings]) -> list[Row]:
-    """Every figure that at least one run has, or says why not."""
+    """Main figures, and every other that at least one run has or has a reason for lacking."""
     rows = []
     for key, name, unit, text, main in FIGURES:
         values = [_value(run, key, text(run)) for run in runs]

@@ -1,6 +1,6 @@
-"""What an observer counts with: durations in bins, and values at a quantizer's limit.
+"""Accumulators of an observer: histograms of durations, and counts of values at a quantizer's limit.
 
-Each takes a block of a few thousand at once, by numpy, and holds no more however many blocks come.
+Each takes a block of a few thousand values at once, by numpy, in memory that does not grow.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _BINS: Final = 32 * _BINS_PER_OCTAVE  # 1 µs … 2^32 µs, as protocol/runtime/
 
 
 class Durations:
-    """A histogram of durations as `protocol/runtime/timing.py`, which takes many at once."""
+    """Histogram of durations with the bins of `protocol/runtime/timing.py`; takes many at once."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, dtype=np.int64)
@@ -34,7 +34,7 @@ class Durations:
             self._max_us = max(self._max_us, float(us.max()))
 
     def spread(self) -> Spread | None:
-        """How they were spread; None if there were none."""
+        """Their distribution; None if there were none."""
         total = int(self._counts.sum())
         if not total:
             return None
@@ -56,7 +56,7 @@ class Durations:
 
 
 class SaturationCount:
-    """How many values of a signal were at the quantizer's outermost level."""
+    """Counts values of a signal at the quantizer's outermost level."""
 
     def __init__(self, signal: SignalSpec) -> None:
         quantizer = signal.quantizer()
@@ -64,7 +64,7 @@ class SaturationCount:
         self._values = self._saturated = 0
 
     def add(self, codes: Array) -> npt.NDArray[np.bool_]:
-        """Count codes, and say which frames have one that is no valid value. Shapes (n, values) and (n,)."""
+        """Count codes, and return which frames have one without a valid value. Shapes (n, values) and (n,)."""
         invalid = np.isnan(codes) | (codes == self._invalid)
         self._values += codes.size - int(invalid.sum())
         self._saturated += int(((np.abs(codes) >= self._top) & ~invalid).sum())
@@ -72,5 +72,5 @@ class SaturationCount:
 
     @property
     def share(self) -> float | None:
-        """Of the valid values; None if there were none."""
+        """Share of the valid values; None if there were none."""
         return self._saturated / self._values if self._values else None

@@ -1,8 +1,8 @@
-"""What a session is held against: the certificate of what it began with, and the bounds that it is made of.
+"""Certificate and bounds that a review checks a session against.
 
-The controller's description carries the certificate of its configuration, so none is computed; where the session began
-with other gains or another reference, or the log is older, it is computed from what the log says. The bounds of
-Lemma 1 always are.
+The controller's description has the certificate of its configuration, which is used if the session began with that
+configuration; with other gains or another reference, or in an older log, it is computed from the log. The bounds of
+Lemma 1 are always computed.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from aeroloop.service.theorem.extremes import BoundlessError
 
 
 class CertifiedBounds(NamedTuple):
-    """What a session is held against.
+    """Certificate and bounds of a session.
 
     Attributes:
         law: The model, with the gains that the session began with.
-        certificate: What the theorem says of them; None of a stream.
-        bounds: What the certificate is made of; None of a stream.
+        certificate: Theorem 1 applied to them; None for a stream of set-points.
+        bounds: The bounds that the certificate is made of; likewise.
         verdict: The certificate in a sentence, or why there is none.
     """
 
@@ -38,12 +38,12 @@ class CertifiedBounds(NamedTuple):
 
     @property
     def radius(self) -> float | None:
-        """Where ‖z‖ ends; None where nothing is guaranteed."""
+        """Where ‖z‖ is guaranteed to end; None without a guarantee."""
         return None if self.certificate is None or not self.certificate.holds else self.certificate.radius
 
 
 class CertificateCache:
-    """The grounds of a log's sessions, most of which began alike.
+    """Computes the certified bounds of sessions and keeps the last, since most sessions begin alike.
 
     Args:
         settings: The controller's configuration.
@@ -56,20 +56,20 @@ class CertificateCache:
         self._last: tuple[Gains | None, Reference, CertifiedBounds] | None = None
 
     def of(self, changes: Sequence[Change]) -> CertifiedBounds:
-        """The grounds of a session.
+        """The certified bounds of a session.
 
         Args:
-            changes: What its controller followed from which tick on; the first is what it began with.
+            changes: Its changes of gains and reference, in order; one at tick 0 is what it began with.
         """
         settings = self._settings
         first = changes[0] if changes and changes[0].tick == 0 else None
         gains = first.gains if first else None
         reference = (first.reference if first else None) or settings.reference
         if self._last is None or self._last[:2] != (gains, reference):
-            self._last = gains, reference, self._made(gains, reference)
+            self._last = gains, reference, self._computed(gains, reference)
         return self._last[2]
 
-    def _made(self, gains: Gains | None, reference: Reference) -> CertifiedBounds:
+    def _computed(self, gains: Gains | None, reference: Reference) -> CertifiedBounds:
         settings = self._settings
         given = {name: value for name, value in gains or () if value is not None}
         law = settings.law.model_copy(update=given)
@@ -94,7 +94,7 @@ def _read(promised: dict[str, Any]) -> Certificate | None:
 
 
 def damping_of(plant: PlantSettings) -> Vector | None:
-    """θ of an emulated plant [N·m·s/rad]; None where its friction is not only that, or it is no emulated plant."""
+    """θ of an emulated plant [N·m·s/rad]; None if it has other friction, or is not emulated."""
     if plant.via == "quanser":
         return None
     if plant.kind == "rigid_body":

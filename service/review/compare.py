@@ -31,12 +31,12 @@ class Comparison(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    runs: dict[str, Findings] = Field(description="what each log tells, by the run's name")
+    runs: dict[str, Findings] = Field(description="by the run's name")
     differences: list[SettingDifference]
 
     @classmethod
     def of(cls, reports: Sequence[Report]) -> Comparison:
-        """Of runs whose names differ."""
+        """Comparison of runs whose names differ."""
         names = [run.name for run in reports]
         return cls(
             runs={run.name: run.findings for run in reports},
@@ -54,8 +54,8 @@ def read_runs(
 
     Args:
         logs: A file or a folder each.
-        limits: What the figures of each are held to.
-        progress: Called now and then with the share that is done, 0…1.
+        limits: Limits that the figures of each must keep.
+        progress: Called repeatedly with the share done, 0…1.
     """
 
     def share(done: int) -> Callable[[float], None] | None:

@@ -1,8 +1,8 @@
-"""Lines thinned out as they come, so that a page can hold hours of them.
+"""Downsampling of lines in bounded memory, so that a page can hold hours of them.
 
-Rows go into buckets, each with the least and the largest value of every column and which of the two came first. When
-there are too many buckets, neighbours are merged in pairs; so the number of points is bounded whatever the length, and
-no extreme is ever lost. While there are few enough rows, each is a bucket of its own and the lines are exact.
+Rows go into buckets, each with the least and the largest value of every column and the order of the two. When there are
+too many buckets, neighbours are merged in pairs; so the number of points is bounded whatever the length, and no extreme
+is lost. While there are few enough rows, each is a bucket of its own and the lines are exact.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 MAX_POINTS: Final = 4096
-"""Of a line: two for each pixel of a wide screen."""
+"""Points of a line: two for each pixel of a wide screen."""
 
 
 class Buckets(NamedTuple):
@@ -40,7 +40,7 @@ class Buckets(NamedTuple):
         return cls(rows, rows, np.ones(rows.shape, dtype=bool), np.ones(len(rows), dtype=np.int64))
 
     def followed_by(self, other: Self) -> Self:
-        """These, then those."""
+        """These buckets, followed by others."""
         return type(self)(
             np.concatenate([self.low, other.low]),
             np.concatenate([self.high, other.high]),
@@ -49,7 +49,7 @@ class Buckets(NamedTuple):
         )
 
     def part(self, cut: slice) -> Self:
-        """Some of them."""
+        """A slice of the buckets."""
         return type(self)(self.low[cut], self.high[cut], self.rising[cut], self.rows[cut])
 
     def paired(self, since: int = 0) -> Self:
@@ -80,12 +80,12 @@ class DownsampledLines:
         self.per_bucket = 1
 
     def add(self, rows: Array) -> None:
-        """More rows. Shape (rows, columns)."""
+        """Add rows. Shape (rows, columns)."""
         buckets, size = Buckets.of(rows), 1
         while size < self.per_bucket and len(buckets.rows) > 1:
             buckets, size = buckets.paired(), 2 * size
         self._buckets = self._buckets.followed_by(buckets)
-        # Where a bucket is to hold more rows than come at once, the last one takes in what fits.
+        # If a bucket holds more rows than one call adds, the last one is filled up.
         while len(self._buckets.rows) > 1 and int(self._buckets.rows[-2:].sum()) <= self.per_bucket:
             self._buckets = self._buckets.paired(len(self._buckets.rows) - 2)
         while len(self._buckets.rows) * (1 if self.per_bucket == 1 else 2) > self._max_points:
@@ -93,10 +93,10 @@ class DownsampledLines:
             self.per_bucket *= 2
 
     def points(self) -> Array:
-        """The lines' points: every row, or of each bucket two that span it. Shape (points, columns).
+        """The lines' points: every row, or two per bucket that span it. Shape (points, columns).
 
-        The two stand in the middle of the bucket's first and second half, each line's extremes in the order in which
-        they came.
+        The two stand in the middle of the bucket's first and second half, each line's extremes in order of
+        time.
         """
         low, high, rising, rows = self._buckets
         if self.per_bucket == 1:

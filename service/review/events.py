@@ -1,8 +1,8 @@
-"""What happened, as roles published it: events, changes, losses, and how old measurements were when they were used.
+"""Events of a session: published events, changes, recorder losses, and the age of measurements.
 
-What carries a session tick stands there; the rest stands at the tick that the plant's trace had reached in the file
-when it was recorded. Of each kind the first few hundred become marks and the rest are counted, so that a log with a
-storm of them can be read and held in memory.
+An event with a session tick is placed at that tick; any other at the tick that the plant's trace had reached in the
+file when the event was recorded. The first few hundred of each kind become marks and the rest are counted, so that a
+log with a storm of events fits in memory and can be read.
 """
 
 from __future__ import annotations
@@ -21,18 +21,17 @@ from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.review.report import Mark
 
 MAX_MARKS: Final = 300
-"""Of one kind of one role."""
+"""Marks kept per kind and role."""
 
 _RECENT: Final = 100_000
-"""Messages that are remembered, so that a recorder that was restarted and got them again does not double them."""
-
+"""Messages kept to find duplicates: a restarted recorder records some messages again."""
 
 Place = tuple[int, float]
-"""Where a mark stands among others: −1 before the session, 0 and a time [s] within it, 1 after it."""
+"""Sort key of a mark: −1 before the session, 0 and a time [s] within it, 1 after it."""
 
 
 class Kind:
-    """All of one kind: the first few hundred, and how many more."""
+    """Marks of one kind: the first few hundred, and the count of the rest."""
 
     def __init__(self) -> None:
         self.first: list[tuple[Place, Mark]] = []
@@ -40,7 +39,7 @@ class Kind:
         self.last: tuple[Place, Mark] | None = None
 
     def add(self, place: Place, mark: Mark) -> None:
-        """One more."""
+        """Add a mark."""
         if len(self.first) < MAX_MARKS:
             self.first.append((place, mark))
         else:
@@ -48,7 +47,7 @@ class Kind:
             self.last = place, mark
 
     def all(self) -> list[tuple[Place, Mark]]:
-        """As many as were kept, and one that stands for the others."""
+        """The marks kept, and one that stands for the rest."""
         if self.last is None:
             return self.first
         place, mark = self.last
@@ -56,37 +55,37 @@ class Kind:
 
 
 class MeasurementAges:
-    """Age of measurements by a controller's statuses, each over ten seconds."""
+    """Age of measurements from a controller's statuses, each over ten seconds."""
 
     def __init__(self) -> None:
         self._p50 = Histogram()
         self._p99 = self._max = 0.0
 
     def add(self, status: Status) -> None:
-        """One more status."""
+        """Add a status."""
         if status.age_us is not None:
             self._p50.add(round(status.age_us.p50 * 1e3))
             self._p99, self._max = max(self._p99, status.age_us.p99), max(self._max, status.age_us.max)
 
     def figures(self) -> dict[str, float] | None:
-        """The median of all tens of seconds, and the worst p99 and maximum of any [µs]; None without any."""
+        """Median of all medians, worst p99 and maximum [µs]; None without any."""
         if not self._p50.count:
             return None
         return {"p50": round(self._p50.percentile(50), 1), "p99": self._p99, "max": self._max}
 
 
 class EventLog:
-    """What a log has beside its traces, of one session and its vehicle.
+    """Messages beside the traces, of one session and its vehicle.
 
     Args:
         which: The session that is judged.
         period: Time between its ticks [s].
         reached: The last tick of each session that the traces have reached in the files so far.
-        open_sessions: The session of each vehicle that has begun there and not ended.
+        open_sessions: The session of each vehicle that is open at that point of the files.
 
     Attributes:
-        statuses: The last of every vehicle and role.
-        trips: Why a plant went to 0 V by itself, each time one did.
+        statuses: The last status of every vehicle and role.
+        trips: Reason of every trip, in which a plant goes to 0 V by itself.
         losses: Messages of the vehicle that the recorder lost, by topic.
     """
 
@@ -102,11 +101,11 @@ class EventLog:
         self._open = open_sessions
         self._kinds: defaultdict[tuple[str, str], Kind] = defaultdict(Kind)
         self._ages = MeasurementAges()
-        self._known: dict[int, None] = {}
+        self._recent: dict[int, None] = {}
         self._status_ns: dict[tuple[str, str], int] = {}
 
     def route(self, address: Address) -> Taker | None:
-        """Who takes the messages of a key; None if they are not part of it."""
+        """Callback for the messages of a key; None if they are not used."""
         vehicle, role = address.vehicle, address.role
         match address.topic.name:
             case "event":
@@ -118,7 +117,7 @@ class EventLog:
         return None
 
     def changed(self, changes: Sequence[Change]) -> None:
-        """What the controller followed from which tick on."""
+        """Add changes of gains and reference."""
         for change in changes:
             self._add("change", "controller", described(change), change.tick)
 
@@ -128,12 +127,12 @@ class EventLog:
         return self._ages.figures()
 
     def marks(self) -> list[Mark]:
-        """Everything that happened to the vehicle, in order of time; what was outside the session before or after."""
+        """Marks of the vehicle in order of time; those outside of the session come first or last."""
         found = [placed for kind in self._kinds.values() for placed in kind.all()]
         return [mark for _, mark in sorted(found, key=lambda placed: placed[0])]
 
     def _event(self, vehicle: str, payload: bytes, at_ns: int) -> None:
-        if self._is_known(vehicle, payload, at_ns):
+        if self._is_duplicate(vehicle, payload, at_ns):
             return
         event = Event.model_validate_json(payload)
         if event.kind == "tripped":
@@ -144,7 +143,7 @@ class EventLog:
         self._add(event.kind, event.role, event.text, tick, event.session)
 
     def _loss(self, vehicle: str, payload: bytes, at_ns: int) -> None:
-        if vehicle != self._which[0] or self._is_known(vehicle, payload, at_ns):
+        if vehicle != self._which[0] or self._is_duplicate(vehicle, payload, at_ns):
             return
         loss = Loss.model_validate_json(payload)
         address = topics.read_key(loss.key)
@@ -154,24 +153,24 @@ class EventLog:
 
     def _status(self, vehicle: str, role: str, payload: bytes, at_ns: int) -> None:
         if at_ns <= self._status_ns.get((vehicle, role), 0):
-            return  # recorded again
+            return  # a duplicate
         self._status_ns[vehicle, role] = at_ns
         status = self.statuses[vehicle, role] = Status.model_validate_json(payload)
         if (vehicle, status.session) == self._which and role == "controller":
             self._ages.add(status)
 
-    def _is_known(self, vehicle: str, payload: bytes, at_ns: int) -> bool:
+    def _is_duplicate(self, vehicle: str, payload: bytes, at_ns: int) -> bool:
         """Whether the very same message was recorded before."""
         message = hash((vehicle, payload, at_ns))
-        if message in self._known:
+        if message in self._recent:
             return True
-        self._known[message] = None
-        if len(self._known) > _RECENT:
-            del self._known[next(iter(self._known))]
+        self._recent[message] = None
+        if len(self._recent) > _RECENT:
+            del self._recent[next(iter(self._recent))]
         return False
 
     def _is_a_change(self, event: Event) -> bool:
-        """Whether it says in words what a change of the session says, too."""
+        """Whether an event only repeats a change of the session in words."""
         return event.kind == "changed" and event.role == "controller" and event.session == self._which[1]
 
     def _add(self, kind: str, role: str, text: str, tick: int | None = None, session: str | None = None) -> None:
@@ -185,21 +184,21 @@ class EventLog:
 
 
 _WHERE: Final = {
-    "network": "they never came",
-    "queue": "they came faster than they could be written",
+    "network": "not received",
+    "queue": "received faster than written",
     "disk": "the log could not be written",
 }
 
 
 def described(change: Change) -> str:
     """A change in words."""
-    said = []
+    parts = []
     if change.gains is not None:
-        said.append(_gains(change.gains))
+        parts.append(_gains(change.gains))
     if change.reference is not None:
         within = f" within {change.within_s:g} s" if change.within_s else ""
-        said.append(f"follows {_reference(change.reference)}{within}")
-    return "; ".join(said)
+        parts.append(f"follows {_reference(change.reference)}{within}")
+    return "; ".join(parts)
 
 
 def _gains(gains: Gains) -> str:

@@ -1,4 +1,4 @@
-"""Findings and facts: what was observed of a session and published beside it, put into the models of report.py."""
+"""Findings and facts: fills the models of report.py from a session's observations and events."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from aeroloop.service.review.report import Findings
 from aeroloop.service.review.session import Session
 
 
-def findings_of(figures: Figures, which: SessionKey, session: Session, story: EventLog, run: Run) -> Findings:
-    """Everything that is known of a session.
+def findings_of(figures: Figures, which: SessionKey, session: Session, events: EventLog, run: Run) -> Findings:
+    """Findings of a session.
 
     Args:
-        figures: Its figures of merit; they are taken over as they are.
+        figures: Its figures of merit, copied unchanged.
         which: Its vehicle and name.
-        session: What was observed of it.
-        story: What was published in the whole log.
+        session: Its review.
+        events: Events of the log.
         run: The log.
     """
     observer, offset = session.observer, session.reader.offset
-    timing, age = observer.timing, story.age_us
+    timing, age = observer.timing, events.age_us
     reasons = dict(figures.reasons)
     if age is None:
         reasons["age_us"] = "the log has no status of the controller with an age"
@@ -50,31 +50,31 @@ def findings_of(figures: Figures, which: SessionKey, session: Session, story: Ev
         gap_count=observer.gap_count,
         saturated=observer.saturated,
         invalid=observer.invalid,
-        losses=story.losses,
+        losses=events.losses,
         missing_ticks={end: sum(gap.rows for gap in run.missing if gap.end == end) for end in ("controller", "plant")},
         missing=run.missing,
         lapses={name: count for name, count in session.lapses.items() if count},
         theorem=theorem,
-        marks=story.marks(),
+        marks=events.marks(),
     )
 
 
-def facts_of(run: Run, story: EventLog, vehicle: str) -> dict[str, dict[str, Any]]:
-    """About software and host, by role: what its description says, what the log's metadata says, what was refused."""
+def facts_of(run: Run, events: EventLog, vehicle: str) -> dict[str, dict[str, Any]]:
+    """Facts about software and host, by role: from descriptions, the log's metadata, and notes in statuses."""
     facts: dict[str, dict[str, Any]] = {}
-    for (whose, role), description in run.files.descriptions.items():
-        if whose == vehicle:
+    for (owner, role), description in run.files.descriptions.items():
+        if owner == vehicle:
             facts[role] = {"host": description.host, **description.facts, "versions": description.versions}
-    for name, said in run.files.metadata.items():
-        facts.setdefault(name, {}).update(said)
-    for (whose, role), status in story.statuses.items():
-        if whose == vehicle and status.notes:
+    for name, values in run.files.metadata.items():
+        facts.setdefault(name, {}).update(values)
+    for (owner, role), status in events.statuses.items():
+        if owner == vehicle and status.notes:
             facts.setdefault(role, {})["notes"] = status.notes
     return facts
 
 
 def name_of(paths: Sequence[Path]) -> str:
-    """What to call a run: its file or folder, without what every log has."""
+    """Name of a run: its file or folder, without the ending."""
     first = paths[0].resolve()
     name = first.name if first.is_dir() else first.stem
     return name if len(paths) == 1 else f"{name} and {len(paths) - 1} more"

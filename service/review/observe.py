@@ -1,7 +1,7 @@
-"""What is looked at in a session beside its figures: timing, gaps, saturation, and every quantity over time.
+"""Observations of a session beside its figures: timing, gaps, saturation, and every quantity over time.
 
 An `Observer` takes frames and ticks by the block and reduces them by numpy, so memory stays bounded however long the
-session is. Durations go into histograms, lines into buckets (thin.py), and of gaps the longest hundred are kept.
+session is. Durations go into histograms, lines into buckets (downsample.py), and the longest hundred gaps are kept.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ LONGEST_GAPS: Final = 100
 
 
 class Observer:
-    """Watches one session.
+    """Observes one session.
 
     Args:
         settings: The configuration of its controller.
-        trial: Holds it against the theorem.
+        check: Checks it against the theorem.
+
+    Attributes:
+        trial: The same check.
     """
 
-    def __init__(self, settings: Settings, trial: TheoremCheck) -> None:
+    def __init__(self, settings: Settings, check: TheoremCheck) -> None:
         wire = settings.wire
         self._period = settings.loop.period
-        self.trial = trial
-        self._columns = columns_of(settings, theta=trial.damping_known)
+        self.trial = check
+        self._columns = columns_of(settings, theta=check.damping_known)
         self._lines = DownsampledLines(1 + len(self._columns))  # k, then what is drawn
         self._outermost = {name: SaturationCount(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
         self._timing = {name: Durations() for name in ("period", "latency", "measurement_delay", "command_delay")}
@@ -47,16 +50,16 @@ class Observer:
         self.gap_count = 0
         self.invalid = {"measurement": 0, "command": 0}
 
-    # ── what it is given ──
+    # ── input ──
 
     def frames(self, measurements: Array, commands: Array) -> None:
-        """Codes of frames that were sent, answered or not. Shapes (n, 6) and (m, actuators)."""
+        """Add codes of frames that were sent, answered or not. Shapes (n, 6) and (m, actuators)."""
         wrong = self._outermost["attitude"].add(measurements[:, :3]) | self._outermost["rate"].add(measurements[:, 3:])
         self.invalid["measurement"] += int(wrong.sum())
         self.invalid["command"] += int(self._outermost["voltage"].add(commands).sum())
 
     def answered(self, k: Integers) -> None:
-        """Ticks that were answered, be it by commands without a valid value. Shape (n,)."""
+        """Add ticks that a command answered, with or without a valid value. Shape (n,)."""
         answers = np.concatenate([self._last_answer, k])
         self._last_answer = answers[-1:]
         missing = np.diff(answers) - 1
@@ -66,7 +69,7 @@ class Observer:
         self._longest = sorted(self._longest + found, reverse=True)[:LONGEST_GAPS]
 
     def ticks(self, ticks: Ticks) -> None:
-        """Ticks that are judged, a block at a time."""
+        """Add a block of ticks that are judged."""
         if not len(ticks.k):
             return
         if self._start_ns is None:
@@ -106,7 +109,7 @@ class Observer:
             )
         )
 
-    # ── what it has found ──
+    # ── results ──
 
     @property
     def started(self) -> str:
@@ -117,7 +120,7 @@ class Observer:
 
     @property
     def timing(self) -> dict[str, Spread]:
-        """Spreads by name, of what there was."""
+        """Spreads by name, without empty ones."""
         return {name: spread for name, one in self._timing.items() if (spread := one.spread()) is not None}
 
     @property
@@ -146,10 +149,10 @@ class Observer:
 
 
 def _beside(attitude: Array, desired: Array) -> Array:
-    """Of ±q, the one beside q_d. Shape (n, 4)."""
+    """±q, with the sign that is nearer to q_d. Shape (n, 4)."""
     return np.where(np.sum(attitude * desired, axis=1, keepdims=True) < 0, -attitude, attitude)
 
 
 def _alternating(one: Array, other: Array) -> Array:
-    """The columns of both by turns. Shape (n, 2·columns)."""
+    """The columns of both, interleaved. Shape (n, 2·columns)."""
     return np.stack([one, other], axis=2).reshape(len(one), -1)

@@ -1,8 +1,8 @@
-"""What is drawn of a session: quantities in the order of the paper's figures, and which figure shows which.
+"""Panels of a session: quantities in the order of the paper's figures, with the numbers of these figures.
 
 A log is one run, and a run is one of the paper's three cases: without quantization (C.4–C.6), with it (C.7–C.11), with
-it and wind (C.12–C.14). Every quantity is drawn whatever the case; a title carries the paper's number where the paper
-has that figure. What the paper has no figure of follows: timing, and what is told less often than every tick.
+it and wind (C.12–C.14). Every quantity is drawn in every case; a title has the paper's number where the paper has
+that figure. Quantities without a figure in the paper follow: timing, estimates, and the theorem's norms.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ NUMBERS: Final[dict[tuple[str, Case], str]] = {
     ("rate_error", "wind"): "C.13",
     ("input", "wind"): "C.14",
 }
-"""SessionKey figure of the paper shows a quantity in a case."""
+"""Number of the paper's figure of a quantity in a case."""
 
 
 def case_of(settings: Settings) -> Case:
-    """SessionKey of the paper's cases a session was."""
+    """The paper's case that a session belongs to."""
     if settings.plant.wind.blowing and not settings.plant.ideal:
         return "wind"
     bits = (settings.wire.attitude.bits, settings.wire.rate.bits, settings.wire.voltage.bits)
@@ -57,7 +57,7 @@ def title_of(name: str, quantity: str, case: Case) -> str:
 
 
 class PanelColumn(NamedTuple):
-    """One line: the panel that it is drawn in, and what it is there."""
+    """One line and the panel that it is drawn in."""
 
     group: str
     title: str
@@ -68,7 +68,7 @@ class PanelColumn(NamedTuple):
 
 
 def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
-    """What is kept of every tick, in the order in which it is drawn; as `Observer` gathers it.
+    """Columns kept of every tick, in the order of drawing, as `Observer` fills them.
 
     Args:
         settings: The configuration of the controller.
@@ -81,7 +81,7 @@ def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
     """Panels of columns; lines that share an axis share a panel, and a line without any value is left out.
 
     Args:
-        columns: What they are.
+        columns: Their descriptions.
         values: Shape (n, columns).
     """
     panels = []
@@ -94,7 +94,7 @@ def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
 
 
 def with_level(panels: list[Panel], group: str, label: str, level: float | None) -> list[Panel]:
-    """Panels, those of a group with a level across them that the others are to stay below; None is no level."""
+    """Panels, with a horizontal line at a level in those of a group; unchanged if the level is None."""
     if level is None:
         return panels
     return [

@@ -1,7 +1,7 @@
-"""A run as data: what `log review --json` prints and what its page draws.
+"""Report of a run as data: what `log review --json` prints and what its page draws.
 
-A `Report` is figures plus everything that happened, and lines thinned out so that a page can hold hours of them. It is
-filled by review.py and knows nothing of how it is shown.
+A `Report` has figures, events, and lines thinned out so that a page can hold hours of them. review.py fills it; it does
+not depend on how it is shown.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from aeroloop.service.logs.traces import Array, Missing
 
 
 class Spread(BaseModel):
-    """How a duration was spread: percentiles, and a histogram of bins 4.4 % wide."""
+    """Distribution of a duration: percentiles, and a histogram of bins 4.4 % wide."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -41,7 +41,7 @@ class Gap(BaseModel):
 
 
 class Mark(BaseModel):
-    """Something that happened: an event, a change of gains or reference, a loss."""
+    """An event on the time axis: an event message, a change of gains or reference, a loss."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -52,7 +52,7 @@ class Mark(BaseModel):
 
 
 class Check(BaseModel):
-    """A limit that was asked for, and whether it holds."""
+    """A limit, and whether it holds."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -62,7 +62,7 @@ class Check(BaseModel):
 
 
 class LemmaCheck(BaseModel):
-    """An inequality of Lemma 1, or of those that it builds on, held against true states."""
+    """An inequality of Lemma 1, or of those that it builds on, checked at true states."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -76,7 +76,7 @@ class LemmaCheck(BaseModel):
 
 
 class TheoremFindings(BaseModel):
-    """What Theorem 1 promises of a session, and what the session did.
+    """What Theorem 1 guarantees for a session, and what the session did.
 
     The transient lasts three times the law's slower time constant: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
     """
@@ -98,7 +98,7 @@ class TheoremFindings(BaseModel):
     z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the quantized signals [1, rad/s]")
     z_norm_share: float | None = Field(description="that as a share of the radius")
     error_deg: float | None = Field(description="largest attitude error after the transient, as the controller saw it")
-    true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the true states that were told")
+    true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the published true states")
     true_error_deg: float | None = Field(description="likewise of the attitude error [deg]")
     damping_known: bool = Field(description="whether the true V that is drawn has its θ̃ term: the plant's θ is known")
     samples: int = Field(description="true states that belong to a tick that is judged")
@@ -112,7 +112,7 @@ class TheoremFindings(BaseModel):
 
 
 class Findings(Figures):
-    """Figures of merit, and what else a log tells. What could not be had is null, with the reason in `reasons`."""
+    """Figures of merit and all other findings. What is unavailable is null, with the reason in `reasons`."""
 
     vehicle: str
     session: str
@@ -126,7 +126,7 @@ class Findings(Figures):
         default=None, description="the controller's monotonic clock less the plant's, at the first and the last tick"
     )
     age_us: dict[str, float] | None = Field(
-        description="age of measurements when they were used, as the controller tells it: p50, p99, max"
+        description="age of measurements when they were used, as the controller reports it: p50, p99, max"
     )
     gaps: list[Gap] = Field(description="the longest hundred, in order of time")
     gap_count: int
@@ -134,17 +134,17 @@ class Findings(Figures):
         description="share of values at a quantizer's outermost level, 0…1: `attitude`, `rate`, `voltage`"
     )
     invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
-    losses: dict[str, int] = Field(description="messages that the recorder knows it has lost, by topic")
+    losses: dict[str, int] = Field(description="messages that the recorder lost, by topic")
     missing_ticks: dict[str, int] = Field(description="rows of either end that were never recorded, in all sessions")
     missing: list[Missing] = Field(description="where they are, and sessions of whose last batch there is none")
     lapses: dict[str, int] = Field(
-        description="what went otherwise than one frame each way a tick. At the controller: measurements that came "
+        description="deviations from one frame each way per tick. At the controller: measurements received "
         "`late`, ticks `missed`, `malformed` measurements; at the plant: commands `stale`, `repeated`, `refused` "
         "(malformed, or without a valid value), `withheld` by a fault"
     )
     frames: dict[str, dict[str, int]] | None = Field(
         default=None,
-        description="where the recorder took frames from the wire, too: how many were `recorded` of either kind, and "
+        description="if the recorder recorded frames, too: how many were `recorded` of either kind, and "
         "how many `differ` from what the ends have in their traces",
     )
     marks: list[Mark]
@@ -159,7 +159,7 @@ class Line:
     label: str
     values: Array
     desired: bool = False
-    """Whether it is what the measured one should follow."""
+    """Whether it is the desired value."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class Panel:
     """Lines that share an axis.
 
     Attributes:
-        group: What they are about, such as `attitude_error`; panels of a group stand together.
+        group: Their subject, such as `attitude_error`; panels of a group stand together.
         title: Such as `Attitude error`, with the paper's number where the paper has that figure.
         label: Of the axis, such as `ε̃₁`.
         unit: Such as `rad/s`; `1` if it has none.
@@ -185,14 +185,14 @@ class Report:
     """A run.
 
     Attributes:
-        name: What to call it.
-        findings: What it is judged by.
+        name: Its name.
+        findings: Its findings.
         time: Times of every line, on the law's clock [s]. Shape (n,).
         panels: What is drawn over time, in the order of the paper's figures.
-        thinned: Ticks that stand behind two points of a line: 1 or 2 if nothing was thinned out. Of more, a line has
-            the least and the largest value.
+        thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
+            and the largest value.
         settings: The effective configuration, as nested tables.
-        facts: About software and host, by role: versions, git revision, kernel, what was refused.
+        facts: Facts about software and host, by role: versions, git revision, kernel, notes.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Limits that figures are held to: `z_track=50e-4` holds if the figure is at most that."""
+"""Limits of figures: `z_track=50e-4` holds if the figure is at most that."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ UNITS: Final[dict[str, str]] = {
     **{f"theorem.{name}": "" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "broken")},
     **{f"theorem.{name}": "°" for name in ("error_deg", "true_error_deg", "radius_deg")},
 }
-"""What can be held to a limit, as it is called in the findings, and its unit."""
+"""Figures that can have a limit, by their names in the findings, and their units."""
 
 SHORT: Final[dict[str, str]] = {
     "skipped": "skipped_ticks",
@@ -51,11 +51,11 @@ NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age
 
 
 class LimitError(AeroloopError):
-    """Not a limit; one line that says how to write one."""
+    """Not a limit; one line with the correct form."""
 
 
 class Limit(NamedTuple):
-    """The most that a figure may be. Of what is a list it is how many there are, of counts by name their sum."""
+    """Upper limit of a figure. A list counts by its length, counts by name by their sum."""
 
     figure: str
     most: float
@@ -72,7 +72,7 @@ class Limit(NamedTuple):
             raise LimitError(f"--require {name} takes a number, not {value!r}") from None
 
     def value(self, figures: Figures) -> float | None:
-        """What the figure is; None if it could not be had."""
+        """The figure's value; None if it is unavailable."""
         found: object = figures
         for part in SHORT.get(self.figure, self.figure).split("."):
             found = found.get(part) if isinstance(found, dict) else getattr(found, part, None)
@@ -83,7 +83,7 @@ class Limit(NamedTuple):
         return found if isinstance(found, int | float) else None
 
     def broken(self, figures: Figures) -> str | None:
-        """Why it does not hold, in a line; None if it does. A figure that could not be had does not hold."""
+        """Why it does not hold, in a line; None if it does. It does not hold for an unavailable figure."""
         value = self.value(figures)
         if value is None:
             return f"{self.figure} is not known, so it is not at most {self.most:g}"

@@ -1,7 +1,7 @@
-"""The review: every figure, from a log alone.
+"""Review of a log: every figure, from the log alone.
 
-The log holds the configuration (roles' descriptions) and what each end did (traces), so the review computes the
-controller again, to the last bit. Of a log with several sessions the longest is judged.
+The log holds the configuration (roles' descriptions) and what each end did (traces), so the review recomputes the
+controller, bit for bit. Of several sessions, it judges the longest.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from aeroloop.service.review.theorem_check import TheoremCheck
 
 
 class Review(NamedTuple):
-    """What a log says of its longest session.
+    """Review of a log's longest session.
 
     Attributes:
         figures: The figures of merit alone.
         findings: The same figures and everything else.
         session: The session.
         which: Its vehicle and name.
-        name: What to call the run.
-        facts: About software and host, by role.
+        name: Name of the run.
+        facts: Facts about software and host, by role.
     """
 
     figures: Figures
@@ -50,7 +50,7 @@ class Review(NamedTuple):
     facts: dict[str, dict[str, Any]]
 
     def report(self, limits: Sequence[Limit] = ()) -> Report:
-        """All of it as data, held to limits."""
+        """The review as data, checked against limits."""
         observer = self.session.observer
         time, panels = observer.lines()
         return Report(
@@ -65,28 +65,28 @@ class Review(NamedTuple):
 
 
 def review(*paths: Path) -> Figures:
-    """Judge a run: the figures of its longest session. Raises as `read` does."""
+    """Figures of a run's longest session. Raises as `read` does."""
     return read(*paths).figures
 
 
 def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
-    """Everything that a log says of its longest session, as data. Raises as `read` does.
+    """Report of a run's longest session. Raises as `read` does.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
-        limits: What its figures are held to.
-        progress: Called now and then with the share that is done, 0…1.
+        limits: Limits that its figures must keep.
+        progress: Called repeatedly with the share done, 0…1.
     """
     return read(*paths, progress=progress).report(limits)
 
 
 def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: Progress | None = None) -> Review:
-    """Read a run and judge its longest session. What cannot be read of a broken file is named in the figures.
+    """Read a run and judge its longest session. The figures list what cannot be read of a broken file.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         watch: Called with every block of the session's ticks.
-        progress: Called now and then with the share that is done, 0…1.
+        progress: Called repeatedly with the share done, 0…1.
 
     Raises:
         ReviewError: Not a log, or one without a session.
@@ -97,44 +97,42 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         vehicle, files = which[0], run.files
         settings, plant = files.settings(vehicle), files.plant(vehicle)
         description = files.descriptions.get((vehicle, "controller"))
-        library, damping = (
-            CertificateCache(settings, description.certificate if description else None),
-            damping_of(plant),
-        )
+        cache = CertificateCache(settings, description.certificate if description else None)
+        damping = damping_of(plant)
 
-        def trial(changes: Sequence[Change]) -> TheoremCheck:
-            return TheoremCheck(library.of(changes), settings.loop.period, damping)
+        def check(changes: Sequence[Change]) -> TheoremCheck:
+            return TheoremCheck(cache.of(changes), settings.loop.period, damping)
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
-        session = Session(settings, plant.watchdog_s, trial, missing, watch)
+        session = Session(settings, plant.watchdog_s, check, missing, watch)
         frames = WireCheck(which, settings.wire, run.reached)
-        story = EventLog(which, settings.loop.period, run.reached, run.open_sessions)
+        events = EventLog(which, settings.loop.period, run.reached, run.open_sessions)
 
         def route(address: Address) -> Taker | None:
             if address.topic.name == "truth":
                 return session.truth if address.vehicle == vehicle else None
-            return frames.route(address) or story.route(address)
+            return frames.route(address) or events.route(address)
 
         for block in run.read([which], route):
-            story.changed(block.changes)
+            events.changed(block.changes)
             frames.take(block)
             session.take(block)
         session.finish()
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    figures = _figures(session, story, run, which)
-    findings = findings_of(figures, which, session, story, run)
+    figures = _figures(session, events, run, which)
+    findings = findings_of(figures, which, session, events, run)
     findings = findings.model_copy(update={"frames": frames.findings()})
-    return Review(figures, findings, session, which, name_of(paths), facts_of(run, story, vehicle))
+    return Review(figures, findings, session, which, name_of(paths), facts_of(run, events, vehicle))
 
 
-def _figures(session: Session, story: EventLog, run: Run, which: SessionKey) -> Figures:
+def _figures(session: Session, events: EventLog, run: Run, which: SessionKey) -> Figures:
     reasons: dict[str, str] = {}
-    plant = story.statuses.get((which[0], "plant"))
+    plant = events.statuses.get((which[0], "plant"))
     latency = plant.latency_us if plant else None
     if latency is None:
         reasons["latency_us"] = "the log has no status of the plant with a latency"
     files = run.files
     return session.score.figures(
-        latency=latency, log=files.name, trips=story.trips, reasons=reasons, damages=files.unread
+        latency=latency, log=files.name, trips=events.trips, reasons=reasons, damages=files.unread
     )

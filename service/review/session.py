@@ -1,4 +1,4 @@
-"""One session under review: its ticks are scored, observed and held against the theorem."""
+"""Review of one session: scores its ticks, observes them, and checks them against the theorem."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from aeroloop.service.review.observe import Observer
 from aeroloop.service.review.theorem_check import WAITING, TheoremCheck
 
 _TRUTHS: Final = TypeAdapter(list[Truth])
-"""Parsed as one text, they take a third of the time."""
+"""Parsing them as one array takes a third of the time."""
 
 _OUTCOMES: Final = {
     "stale": [Outcome.STALE],
@@ -37,9 +37,9 @@ class Session:
 
     Args:
         settings: The configuration of its controller.
-        watchdog_s: How long its plant holds a command that no other follows [s].
-        trial: Makes what holds it against the theorem, given the changes that it began with.
-        missing: What the log lacks of it.
+        watchdog_s: How long its plant holds the last command [s].
+        check: Creates its check against the theorem, from the changes that it began with.
+        missing: Its rows that the log lacks.
         watch: Called with every block of ticks, in order.
 
     Attributes:
@@ -52,7 +52,7 @@ class Session:
         self,
         settings: Settings,
         watchdog_s: float,
-        trial: Callable[[Sequence[Change]], TheoremCheck],
+        check: Callable[[Sequence[Change]], TheoremCheck],
         missing: Sequence[Missing] = (),
         watch: Callable[[Ticks], None] | None = None,
     ) -> None:
@@ -60,7 +60,7 @@ class Session:
         self.score = Score(settings.wire, settings.loop.period, watchdog_s)
         self.lapses: Counter[str] = Counter()
         self.reader = TickReader(settings)
-        self._trial = trial
+        self._check = check
         self._gaps = [(gap.first_tick, gap.last_tick) for gap in missing if gap.end == "controller" and gap.rows]
         self._watch = watch
         self._observer: Observer | None = None
@@ -69,23 +69,23 @@ class Session:
 
     @property
     def observer(self) -> Observer:
-        """What was observed beside the figures."""
+        """The observations beside the figures."""
         if self._observer is None:
-            self._observer = Observer(self.settings, self._trial(()))
+            self._observer = Observer(self.settings, self._check(()))
         return self._observer
 
     def truth(self, payload: bytes, _at_ns: int) -> None:
-        """A message with what was true as a measurement was taken."""
+        """Add a message with the true state at a measurement."""
         self._truths.append(payload)
 
     def take(self, block: Block) -> None:
         """Review the next block."""
         if self._observer is None:
-            self._observer = Observer(self.settings, self._trial(block.changes))
-        observer, trial = self._observer, self._observer.trial
-        trial.changed(block.changes)
+            self._observer = Observer(self.settings, self._check(block.changes))
+        observer, check = self._observer, self._observer.trial
+        check.changed(block.changes)
         self._session = block.which[1]
-        self._give_truths(trial)
+        self._add_truths(check)
         self._count(block)
         found = self.reader.take(block)
         for tick in found.missed.tolist():
@@ -100,19 +100,19 @@ class Session:
             self._watch(found.judged)
 
     def finish(self) -> None:
-        """Review what came after the last block."""
+        """Check the truths after the last block."""
         if self._observer is not None:
-            self._give_truths(self._observer.trial)
+            self._add_truths(self._observer.trial)
             self._observer.trial.finish()
 
-    def _give_truths(self, trial: TheoremCheck) -> None:
+    def _add_truths(self, check: TheoremCheck) -> None:
         for truth in _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]"):
             if truth.session == self._session:
-                trial.truth(truth.session_tick, truth.attitude, truth.rate)
+                check.truth(truth.session_tick, truth.attitude, truth.rate)
         self._truths.clear()
 
     def _count(self, block: Block) -> None:
-        """Count what went otherwise than one frame each way a tick."""
+        """Count late, malformed, stale, repeated, refused and withheld frames."""
         if rows := block.controller:
             for name, kind in (("late", Received.LATE), ("malformed", Received.MALFORMED)):
                 self.lapses[name] += int((rows["received_as"] == kind).sum())

@@ -1,10 +1,10 @@
-"""Theorem 1 and Lemma 1 held against a session: what was promised, what the run did, each inequality where truth is.
+"""Check of a session against Theorem 1 and Lemma 1: guarantees, what the run did, each inequality at true states.
 
-‖z‖ and V are those that the controller computed, from quantized signals, at every tick; and the true ones at the ticks
-of which an emulator told the true state. A truth says which tick's measurement was taken of it, so nothing that is
-judged is interpolated. The transient lasts three times the law's slower time constant, by when an error has fallen to
-5 %. All is judged from when the reference is followed, which a session that begins far from it first goes to, until an
-operator first changes gains or reference: before and after, another certificate would hold.
+‖z‖ and V are computed from the controller's quantized signals at every tick, and from the true states at the ticks for
+which an emulator published one. A truth has the tick of its measurement, so nothing that is judged is interpolated. The
+transient lasts three times the law's slower time constant, after which an error has fallen to 5 %. Judging begins when
+the reference is followed, since a session that begins far from it approaches it first, and ends when an operator first
+changes gains or reference. Why: before and after, another certificate holds.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ Flags = npt.NDArray[np.bool_]
 
 PREMISES: Final = ("C.28", "C.29")
 ERROR_PREMISE: Final = "Assumption 3"
-"""That the attitude error is within what the certificate assumes."""
+"""Premise: the attitude error is within the certificate's assumption."""
 
 WAITING: Final = 8192
-"""Truths that may wait for the ticks that they are of."""
+"""Truths that may wait for their ticks."""
 
 
 class Truths(NamedTuple):
-    """What was true at ticks, a row each. Shapes (n,), (n, 4), (n, 3)."""
+    """True states at ticks, a row each. Shapes (n,), (n, 4), (n, 3)."""
 
     k: Integers
     attitude: Array
@@ -53,7 +53,7 @@ class Truths(NamedTuple):
 
 
 class InequalityCount:
-    """One inequality: how often it was judged, how often broken, and how close it came."""
+    """Counts of one inequality: samples, violations, and the closest approach to its bound."""
 
     def __init__(self, inequality: Inequality) -> None:
         self.equation, self.what = inequality.equation, inequality.what
@@ -62,7 +62,7 @@ class InequalityCount:
         self.closest_s = self.broken_s = nan
 
     def add(self, inequality: Inequality, judged: Flags, time: Array) -> None:
-        """More samples, and which of them count. Shapes (n,)."""
+        """Add samples, of which those in `judged` count. Shapes (n,)."""
         left, right, broken = inequality.left[judged], inequality.right[judged], inequality.broken[judged]
         self.samples += len(left)
         if not len(left):
@@ -76,7 +76,7 @@ class InequalityCount:
         self.broken += int(broken.sum())
 
     def check(self) -> LemmaCheck:
-        """What has been found."""
+        """Result of all samples so far."""
         return LemmaCheck(
             equation=self.equation,
             what=self.what,
@@ -89,58 +89,58 @@ class InequalityCount:
 
 
 class TheoremCheck:
-    """Holds one session against the theorem.
+    """Checks one session against the theorem.
 
     Args:
-        grounds: What it is held against.
+        certified: Certificate and bounds to check against.
         period: Time between ticks [s].
-        damping: θ of the plant, if that is known [N·m·s/rad].
+        damping: θ of the plant; None if not known [N·m·s/rad].
 
     Attributes:
-        damping_known: Whether it is.
+        damping_known: Whether θ is known.
     """
 
-    def __init__(self, grounds: CertifiedBounds, period: float, damping: Vector | None) -> None:
-        self._grounds = grounds
+    def __init__(self, certified: CertifiedBounds, period: float, damping: Vector | None) -> None:
+        self._certified = certified
         self._period = period
         self._damping = damping
         self.damping_known = damping is not None
         self._changes: list[Change] = []  # the first few
         self._since, self._until = 0, inf
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
-        self._before: Ticks | None = None  # the last block: a truth may come a little late
+        self._before: Ticks | None = None  # the last block, for late truths
         self._drawn = np.empty((0, 4))  # the last true state: its tick, ‖z‖, V and the angle of its error [deg]
-        self._tallies: dict[str, InequalityCount] = {}
+        self._counts: dict[str, InequalityCount] = {}
         self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
-        self._settled = transient(grounds.law) / period  # tick from which the transient is over
+        self._settled = transient(certified.law) / period  # tick from which the transient is over
         self._seen: tuple[float, float] | None = None  # largest ‖z‖ and largest attitude error [rad] from then on
         self._true: tuple[float, float] | None = None  # the same of the true state
 
-    # ── what it is told ──
+    # ── input ──
 
     def changed(self, changes: Sequence[Change]) -> None:
-        """What the controller followed from which tick on, in order, before those ticks are given.
+        """Add changes of gains and reference, in order, before their ticks.
 
-        The first is what the session began with, unless the log lacks that.
+        The first is the one that the session began with, unless the log lacks it.
         """
         self._changes = [*self._changes, *changes][:3]
         self._since, self._until = _judged_ticks(self._changes, self._period)
-        self._settled = self._since + transient(self._grounds.law) / self._period
+        self._settled = self._since + transient(self._certified.law) / self._period
 
     def truth(self, tick: int | None, attitude: Quaternion, rate: Vector) -> None:
-        """What was true as a tick's measurement was taken; None of a state that none was taken of."""
+        """Add the true state at a tick's measurement; a state without a tick (None) is dropped."""
         if tick is not None and (not self._truths or tick > self._truths[-1][0]):
             self._truths.append((tick, attitude, rate))
 
     def ticks(self, ticks: Ticks) -> tuple[Array, Array]:
-        """A block of ticks.
+        """Check a block of ticks.
 
         Returns:
-            What is drawn of them, NaN where there is none: the true attitude error [deg], shape (n,); measured and true
+            Values to draw, NaN where there is none: the true attitude error [deg], shape (n,); measured and true
             ‖z‖, measured and true V, shape (n, 4).
         """
-        z, V = measured_norm(ticks, self._grounds.law)
+        z, V = measured_norm(ticks, self._certified.law)
         self._settle(ticks, z)
         true = np.full((3, len(z)), nan)
         before, self._before = self._before, ticks
@@ -149,12 +149,12 @@ class TheoremCheck:
             if (found := self._judge_truths(Ticks.joined([*late, ticks]))) is not None:
                 known = np.vstack([self._drawn, found])
                 self._drawn = known[-1:]
-                # A line is drawn from one to the next.
+                # Interpolated for drawing only.
                 true = np.array([np.interp(ticks.k, known[:, 0], values, left=nan) for values in known.T[1:]])
         return true[2], np.column_stack([z, true[0], V, true[1]])
 
     def finish(self) -> None:
-        """Judge the last block's true states that came after it."""
+        """Judge true states of the last block that were received after it."""
         if self._truths and self._before is not None:
             self._judge_truths(self._before)
 
@@ -170,17 +170,17 @@ class TheoremCheck:
         if not there.any():
             return None
         at = ticks.where(place[there])
-        return np.column_stack([at.k, *self._try(at, Truths(*(column[there] for column in truths)))])
+        return np.column_stack([at.k, *self._judge_lemma(at, Truths(*(column[there] for column in truths)))])
 
     def _settle(self, ticks: Ticks, z: Array) -> None:
-        """The largest ‖z‖ and attitude error after the transient."""
+        """Update the largest ‖z‖ and attitude error after the transient."""
         after = (ticks.k >= self._settled) & (ticks.k < self._until)
         if after.any():
             square = (ticks.attitude_error[after] ** 2).sum(axis=1)
             self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
 
     def _take_truths(self, first: int, last: int) -> Truths:
-        """Those of these ticks; earlier ones are forgotten, later ones wait."""
+        """Truths of these ticks; earlier ones are dropped, later ones wait."""
         taken = []
         while self._truths and self._truths[0][0] <= last:
             if (truth := self._truths.popleft())[0] >= first:
@@ -188,57 +188,57 @@ class TheoremCheck:
         k, attitude, rate = zip(*taken, strict=True) if taken else ((), (), ())
         return Truths(np.array(k, np.int64), np.array(attitude).reshape(-1, 4), np.array(rate).reshape(-1, 3))
 
-    def _try(self, at: Ticks, truths: Truths) -> tuple[Array, Array, Array]:
-        """Judge the lemma at ticks of which the truth is known. Returns true ‖z‖, V and error [deg]. Shapes (n,)."""
-        grounds = self._grounds
-        law = grounds.law
+    def _judge_lemma(self, at: Ticks, truths: Truths) -> tuple[Array, Array, Array]:
+        """Judge the lemma at ticks with a truth. Returns true ‖z‖, V and error [deg]. Shapes (n,)."""
+        certified = self._certified
+        law = certified.law
         inertial = times(rotation(at.attitude), at.desired_rate)
         samples = Samples(truths.attitude, truths.rate, at.attitude, at.rate, at.desired, inertial, at.sign)
         q = samples.q * np.where((samples.q * samples.q_Q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
         b = coordinates(q, samples.omega, samples.q_d, inertial, at.sign, at.gain)
         theta_error = np.zeros((1, 3)) if self._damping is None else self._damping - at.damping_estimate
-        counts = (at.k >= self._since) & (at.k < self._until)
+        within = (at.k >= self._since) & (at.k < self._until)
         half_angle = np.arcsin(np.minimum(1.0, np.linalg.norm(b.eps_e, axis=1)))
-        if (after := counts & (at.k >= self._settled)).any():
+        if (after := within & (at.k >= self._settled)).any():
             self._true = _larger(self._true, b.norm[after], 2 * half_angle[after])
-        self._samples += int(counts.sum())
-        if (bounds := grounds.bounds) is not None and counts.any():
+        self._samples += int(within.sum())
+        if (bounds := certified.bounds) is not None and within.any():
             small = half_angle <= bounds.known.half_angle_e * (1 + 1e-9)
             time: Array = np.asarray(at.k * self._period, dtype=np.float64)
-            self._judge(lemma_inequalities(samples, law, bounds.known, bounds.lemma), counts, small, time)
+            self._judge(lemma_inequalities(samples, law, bounds.known, bounds.lemma), within, small, time)
         return b.norm, lyapunov(b, theta_error, law), np.degrees(2 * half_angle)
 
-    def _judge(self, inequalities: Sequence[Inequality], counts: Flags, small: Flags, time: Array) -> None:
-        """Count each inequality where every premise is met: where it counts, and the error is as small as assumed."""
-        self._outside[ERROR_PREMISE] += int((counts & ~small).sum())
-        judged = counts & small
+    def _judge(self, inequalities: Sequence[Inequality], within: Flags, small: Flags, time: Array) -> None:
+        """Count each inequality at samples within the judged span that meet every premise."""
+        self._outside[ERROR_PREMISE] += int((within & ~small).sum())
+        judged = within & small
         for inequality in inequalities:
             if inequality.equation in PREMISES:
-                self._outside[inequality.equation] += int((counts & inequality.broken).sum())
+                self._outside[inequality.equation] += int((within & inequality.broken).sum())
                 judged &= ~inequality.broken
         self._judged += int(judged.sum())
         for inequality in inequalities:
             if inequality.equation not in PREMISES:
-                self._tallies.setdefault(inequality.equation, InequalityCount(inequality)).add(inequality, judged, time)
+                self._counts.setdefault(inequality.equation, InequalityCount(inequality)).add(inequality, judged, time)
 
-    # ── what it has found ──
+    # ── results ──
 
     @property
     def radius(self) -> float | None:
-        """Where ‖z‖ ends, as is guaranteed."""
-        return self._grounds.radius
+        """Where ‖z‖ is guaranteed to end; None without a guarantee."""
+        return self._certified.radius
 
     def findings(self) -> tuple[TheoremFindings, dict[str, str]]:
-        """What is promised, what the run did, and why what is null could not be had."""
-        grounds, radius, seen, true = self._grounds, self.radius, self._seen, self._true
-        certificate = grounds.certificate
-        checks = [tally.check() for tally in self._tallies.values()]
+        """Findings, and the reason of each that is null, by name."""
+        certified, radius, seen, true = self._certified, self.radius, self._seen, self._true
+        certificate = certified.certificate
+        checks = [count.check() for count in self._counts.values()]
         found = TheoremFindings(
-            verdict=grounds.verdict,
+            verdict=certified.verdict,
             holds=None if certificate is None else certificate.holds,
             radius=radius,
             radius_deg=None if radius is None or certificate is None else certificate.radius_deg,
-            transient_s=transient(grounds.law),
+            transient_s=transient(certified.law),
             since_s=round(self._since * self._period, 9),
             until_s=None if self._until == inf else round(self._until * self._period, 9),
             z_norm=seen and seen[0],
@@ -271,7 +271,7 @@ class TheoremCheck:
         if found.radius is None:
             nothing = found.verdict.rstrip(".") if found.holds is None else "the theorem does not hold"
             reasons |= dict.fromkeys(("radius", "radius_deg", "z_norm_share"), nothing)
-            if self._grounds.bounds is None:
+            if self._certified.bounds is None:
                 reasons["broken"] = nothing
         return reasons
 
@@ -282,11 +282,11 @@ def transient(law: LawSettings) -> float:
 
 
 def _judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
-    """From which tick on, and until which, a session follows the reference and gains that it began with."""
-    if not changes or changes[0].tick:  # a log that begins within a session lacks what that began with
+    """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
+    if not changes or changes[0].tick:  # the log begins within the session
         return 0, changes[0].tick if changes else inf
     since, later = 0, list(changes[1:])
-    if later and later[0].start is not None:  # on the way there, which may be faster than the reference
+    if later and later[0].start is not None:  # the approach, which may be faster than the reference
         way = later.pop(0)
         since = way.tick + ceil((way.ease_s + way.within_s) / period)
     return since, later[0].tick if later else inf
@@ -298,7 +298,7 @@ def _larger(known: tuple[float, float] | None, norms: Array, angles: Array) -> t
 
 
 def measured_norm(ticks: Ticks, law: LawSettings) -> tuple[Array, Array]:
-    """‖z^Q‖ and V of it without θ̃ (C.24), as the controller computed the errors. Shapes (n,)."""
+    """‖z^Q‖ and its V without θ̃ (C.24), from the errors that the controller computed. Shapes (n,)."""
     sign, eps_e = ticks.sign[:, np.newaxis], ticks.attitude_error
     eta_e = (ticks.attitude * ticks.desired).sum(axis=1)  # (C.32)
     z1 = (1 - ticks.sign * eta_e) ** 2 + (eps_e**2).sum(axis=1)  # (C.39), its square

@@ -1,1 +1,1 @@
-"""Terminal."""
+"""Terminal output: tables, progress bars, live view, log lines."""

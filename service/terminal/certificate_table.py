@@ -1,4 +1,4 @@
-"""What a person sees of a certificate in the terminal: the verdict, every term, and what would help."""
+"""Terminal table of a certificate: verdict, remedies, every term."""
 
 from __future__ import annotations
 

@@ -1,9 +1,13 @@
-"""What a person sees in the terminal: tables and progress, by rich."""
+"""Terminal tables and progress bars, drawn by rich.
+
+Tables go to stdout, bars to stderr. A bar is drawn only on a terminal and erased at its end.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from math import degrees
 from typing import TYPE_CHECKING
 
@@ -13,6 +17,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -37,15 +42,15 @@ def figures_table(figures: Figures) -> None:
     """Print figures of merit."""
     rows: list[tuple[str, str]] = [
         ("duration", f"{figures.duration_s:g} s"),
-        ("z_track", _or_why(figures, "z_track", lambda z: f"{z:.6f}   ({z * 1e4:.2f} ×10⁻⁴)")),
-        ("u_total", _or_why(figures, "u_total", lambda u: f"{u:.1f} V²·s")),
-        ("largest attitude error", _or_why(figures, "max_error_deg", lambda e: f"{e:.2f}°")),
-        ("final attitude error", _or_why(figures, "final_error_deg", lambda e: f"{e:.2f}°")),
+        ("z_track", _or_reason(figures, "z_track", lambda z: f"{z:.6f}   ({z * 1e4:.2f} ×10⁻⁴)")),
+        ("u_total", _or_reason(figures, "u_total", lambda u: f"{u:.1f} V²·s")),
+        ("largest attitude error", _or_reason(figures, "max_error_deg", lambda e: f"{e:.2f}°")),
+        ("final attitude error", _or_reason(figures, "final_error_deg", lambda e: f"{e:.2f}°")),
     ]
     for name, stream in (("measurements", figures.measurement), ("commands", figures.command)):
         if stream.frames_per_s is not None and stream.bits_per_s is not None:
             rows.append((name, f"{stream.frames_per_s:.1f} frames/s, {stream.bits_per_s:.0f} payload bits/s"))
-    rows.append(("skipped ticks", _or_why(figures, "skipped_ticks", lambda n: f"{n:.0f}")))
+    rows.append(("skipped ticks", _or_reason(figures, "skipped_ticks", lambda n: f"{n:.0f}")))
     latency = figures.latency_us
     rows.append(
         (
@@ -69,45 +74,44 @@ def figures_table(figures: Figures) -> None:
     Console().print(table)
 
 
-def _or_why(figures: Figures, name: str, text: Callable[[float], str]) -> str:
+def _or_reason(figures: Figures, name: str, text: Callable[[float], str]) -> str:
     value = getattr(figures, name)
     return f"— ({figures.reasons.get(name, 'not measured')})" if value is None else text(value)
 
 
 @contextmanager
-def progress_bar(title: str, total_s: float, *, hidden: bool = False) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr that is told the seconds reached; gone when it is done, and never in a pipe."""
+def _bar(title: str, total: float | None, hidden: bool, *columns: ProgressColumn) -> Iterator[Callable[..., None]]:
+    shown = not hidden and _stderr.is_terminal
     with Progress(
-        TextColumn(title),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f} s"),
-        TimeRemainingColumn(),
-        console=_stderr,
-        transient=True,
-        disable=hidden or not _stderr.is_terminal,
-    ) as bar:
-        task = bar.add_task(title, total=total_s)
-        yield lambda reached: bar.update(task, completed=reached)
+        TextColumn(title), BarColumn(), *columns, console=_stderr, transient=True, disable=not shown
+    ) as progress:
+        yield partial(progress.update, progress.add_task(title, total=total))
 
 
 @contextmanager
-def count_bar(what: str, *, hidden: bool = False) -> Iterator[Callable[[int, int | None], None]]:
-    """A bar on stderr that is told how many are done, of how many if that is known; never in a pipe."""
-    with Progress(
-        TextColumn(what),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=_stderr,
-        transient=True,
-        disable=hidden or not _stderr.is_terminal,
-    ) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+def progress_bar(title: str, total_s: float, *, hidden: bool = False) -> Iterator[Callable[[float], None]]:
+    """A bar updated with the seconds reached."""
+    seconds = TextColumn("{task.completed:.0f}/{task.total:.0f} s")
+    with _bar(title, total_s, hidden, seconds, TimeRemainingColumn()) as update:
+        yield lambda reached: update(completed=reached)
+
+
+@contextmanager
+def count_bar(title: str, *, hidden: bool = False) -> Iterator[Callable[[int, int | None], None]]:
+    """A bar updated with the number done and the number in all, None where it is open."""
+    with _bar(title, None, hidden, MofNCompleteColumn(), TimeElapsedColumn()) as update:
+        yield lambda done, total: update(completed=done, total=total)
+
+
+@contextmanager
+def share_bar(title: str, *, hidden: bool = False) -> Iterator[Callable[[float], None]]:
+    """A bar updated with the share done, 0…1."""
+    with _bar(title, 1.0, hidden, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()) as update:
+        yield lambda share: update(completed=share)
 
 
 def paper_tables(tables: Tables) -> None:
-    """Print the paper's tables, ours beside the published."""
+    """Print the predicted tables beside the published ones."""
     console = Console()
     for title, table, digits in (
         ("z_track [1e-4 s], Table C.2", tables.C2, 1),
@@ -151,7 +155,7 @@ def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> st
 
 
 def calibration_table(fit: Calibration) -> None:
-    """Print what was fitted, beside what was measured."""
+    """Print the fitted values beside independent measurements."""
     table = Table("parameter", "fitted", "elsewhere", "what that is", box=None)
     table.add_row(
         "plant.friction.coulomb, yaw",
@@ -163,7 +167,7 @@ def calibration_table(fit: Calibration) -> None:
         "plant.aero.centre_of_mass, z",
         f"{fit.centre_of_mass_height:.6f} m",
         f"{fit.centre_of_mass_height_paper} m",
-        "Table C.1, which the controller believes",
+        "Table C.1, the value in the controller's model",
     )
     pitch, yaw = fit.wind_torque
     table.add_row("plant.wind.torque", f"{pitch:.6f}, {yaw:.6f} N·m", "–", "the paper's fan was not measured")
@@ -175,14 +179,14 @@ def calibration_table(fit: Calibration) -> None:
 
 @contextmanager
 def live_screen() -> Iterator[Callable[[RenderableType], None]]:
-    """The whole terminal, redrawn with whatever it is given."""
+    """A function that redraws the whole terminal."""
     with Live(console=Console(), auto_refresh=False, screen=Console().is_terminal) as live:
         yield lambda drawing: live.update(drawing, refresh=True)
 
 
 def diagnosis_table(diagnosis: Diagnosis) -> None:
-    """Print what was found on this machine."""
-    table = Table("", "looked at", "found", "to change", box=None)
+    """Print the findings of a diagnosis of this machine."""
+    table = Table("", "checked", "found", "to change", box=None)
     for finding in diagnosis.findings:
         table.add_row("✓" if finding.good else "✗", finding.what, finding.found, "" if finding.good else finding.advice)
     Console().print(table)
@@ -212,7 +216,7 @@ def status_table(found: Statuses) -> None:
 
 @contextmanager
 def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
-    """The demo's live view on stderr: a bar and a line of what the loop is doing."""
+    """The demo's live view on stderr: a bar and a line of figures."""
     bar = Progress(
         BarColumn(), TextColumn("{task.completed:5.1f}/{task.total:g} s"), TimeRemainingColumn(), console=_stderr
     )
@@ -233,7 +237,7 @@ def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
 
 
 def soak_table(soak: Soak) -> None:
-    """Print what a soak has shown."""
+    """Print the result of a soak."""
     console = Console()
     loop = Table("at", "missed ticks", "unanswered", "latency p50/p99", "wake-up p50/p99", box=None)
     for minute in soak.minutes:
@@ -263,19 +267,3 @@ def soak_table(soak: Soak) -> None:
     console.print(f"\n{soak.rate_hz:g} Hz; log {soak.log}, {soak.log_mb:g} MB")
     for finding in soak.findings or ["nothing grew, and one session held throughout"]:
         console.print(finding)
-
-
-@contextmanager
-def share_bar(what: str, *, hidden: bool = False) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr that is told the share that is done, 0…1; gone when it is done, and never in a pipe."""
-    with Progress(
-        TextColumn(what),
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeRemainingColumn(),
-        console=_stderr,
-        transient=True,
-        disable=hidden or not _stderr.is_terminal,
-    ) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share: bar.update(task, completed=share)

@@ -1,4 +1,4 @@
-"""Lines on stderr: for a person, or one JSON object each for whatever collects them."""
+"""Log lines on stderr: plain text, or one JSON object per line for a log collector."""
 
 from __future__ import annotations
 

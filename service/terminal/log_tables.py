@@ -1,4 +1,4 @@
-"""What a person sees of a log in the terminal: the account of a review, and what replaying has shown."""
+"""Terminal tables of a log: the findings of a review, the result of a replay."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SPARK_WIDTH: Final = 22
 
 
 def review_account(findings: Findings) -> None:
-    """Print figures of merit, timing, what happened, and whether the limits hold."""
+    """Print figures of merit, timing, events, and whether the limits hold."""
     figures_table(findings)
     console = Console()
     console.print()
@@ -80,9 +80,9 @@ def _timing_table(findings: Findings) -> Table:
 
 
 def sparkline(spread: Spread, width: int = _SPARK_WIDTH) -> str:
-    """The distribution as a row of bars, over the logarithm of the duration and high as the logarithm of the count.
+    """The distribution as a row of bars: logarithm of the count over logarithm of the duration.
 
-    So a single late tick in a million is seen, and how late it was.
+    Why logarithms: a single late tick in a million stays visible.
     """
     first, last = log2(spread.bins[0][0]), log2(spread.bins[-1][0])
     counts = [0] * width
@@ -108,11 +108,11 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         if count:
             yield f"invalid {name}s", str(count)
     lost = ", ".join(f"{count} {name}" for name, count in findings.losses.items())
-    yield "messages lost", lost or "none that the recorder knows of"
+    yield "messages lost", lost or "none reported"
     for gap in findings.missing:
         yield "not recorded", str(gap)
     if findings.lapses:
-        yield "otherwise than planned", ", ".join(f"{count} {name}" for name, count in findings.lapses.items())
+        yield "irregular ticks", ", ".join(f"{count} {name}" for name, count in findings.lapses.items())
     if findings.clock_offset_us is not None:
         first, last = findings.clock_offset_us
         yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
@@ -124,13 +124,13 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
 
 
 def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
-    """What the theorem promises, and what the run did."""
+    """The theorem's bounds beside the run's values."""
     table = _labelled()
 
     def row(label: str, name: str, form: Callable[[float], str]) -> None:
         value = getattr(found, name)
-        why = findings.reasons.get(f"theorem.{name}", "not known")
-        table.add_row(label, Text(f"— ({why})" if value is None else form(value)))
+        reason = findings.reasons.get(f"theorem.{name}", "not available")
+        table.add_row(label, Text(f"— ({reason})" if value is None else form(value)))
 
     table.add_row("the theorem", Text(found.verdict, style="" if found.holds else "bold red"))
     since = f"since {found.since_s + found.transient_s:.3g} s"
@@ -151,9 +151,9 @@ def _beside(bound: float | None, form: str, unit: str = "") -> str:
 
 
 def _lemma(findings: Findings, found: TheoremFindings) -> str:
-    """Whether it held: which inequality came closest, or which were broken; and what it was judged by."""
+    """Lemma 1 in one line: the closest or the broken inequalities, and the number of states checked."""
     if found.broken is None:
-        return f"— ({findings.reasons.get('theorem.broken', 'not known')})"
+        return f"— ({findings.reasons.get('theorem.broken', 'not available')})"
     by = f"the {found.judged} of {found.samples} true states that satisfy its premises"
     if found.broken:
         which = ", ".join(f"({check.equation}) {check.broken}×" for check in found.lemma if check.broken)
@@ -178,7 +178,7 @@ def _marks_table(marks: Sequence[Mark]) -> Table:
 
 
 def replay_table(replay: Replay) -> None:
-    """Print what replaying has shown."""
+    """Print the result of a replay."""
     console = Console()
     table = Table("session", "from tick", "ticks", "differ", "rms", "largest", "u_total", box=None)
     for session in replay.sessions:

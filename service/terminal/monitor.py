@@ -1,7 +1,6 @@
-"""A live view of everything on the network: every vehicle, every role, as they tell it themselves.
+"""Live view of the network: every role of every vehicle, from its published messages.
 
-It only listens. What it shows is gathered from status, telemetry, truth and event messages; a role whose status is old
-or whose liveliness token went is shown as gone.
+Subscribes to status, telemetry, truth and events, and queries descriptions, which hold the wire. Publishes nothing.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ from aeroloop.service.host.bandwidth import PayloadRate
 
 REFRESH_S: Final = 0.2
 SILENT_S: Final = 3.0
-"""A role that has not told its status for this long, three times its period, is shown as silent."""
+"""A role without a status for this long, three of its periods, is shown as silent [s]."""
 EVENTS: Final = 5
 
 
 @dataclass
 class Vehicle:
-    """What is known of one vehicle."""
+    """The latest messages of one vehicle."""
 
     statuses: dict[str, tuple[float, Status]] = field(default_factory=dict)
     telemetry: Telemetry | None = None
@@ -45,7 +44,7 @@ class Vehicle:
 
 
 class Top:
-    """Gathers messages and draws them."""
+    """Collects messages and draws them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -53,7 +52,7 @@ class Top:
         self._events: deque[str] = deque(maxlen=EVENTS)
 
     def receive(self, key: str, payload: bytes) -> None:
-        """Take in any message of the table; what is not understood is left out."""
+        """Take in a message of any topic; drops what it cannot parse."""
         address = topics.read_key(key)
         if address is None:
             return
@@ -76,13 +75,13 @@ class Top:
                         event = Event.model_validate_json(payload)
                         self._events.append(f"{time.strftime('%H:%M:%S')} {address.vehicle} {event.role}: {event.text}")
             except (ValidationError, ConfigError):
-                pass  # of another version; its other messages may still be read
+                pass  # of another version; its other messages may still parse
 
     def draw(self) -> RenderableType:
-        """What is known now."""
+        """The current view."""
         with self._lock:
             if not self._vehicles:
-                return Text("nobody on the network yet")
+                return Text("no role on the network yet")
             blocks: list[RenderableType] = []
             for name, vehicle in sorted(self._vehicles.items()):
                 blocks += [Text(name, style="bold"), _flight(vehicle), _roles(vehicle), Text("")]
@@ -105,11 +104,11 @@ def _flight(vehicle: Vehicle) -> Text:
 
 def _roles(vehicle: Vehicle) -> Table:
     table = Table(
-        "role", "state", "rate", "skipped", "latency", "answers in", "wake-up", "told", "", box=None, pad_edge=False
+        "role", "state", "rate", "skipped", "latency", "answers in", "wake-up", "received", "", box=None, pad_edge=False
     )
-    for role, (heard, status) in sorted(vehicle.statuses.items()):
+    for role, (received, status) in sorted(vehicle.statuses.items()):
         latency, timing = status.latency_us, status.timing
-        age, sample = time.monotonic() - heard, status.age_us
+        age, sample = time.monotonic() - received, status.age_us
         wake = timing.recent_wake if timing else None
         table.add_row(
             role,
@@ -127,23 +126,23 @@ def _roles(vehicle: Vehicle) -> Table:
 
 
 def watch(network: NetworkSettings, show: Callable[[RenderableType], None], stop: threading.Event) -> None:
-    """Listen and draw five times a second until told to stop.
+    """Subscribe, and draw five times a second until `stop` is set.
 
     Raises:
         NetworkError: The network cannot be joined.
     """
     top = Top()
 
-    def heard(sample: zenoh.Sample) -> None:
+    def receive(sample: zenoh.Sample) -> None:
         top.receive(str(sample.key_expr), sample.payload.to_bytes())
 
     with join(network) as session:
         for name in ("status", "telemetry", "truth", "event"):
-            session.declare_subscriber(topics.key(name, "*"), heard)
-        asked = 0.0
+            session.declare_subscriber(topics.key(name, "*"), receive)
+        queried = 0.0
         while not stop.wait(REFRESH_S):
-            if time.monotonic() - asked > 2.0:  # who came since; a plant's description has the wire
-                asked = time.monotonic()
+            if time.monotonic() - queried > 2.0:  # for roles that have joined since
+                queried = time.monotonic()
                 for reply in session.get(topics.key("description", "*"), timeout=1.0):
                     if reply.ok is not None:
                         top.receive(str(reply.ok.key_expr), reply.ok.payload.to_bytes())

@@ -1,4 +1,4 @@
-"""Several runs side by side in the terminal: the rows of their page."""
+"""Terminal tables of several runs, side by side; the rows are those of the HTML page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aeroloop.service.review.report import Report, differences
 
 
 def comparison_tables(reports: Sequence[Report]) -> None:
-    """Print the figures of several runs, and what differs in their configurations."""
+    """Print the figures of several runs and the differences between their configurations."""
     console = Console()
     figures = Table("", box=None)
     differing = Table("differs in the configurations", box=None)

@@ -1,4 +1,4 @@
-"""What `show spec` prints of a wire: each signal's quantizer, and each frame's size."""
+"""Terminal table of a wire spec, for `show spec`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def wire_table(wire: WireSpec) -> None:
 
 
 def _steps(quantizer: Quantizer, unit: str) -> tuple[str, str | None]:
-    """The step between levels, and what else is to be said of them."""
+    """The step between levels, and a note on the kind's other parameters."""
     if isinstance(quantizer, LogarithmicQuantizer):
         least = quantizer.edges[1] - quantizer.edges[0]
         return f"≤ {quantizer.step:.6g}{unit}", (

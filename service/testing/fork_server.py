@@ -1,14 +1,14 @@
-"""Fork server: starts commands from a process that has imported everything already.
+"""Fork server: starts commands from a process that has already imported everything.
 
-Python, casadi, numpy and zenoh take 1.5 s of a core to import, once for each process of a loop. The server imports them
-once; each command is then a fork of it that runs the command line with arguments of its own, as if typed. It opens no
-session and runs no thread of Python, so a fork has nothing to inherit but modules.
+Importing casadi, numpy and zenoh takes 1.5 s of a core, for each process of a loop. The server imports them once; each
+command is a fork of it that runs the command line with its own arguments. The server opens no session and runs no
+Python thread, so a fork inherits modules only.
 
-    this process  → server   a request: arguments, environment; stderr and the writing end of a pipe with it
+    this process  → server   request: arguments, environment, folder; with it stderr and the writing end of a pipe
     server        → this     the child's process id
-    server        → pipe     the child's exit code, once it has ended; closed without one if the server has died
+    server        → pipe     the child's exit code at its end; closed without one if the server has died
 
-The server ends its children and itself when its socket is closed, which is when this process ends, however it ends.
+The server ends its children and itself when its socket closes: at the end of this process, however it ends.
 """
 
 from __future__ import annotations
@@ -37,29 +37,30 @@ _PRELOADED: Final = (
     "aeroloop.service.daemon.daemon",
     "aeroloop.service.daemon.plants",
     "aeroloop.service.recording.recorder",
+    "aeroloop.service.viewers.channels",
     "aeroloop.plant_emulator.hosts.can_node",
 )
 
 
 class ForkedProcess:
-    """A child of the fork server; used like `subprocess.Popen`.
+    """A child of the fork server, used like `subprocess.Popen`.
 
     Attributes:
-        pid: Its process id.
-        returncode: Its exit code, negative for a signal; None while it was last seen to run.
+        pid: Process id.
+        returncode: Exit code, negative for a signal; None if it ran at the last poll.
     """
 
     def __init__(self, pid: int, result: int) -> None:
         self.pid = pid
         self.returncode: int | None = None
-        self._result = result  # what the pipe's reading end is called here
+        self._result = result  # descriptor of the reading end of the pipe
 
     def poll(self) -> int | None:
-        """Its exit code, or None if it runs."""
+        """Exit code, or None while it runs."""
         return self._read(0.0)
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait until it ends; its exit code.
+        """Wait until it ends; return its exit code.
 
         Raises:
             subprocess.TimeoutExpired: It still runs after `timeout` [s].
@@ -87,7 +88,7 @@ class ForkedProcess:
 
 
 class ForkServer:
-    """A process that has imported what roles need."""
+    """A process that has imported what roles import."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -103,12 +104,12 @@ class ForkServer:
 
     @property
     def pid(self) -> int:
-        """Its process id, which is its children's parent."""
+        """Process id, the parent of its children."""
         return self._process.pid
 
     @property
     def alive(self) -> bool:
-        """Whether the server can start more."""
+        """Whether the server runs."""
         return self._process.poll() is None
 
     def close(self) -> None:
@@ -117,12 +118,12 @@ class ForkServer:
         self._process.wait()
 
     def start(self, arguments: Sequence[str], environment: Mapping[str, str], stderr: int) -> ForkedProcess:
-        """Run `aeroloop` with these arguments here, in a new session of its own.
+        """Run `aeroloop` with these arguments, in this folder and in a new process session.
 
         Args:
-            arguments: As typed after `aeroloop`.
-            environment: All of its environment.
-            stderr: File descriptor of its standard error.
+            arguments: Words after `aeroloop`.
+            environment: The child's whole environment.
+            stderr: File descriptor of the child's standard error.
 
         Raises:
             OSError: The server has died.
@@ -145,8 +146,8 @@ _servers: dict[int, ForkServer] = {}
 
 
 def fork_server() -> ForkServer:
-    """The server of this process, started when it is first needed and again if it has died."""
-    mine = os.getpid()  # a fork of this process needs one of its own
+    """The server of this process, started at the first call and again if it has died."""
+    mine = os.getpid()  # a fork of this process starts its own
     if mine not in _servers or not _servers[mine].alive:
         _servers[mine] = ForkServer()
         atexit.register(_servers[mine].close)
@@ -184,12 +185,12 @@ def _serve(control: socket.socket) -> list[str] | None:
             os.dup2(stderr, sys.stderr.fileno())
             for descriptor in (woken, waker, stderr, result, *results.values()):
                 os.close(descriptor)
-            wanted = json.loads(request)
+            parsed = json.loads(request)
             os.setsid()
             os.environ.clear()
-            os.environ.update(wanted["environment"])
-            os.chdir(wanted["folder"])
-            return list(wanted["arguments"])
+            os.environ.update(parsed["environment"])
+            os.chdir(parsed["folder"])
+            return list(parsed["arguments"])
         os.close(stderr)
         results[pid] = result
         control.send(_CODE.pack(pid))
@@ -208,10 +209,11 @@ def _report(results: dict[int, int]) -> None:
 
 
 def main() -> None:
-    """Serve on the socket of which the command line says the descriptor."""
+    """Serve on the socket with the descriptor of the first argument."""
     for module in _PRELOADED:
-        importlib.import_module(module)
-    gc.freeze()  # a collection in a child must not touch, and so copy, what all share
+        with suppress(ModuleNotFoundError):  # of an extra that is not installed
+            importlib.import_module(module)
+    gc.freeze()  # a collection in a child would touch, and so copy, shared pages
     arguments = _serve(socket.socket(fileno=int(sys.argv[1])))
     if arguments is not None:
         sys.argv[1:] = arguments

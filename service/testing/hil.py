@@ -1,7 +1,7 @@
-"""Hardware in the loop, for tests: a controller, a plant and a recorder as processes, and what goes wrong with them.
+"""Hardware-in-the-loop tests: runs controller, plant and recorder as a process group and injects faults.
 
-This is the `hil` fixture of the pytest plugin, and can be used without pytest. In real time `run` lets the clock pass;
-in lockstep the plant takes exactly so many steps, so that a test repeats bit for bit however busy the machine is.
+The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too. In real time `run` sleeps; in lockstep
+the plant takes an exact number of steps, so a test repeats bit for bit on a busy machine.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Status, model_of
+from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.protocol.messages.operator import Advance, Answer, Ask, Change, Inject, Message
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
@@ -31,21 +31,20 @@ from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_
 
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
 PATIENCE_S: Final = 30.0
-"""For what another process must do: it takes a second to start here, and CI may have other work."""
+"""Timeout for another process: one starts in about a second here, and CI machines are busy."""
 PATIENCE_PER_STEP_S: Final = 0.02
-"""In lockstep, for each step: a hundred times what it takes here."""
+"""Timeout per step in lockstep: a hundred times what a step takes here."""
 
 
 class HilError(AeroloopError):
-    """The loop did not do what the test takes for granted; one line."""
+    """The loop did not reach a state that the test requires; one line."""
 
 
 class HilLog:
-    """What a run left behind.
+    """The log of a run.
 
     Attributes:
         path: The MCAP file.
-        figures: Every figure of merit; raises ReviewError if the log holds no session.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,32 +57,32 @@ class HilLog:
 
     @property
     def events(self) -> list[Event]:
-        """What happened, in order."""
+        """Events in order."""
         return [message for _, message in self.messages("event") if isinstance(message, Event)]
 
     @property
     def trips(self) -> list[str]:
-        """Why the plant went to 0 V, each time it did."""
+        """Cause of each trip of the plant, in order."""
         return [event.text for event in self.events if event.kind == "tripped"]
 
     def batches(self, end: End) -> list[Batch]:
-        """What one end did tick by tick, in the order of recording."""
+        """Trace batches of one end, in the order of recording."""
         read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
         return [batch for batch in read if batch is not None and batch.header.end == end]
 
     def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
-        """When one end received or sent frames, on its wall clock [ns since 1970]; ticks without one are left out."""
+        """Times at which one end received or sent frames, on its wall clock [ns since 1970]."""
         frame = Received.FRAME if (end, column) == ("controller", "received") else Sent.FRAME
         return [
             at_ns + batch.header.wall_ns - batch.header.monotonic_ns
             for batch in self.batches(end)
-            for at_ns, what in zip(batch.times_ns(column).tolist(), batch.columns[f"{column}_as"].tolist(), strict=True)
-            if at_ns >= 0 and what == frame
+            for at_ns, kind in zip(batch.times_ns(column).tolist(), batch.columns[f"{column}_as"].tolist(), strict=True)
+            if at_ns >= 0 and kind == frame
         ]
 
     @property
     def changes(self) -> list[Change]:
-        """What controllers followed from which tick on, in order."""
+        """Changes of references and gains that controllers applied, in order."""
         return [change for batch in self.batches("controller") for change in batch.tail.changes]
 
     def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
@@ -94,25 +93,24 @@ class HilLog:
             for _, channel, message in make_reader(file).iter_messages():
                 address = topics.read_key(channel.topic)
                 if address is not None and address.topic is topic:
-                    raw = topic.carries != "json"
-                    content = message.data if raw else model_of(topic).model_validate_json(message.data)
+                    content = topic.model.model_validate_json(message.data) if topic.model else message.data
                     found.append((message.publish_time, content))
         return found
 
 
 class Hil:
-    """A loop of real processes.
+    """A closed loop of real processes.
 
     Args:
-        folder: Where logs go.
-        lockstep: Whether `run` counts steps instead of waiting.
-        plant: What stands at the plant end: as `plant.via`, or can-node for an emulated node on a bus of its own.
-        config: The TOML file to start from, unless `start` is given another.
+        folder: Folder of the logs.
+        lockstep: Whether `run` counts steps instead of seconds.
+        plant: The plant end: a value of `plant.via`, or can-node for an emulated node on a private bus.
+        config: TOML file to start from, unless `start` names another.
 
     Attributes:
-        events: What has happened so far, as it was told on the network.
+        events: Events received so far.
         settings: The configuration, once started.
-        processes: The processes, once started.
+        processes: The process group, once started.
     """
 
     settings: Settings
@@ -123,14 +121,14 @@ class Hil:
     ) -> None:
         self._folder = folder
         self._via = plant.replace("can-node", "can")
-        self._bus_of_its_own = plant == "can-node"
+        self._private_bus = plant == "can-node"
         self._config = config
         self._lockstep = lockstep
         self._running = False
         self._logs: list[HilLog] = []
         self._changed = Condition()
         self._statuses: dict[str, Status] = {}
-        self._asked_ticks = 0
+        self._requested_ticks = 0
         self.events: list[Event] = []
 
     def __enter__(self) -> Self:
@@ -144,15 +142,15 @@ class Hil:
     def start(
         self, config: Path | str | None = None, settings: Mapping[str, Any] | None = None, *, drive: bool = True
     ) -> None:
-        """Start a recorder, a plant and a controller, and wait until the controller has the plant.
+        """Start a recorder, a plant and a controller, and wait until the controller drives the plant.
 
         Args:
             config: A TOML file, as for `--config`.
-            settings: What to override, as for `--set`: section.key to value.
+            settings: Overrides as for `--set`: section.key to value.
             drive: Whether to start a controller and wait for it.
 
         Raises:
-            ConfigError: The configuration is wrong.
+            ConfigError: The configuration is invalid.
             HilError: The loop did not close.
         """
         self.finish()
@@ -160,7 +158,7 @@ class Hil:
         ours = {
             "network.rendezvous": free_rendezvous(),
             "recorder.path": str(log),
-            "recorder.max_file_mb": 1e6,  # a test looks into one file
+            "recorder.max_file_mb": 1e6,  # a test reads one file
             "recorder.max_file_s": 1e6,
             "controller.require_recorder": True,
             "loop.lockstep": self._lockstep,
@@ -169,11 +167,11 @@ class Hil:
         }
         overrides = [f"{key}={json.dumps(value)}" for key, value in {**ours, **(settings or {})}.items()]
         self.settings = load(Path(config) if config else self._config, overrides)
-        if self._bus_of_its_own:
+        if self._private_bus:
             self.settings = self.settings.model_copy(update={"can": private_bus(self.settings.can)})
         self.events.clear()
         self._statuses.clear()
-        self._asked_ticks = 0
+        self._requested_ticks = 0
         self.processes = ProcessGroup(self.settings)
         self._running = True
         self._logs.append(HilLog(log))
@@ -182,7 +180,7 @@ class Hil:
         self.processes.start("recorder")
         self.processes.start_plant()
         if drive:
-            self.processes.start("controller")  # which waits for the recorder by itself
+            self.processes.start("controller")  # it waits for the recorder before it claims
         for role in ROLES:
             self.processes.await_role(role)
         if drive:
@@ -190,25 +188,25 @@ class Hil:
             self.eventually("the controller drives the plant", lambda: self.state("plant") in ready)
 
     def run(self, seconds: float) -> None:
-        """Let the loop run for so long; in lockstep, exactly so many steps, or until the session ends.
+        """Run the loop for a time; in lockstep for that many steps, or until the session ends.
 
-        In lockstep only an emulator waits between two calls; other plants run on, and it is at least so many steps.
+        In lockstep an emulator stops between two calls; other plants run on, so they take at least that many steps.
 
         Raises:
             ProcessGroupError: A process has failed.
-            HilError: In lockstep, the plant does not step.
+            HilError: In lockstep, the plant does not step in time.
         """
         if not self._lockstep:
             time.sleep(seconds)
             self.processes.check()
             return
-        self._asked_ticks += self.settings.loop.ticks(seconds)
+        self._requested_ticks += self.settings.loop.ticks(seconds)
         if self._via == "emulator":
-            self._ask("advance", Advance(seconds=seconds))
+            self._query("advance", Advance(seconds=seconds))
 
         def over() -> bool:
             plant = self._statuses.get("plant")
-            return plant is not None and (plant.ticks >= self._asked_ticks or plant.session is None)
+            return plant is not None and (plant.ticks >= self._requested_ticks or plant.session is None)
 
         self.eventually(
             f"{seconds:g} s in lockstep",
@@ -218,40 +216,40 @@ class Hil:
         self.processes.check()
 
     def inject(self, fault: str | None) -> None:
-        """Let something go wrong with the emulated plant, now or later: `signal:kind[=value][@start[..end]]`.
+        """Inject a fault into the emulated plant, now or later: `signal:kind[=value][@start[..end]]`.
 
         Args:
-            fault: In seconds from now; None takes all faults away.
+            fault: The fault, its times in seconds from now; None clears all faults.
 
         Raises:
-            HilError: It is not a fault, or the plant is not emulated.
+            HilError: The fault is malformed, or the plant is not emulated.
         """
-        self._ask("inject", Inject(fault=fault))
+        self._query("inject", Inject(fault=fault))
 
     def arm(self) -> None:
-        """As `aeroloop op arm`."""
-        self._ask("arm", Ask())
+        """Arm the plant, as `aeroloop op arm`."""
+        self._query("arm", Ask())
 
     def stop(self) -> None:
-        """As `aeroloop op stop`."""
-        self._ask("stop", Ask())
+        """Stop the plant, as `aeroloop op stop`."""
+        self._query("stop", Ask())
 
     def kill(self, role: RoleName) -> None:
-        """kill −9."""
+        """Kill a role with SIGKILL."""
         self.processes.stop(role, signal.SIGKILL)
 
     def pause(self, role: RoleName) -> None:
-        """SIGSTOP: the process stands still, and its links stay open."""
+        """Pause a role with SIGSTOP; its links stay open."""
         self.processes.signal(role, signal.SIGSTOP)
 
     def resume(self, role: RoleName) -> None:
-        """SIGCONT."""
+        """Resume a paused role with SIGCONT."""
         self.processes.signal(role, signal.SIGCONT)
 
     def restart(self, role: RoleName) -> None:
-        """Start a role again that has ended or was killed, and wait until it is on the network.
+        """Start a role again that has ended, and wait until it is on the network.
 
-        A recorder begins another log, which is `log` from then on.
+        A recorder begins another log, which `log` then returns.
         """
         if role == "recorder":
             self._logs.append(HilLog(self._folder / f"hil-{len(self._logs)}.mcap"))
@@ -261,25 +259,25 @@ class Hil:
             self.processes.await_role(role)
 
     def state(self, role: str) -> str | None:
-        """What `plant`, `controller` or `recorder` is doing, as it last said; None if it has said nothing."""
+        """State of `plant`, `controller` or `recorder` in its last status; None before the first."""
         status = self._statuses.get(role)
         return status.state if status else None
 
     def status(self, role: str) -> Status:
-        """The last status of a role. Raises HilError if it has told none."""
+        """The last status of a role. Raises HilError before the first."""
         if role not in self._statuses:
-            raise HilError(f"the {role} has told no status")
+            raise HilError(f"no status received from the {role}")
         return self._statuses[role]
 
     def happened(self, kind: str, text: str = "") -> bool:
-        """Whether an event of this kind, with this in its text, has been told."""
+        """Whether an event of this kind, with this in its text, was received."""
         return any(event.kind == kind and text in event.text for event in self.events)
 
     def eventually(self, what: str, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
-        """Wait for something that the loop brings about.
+        """Wait until a condition on the loop holds.
 
         Raises:
-            HilError: It did not, or a process has failed meanwhile.
+            HilError: It did not hold in time.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -294,20 +292,20 @@ class Hil:
                 self._changed.wait(0.05)
 
     def finish(self) -> None:
-        """Stop all processes; the log is whole then."""
+        """Stop all processes and close the log."""
         if self._running:
             self._running = False
             self.processes.__exit__(None, None, None)
 
     @property
     def log(self) -> HilLog:
-        """Everything that crossed the network since `start`; asking for it ends the run."""
+        """The log since `start`, or since the recorder's last restart. Reading it ends the run."""
         self.finish()
         if not self._logs:
             raise HilError("nothing was started, so there is no log")
         return self._logs[-1]
 
-    def _ask(self, topic: str, message: Message) -> None:
+    def _query(self, topic: str, message: Message) -> None:
         key = topics.key(topic, self.settings.vehicle)
         for reply in self.processes.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
             if reply.ok is not None:
@@ -315,7 +313,7 @@ class Hil:
                 if not answer.done:
                     raise HilError(answer.text)
                 return
-        raise HilError(f"nobody answers {topic!r}")
+        raise HilError(f"no answer to {topic!r}")
 
     def _receive_event(self, sample: zenoh.Sample) -> None:
         with self._changed:

@@ -1,7 +1,7 @@
-"""Roles as child processes of this one: what the demo and the tests on real processes start and stop.
+"""Process group: starts and stops roles as child processes, for the demo and the tests.
 
-Each child runs the same command a user would type, with the effective configuration in a file of its own. It ends when
-its parent does, so that nothing is left behind. ^C reaches only the parent, which stops its children one by one.
+Each child runs the command that a user would type, with the effective configuration in a temporary file. A child ends
+when its parent ends. ^C reaches only the parent, which stops its children one by one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import zenoh
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.can_link import CanSettings
+from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.transport.network import join
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
@@ -37,18 +37,18 @@ STOP_WAIT_S: Final = 10.0
 
 
 class ProcessGroupError(AeroloopError):
-    """A process did not start or ended early; one line with what it said last."""
+    """A process did not start or ended early; one line with its last log line."""
 
 
 def free_rendezvous() -> str:
-    """A loopback endpoint that nobody listens on right now."""
+    """A free loopback endpoint."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def private_bus(can: CanSettings) -> CanSettings:
-    """The same bus, for processes of this machine only, where the interface knows no bounds by itself."""
+    """The same bus, limited to this machine and to a free port where the interface is UDP multicast."""
     if can.interface != "udp_multicast":
         return can
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -61,10 +61,10 @@ class ProcessGroup:
     """Processes of one network on this machine. A context: leaving it stops them all.
 
     Args:
-        settings: The configuration of them all.
+        settings: The configuration of every process.
 
     Attributes:
-        zenoh: A session of our own on their network.
+        zenoh: A session on their network.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -74,7 +74,7 @@ class ProcessGroup:
         self._config.write_text(settings.toml())
         self._children: dict[str, Child] = {}
         self._alive: set[str] = set()
-        self._killed: set[str] = set()  # on purpose
+        self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
         self._changed = threading.Condition()
         self.zenoh = join(settings.network)
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
@@ -93,19 +93,19 @@ class ProcessGroup:
         self._folder.cleanup()
 
     def start_plant(self) -> None:
-        """Start the plant end that the configuration names, and a node on the bus if that is one of software only."""
+        """Start the configured plant end, and a node on the bus where the bus is software."""
         if self._settings.plant.via == "can" and self._settings.can.interface == "udp_multicast":
             self.start("can-node")
         self.start("plant")
 
     def start(self, role: RoleName, *arguments: str, environment: Mapping[str, str] | None = None) -> Child:
-        """Start a role; it is not yet on the network when this returns.
+        """Start a role; `await_role` waits until it is on the network.
 
         Args:
-            role: SessionKey.
-            arguments: For its command line, besides the configuration of all.
-            environment: For its environment, besides this process's. A process with one is started from nothing, since
-                the dynamic linker reads it, too; any other is a fork (see `fork_server`).
+            role: The role to start.
+            arguments: Further words of its command line.
+            environment: Additions to this process's environment. With them the child is a new interpreter, because the
+                dynamic linker reads them at start; without, it is a fork (see `fork_server`).
         """
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
         server = None if environment else fork_server()
@@ -129,10 +129,10 @@ class ProcessGroup:
         return child
 
     def await_role(self, role: RoleName, timeout_s: float = START_WAIT_S) -> None:
-        """Wait until a role's liveliness token is there.
+        """Wait for a role's liveliness token.
 
         Raises:
-            ProcessGroupError: It ended, or the time is over.
+            ProcessGroupError: The role ended, or the time is over.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -143,16 +143,16 @@ class ProcessGroup:
                 self._changed.wait(0.1)
 
     def running(self, role: RoleName) -> bool:
-        """Whether a role that was started is still running."""
+        """Whether a started role still runs."""
         return self._children[role].poll() is None
 
     def stop(self, role: RoleName, how: signal.Signals = signal.SIGTERM) -> int:
-        """Stop a role and wait for it; killed if it does not end by itself. Returns its exit code."""
+        """Stop a role and wait for its end; kill it after `STOP_WAIT_S`. Returns its exit code."""
         self._killed.add(role)
         child = self._children[role]
         if child.poll() is None:
             child.send_signal(how)
-            child.send_signal(signal.SIGCONT)  # a process that stands still ends no other way
+            child.send_signal(signal.SIGCONT)  # a paused process handles no other signal
         try:
             return child.wait(STOP_WAIT_S)
         except subprocess.TimeoutExpired:
@@ -160,15 +160,15 @@ class ProcessGroup:
             return child.wait()
 
     def signal(self, role: RoleName, which: signal.Signals) -> None:
-        """Send a signal to a role that was started."""
+        """Send a signal to a started role."""
         self._children[role].send_signal(which)
 
     def pid(self, role: RoleName) -> int:
-        """Process id of a role that was started."""
+        """Process id of a started role."""
         return self._children[role].pid
 
     def replace_log(self, path: Path) -> None:
-        """Let a recorder that is started from now on write another log."""
+        """Set the path of the log for recorders started from now on."""
         self._settings = self._settings.model_copy(
             update={"recorder": self._settings.recorder.model_copy(update={"path": path})}
         )
@@ -178,7 +178,7 @@ class ProcessGroup:
         """Raise if any process has failed.
 
         Raises:
-            ProcessGroupError: With what it said last.
+            ProcessGroupError: With its last log line.
         """
         for role in self._children:
             self._check(role)
@@ -186,8 +186,8 @@ class ProcessGroup:
     def _check(self, role: str) -> None:
         code = self._children[role].poll()
         if code and role not in self._killed:
-            said = self._log(role).read_text(errors="replace").strip().splitlines()
-            raise ProcessGroupError(f"the {role} ended with exit code {code}" + (f": {said[-1]}" if said else ""))
+            lines = self._log(role).read_text(errors="replace").strip().splitlines()
+            raise ProcessGroupError(f"the {role} ended with exit code {code}" + (f": {lines[-1]}" if lines else ""))
 
     def _log(self, role: str) -> Path:
         return Path(self._folder.name) / f"{role}.stderr"

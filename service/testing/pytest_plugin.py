@@ -1,6 +1,6 @@
-"""The pytest plugin: a `hil` fixture for tests of one's own, on real processes.
+"""Pytest plugin: provides the `hil` fixture, a closed loop of real processes.
 
-It is there once the package is installed. What it needs is imported by the first test that asks for it.
+Active once the package is installed. It imports the loop's modules only when a test uses the fixture.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PLANTS = ("emulator", "can", "can-node", "quanser", "quanser-fake")
 SOFTWARE = ("emulator", "can-node", "quanser-fake")
-"""What needs no hardware: what the contract's tests run against where nobody says otherwise."""
+"""Plant ends without hardware: the defaults of the conformance suite."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -25,17 +25,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--hil-plant",
         choices=PLANTS,
-        help="what stands at the plant end of `hil`: an emulator (default), a node on the CAN bus of the configuration "
-        "(can-node: an emulated one on a bus of its own), or Quanser's board (or its fake)",
+        help="plant end of `hil`: an emulator (default), a node on the configured CAN bus (can-node: an emulated node "
+        "on a private bus), or Quanser's board (or its fake)",
     )
     group.addoption(
-        "--hil-lockstep", action="store_true", help="run `hil` in lockstep: repeatable, and as fast as it goes"
+        "--hil-lockstep", action="store_true", help="run `hil` in lockstep: repeatable, as fast as the machine allows"
     )
-    group.addoption("--hil-config", type=Path, help="the configuration that `hil` starts from, as for --config")
+    group.addoption("--hil-config", type=Path, help="configuration that `hil` starts from, as for --config")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker that the conformance suite uses."""
+    config.addinivalue_line("markers", "processes: starts real processes, most of them in real time")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """The contract's tests run against every plant that needs no hardware, unless one is named."""
+    """Run the conformance suite against every plant end of SOFTWARE, or against the one named."""
     if ".testing.conformance." in metafunc.module.__name__ and "hil" in metafunc.fixturenames:
         named = metafunc.config.getoption("--hil-plant")
         metafunc.parametrize("hil_plant", [named] if named else SOFTWARE, indirect=True, scope="function")
@@ -43,14 +48,14 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def hil_plant(request: pytest.FixtureRequest) -> str:
-    """What stands at the plant end of `hil`."""
+    """The plant end of `hil`."""
     plant: str = getattr(request, "param", None) or request.config.getoption("--hil-plant") or "emulator"
     return plant
 
 
 @pytest.fixture
 def hil(request: pytest.FixtureRequest, tmp_path: Path, hil_plant: str) -> Iterator[Hil]:
-    """A loop of real processes: start it, run it, let things go wrong, and ask its log."""
+    """A closed loop of real processes: start it, run it, inject faults, read its log."""
     from aeroloop.service.testing.hil import Hil
 
     option = request.config.getoption

@@ -1,1 +1,1 @@
-"""What the paper proves, evaluated: the bounds of Lemma 1 and Theorem 1, certificates, and what would satisfy them."""
+"""Bounds of Lemma 1, Theorem 1 and Corollary 1, certificates of a configuration, and remedies."""

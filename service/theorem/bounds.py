@@ -1,4 +1,4 @@
-"""The bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper.
+"""Bounds of Lemma 1 and of Theorem 1, (C.26)–(C.80), written beside the paper.
 
     symbol     name in code             symbol     name in code             symbol   name in code
     ‖δ_ε‖      delta_eps                k_ω_d      k_omega_d                ‖δ_z2‖   delta_z2
@@ -6,20 +6,20 @@
     ‖δ_u‖      delta_u                  k_ω_e      k_omega_e                λ_max(J) lambda_J
     k_θ        k_theta                  ‖δ_ω_e‖    delta_omega_e            C₁ C₂    least and largest element
 
-What each means, with its unit and equation, stands beside it in `Known`, `Lemma` and `Theorem`; a certificate prints it
-from there. The paper weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here.
+`Known`, `Lemma` and `Theorem` hold each quantity's meaning, unit and equation; a certificate prints them. The paper
+weighs z₁ with an implied 1 N·m, and ‖z‖ adds z₁ [1] to z₂ [rad/s]; so do the units here.
 
-Where the paper's text cannot be evaluated as it is printed, this is how it is read:
+Where the paper's text cannot be evaluated as printed, it is read as follows:
 
 - (C.50), (C.51) and (C.58), (C.59) compare vectors with ≤; they are read with norms. The δ_ωe of (C.58) is then
   δ_R k_ωd + δ_ω, with the k_ε² of (C.61).
-- k_ε of (C.31) is only said to exceed 1. Here it is the least such constant that serves d_ε, the chord ‖q^Q − q‖ and
-  d_ε̃ of (C.33) alike: near η = 0, ε says little about η, so it follows from how far the body may turn.
+- The paper states of k_ε of (C.31) only that it exceeds 1. Here it is the least constant that bounds d_ε, the chord
+  ‖q^Q − q‖ and d_ε̃ of (C.33): near η = 0, ε determines η badly, so k_ε follows from the largest angle of the body.
 - c₀ of (C.66): GᵀC₁G has rank 3 and the least eigenvalue 0. The proof needs z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃, which is at least
   λ_min(C₁) (1 + |η̃|)/2 ‖z₁‖².
 - (C.71) has δ_R λ_max(J) k_ωd where the proof has k_ω̇d; the proof is right.
 - Remark 5 says ‖θ̃‖ ≤ k_θ. The projection keeps θ̂, and Assumption 2 θ, within k_θ: that gives 2 k_θ.
-- k of (C.66) is taken as large as it may be: the margin itself.
+- k of (C.66) is the largest allowed: the margin itself.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Annotated, NamedTuple
 
 
 class Term(NamedTuple):
-    """What a field of the classes below stands for: the paper's symbol, where it is from, unit, meaning."""
+    """A quantity of the classes below: symbol in the paper, equation or assumption, unit, meaning."""
 
     symbol: str
     equation: str
@@ -40,11 +40,11 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True)
 class Known:
-    """What the theorem takes for granted: of the model, the gains, the wire and the reference; and what is assumed."""
+    """Inputs of the theorem: from the model, the gains, the wire and the reference, and assumptions."""
 
     lambda_J: Annotated[float, Term("λ_max(J)", "C.2", "kg·m²", "largest moment of inertia")]
     weight: Annotated[float, Term("‖r_g‖ m g", "C.6", "N·m", "largest torque of the weight")]
-    norm_B: Annotated[float, Term("‖B‖", "C.2", "N·m/V", "of the motors that there are")]
+    norm_B: Annotated[float, Term("‖B‖", "C.2", "N·m/V", "of the motors present")]
     C1_min: Annotated[float, Term("λ_min(C₁)", "C.20", "1/s", "least gain of the attitude error")]
     C1_max: Annotated[float, Term("λ_max(C₁)", "C.20", "1/s", "largest gain of the attitude error")]
     C2_min: Annotated[float, Term("λ_min(C₂)", "C.22", "N·m·s/rad", "least gain of the rate error")]
@@ -54,23 +54,23 @@ class Known:
     delta_u: Annotated[float, Term("‖δ_u‖", "C.30", "V", "quantization error of u, from wire.voltage")]
     k_omega_d: Annotated[float, Term("k_ω_d", "Assumption 1", "rad/s", "largest ‖ω_d‖ of the reference")]
     k_omega_d_dot: Annotated[float, Term("k_ω̇_d", "Assumption 1", "rad/s²", "largest ‖ω̇_d‖ of the reference")]
-    half_angle_d: Annotated[float, Term("max ∡q_d/2", "C.16", "rad", "farthest turn of the reference, halved")]
+    half_angle_d: Annotated[float, Term("max ∡q_d/2", "C.16", "rad", "largest angle of the reference, halved")]
     half_angle_e: Annotated[
         float,
         Term(
             "max ∡e/2",
             "Assumption 3",
             "rad",
-            "assumed: the attitude error stays below twice this; by --attitude-error, else controller.start_within_deg "
-            "within which sessions begin, and at least what is guaranteed in the end",
+            "assumed: the attitude error stays below twice this; from --attitude-error, else "
+            "controller.start_within_deg, within which sessions begin; at least the guaranteed final error",
         ),
     ]
     k_theta: Annotated[
-        float, Term("k_θ", "Assumption 2", "N·m·s/rad", "assumed: ‖θ‖ ≤ law.damping_bound, as the law does")
+        float, Term("k_θ", "Assumption 2", "N·m·s/rad", "assumed: ‖θ‖ ≤ law.damping_bound, as in the law")
     ]
     k_tau_d: Annotated[
         float,
-        Term("k_τ_d", "C.78", "N·m", "assumed: ‖τ_d‖ ≤ this, by --disturbance; 0 is Theorem 1, as nothing is known"),
+        Term("k_τ_d", "C.78", "N·m", "assumed: ‖τ_d‖ ≤ this, from --disturbance; 0 is Theorem 1"),
     ]
     omega_limit: Annotated[
         float,
@@ -78,7 +78,7 @@ class Known:
             "max |ω_k|",
             "C.29",
             "rad/s",
-            "assumed: within wire.rate.limit; max ‖ω‖ below is how far ω may get in the end",
+            "assumed: within wire.rate.limit; max ‖ω‖ below is the guaranteed final bound",
         ),
     ]
     u_limit: Annotated[
@@ -88,10 +88,10 @@ class Known:
 
 @dataclass(frozen=True)
 class Lemma:
-    """The right-hand sides of Lemma 1, (C.50)–(C.57), with (C.75) and the constants they are made of."""
+    """Right-hand sides of Lemma 1, (C.50)–(C.57), with (C.75) and their constants."""
 
-    delta_q: Annotated[float, Term("k_ε‖δ_ε‖", "C.31", "1", "how far q^Q may be from q")]
-    k_eps: Annotated[float, Term("k_ε", "C.31", "1", "what q's error is to that of ε, by how far the body may turn")]
+    delta_q: Annotated[float, Term("k_ε‖δ_ε‖", "C.31", "1", "largest ‖q^Q − q‖")]
+    k_eps: Annotated[float, Term("k_ε", "C.31", "1", "ratio of the errors of q and ε, at the body's largest angle")]
     k_omega_e: Annotated[float, Term("k_ω_e", "C.26", "1", "‖ω_e‖ ≤ k_ω_e ‖z‖")]
     delta_R: Annotated[float, Term("δ_R", "C.53, C.61", "1", "‖R_i^Q − R_i^b‖")]
     delta_omega_e: Annotated[float, Term("‖δ_ω_e‖", "C.50, C.58", "rad/s", "‖ω_e^Q − ω_e‖")]
@@ -111,22 +111,24 @@ class Lemma:
 
 @dataclass(frozen=True)
 class Theorem:
-    """What Theorem 1 and Corollary 1 make of Lemma 1. The last four are None where condition (C.66) fails."""
+    """Quantities of Theorem 1 and Corollary 1. The last four are None where condition (C.66) fails."""
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
     coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
     alpha: Annotated[float, Term("δ_ᾱ2 λ_max(J)", "C.67", "N·m·s/rad", "δ_V1's part of ᾱ^Q")]
-    delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "what quantization takes of the damping c₀/2")]
+    delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
     k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "2 k_θ: θ and θ̂ are both within k_θ")]
-    delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q that θ̃ has")]
-    delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 that θ and θ̃ have")]
-    delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "what quantization adds as a torque")]
-    delta_Q: Annotated[float, Term("δ_Q", "C.69", "W", "what drives V without a disturbance")]
-    delta_Qdist: Annotated[float, Term("δ_Qdist", "C.80", "W", "what drives V under the disturbance")]
+    delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q due to θ̃")]
+    delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 due to θ and θ̃")]
+    delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "quantization's effect as a torque")]
+    delta_Q: Annotated[float, Term("δ_Q", "C.69", "W", "constant of V̇ ≤ −k ‖z‖² + δ_Q without a disturbance")]
+    delta_Qdist: Annotated[float, Term("δ_Qdist", "C.80", "W", "the same with the disturbance")]
     margin: Annotated[float, Term("c₀/2 − δ_V1", "C.66", "N·m·s/rad", "positive where the theorem holds")]
-    k: Annotated[float | None, Term("k", "C.66", "N·m·s/rad", "rate at which V falls, per ‖z‖²")]
-    radius: Annotated[float | None, Term("√(δ_Q/k)", "C.68, C.79", "1, rad/s", "where ‖z‖ ends, under the disturbance")]
-    end_angle: Annotated[float | None, Term("4 asin(√(δ_Q/k)/2)", "C.19", "rad", "attitude error that ‖z₁‖ is then")]
+    k: Annotated[float | None, Term("k", "C.66", "N·m·s/rad", "rate at which V decreases, per ‖z‖²")]
+    radius: Annotated[
+        float | None, Term("√(δ_Q/k)", "C.68, C.79", "1, rad/s", "final bound of ‖z‖, disturbance included")
+    ]
+    end_angle: Annotated[float | None, Term("4 asin(√(δ_Q/k)/2)", "C.19", "rad", "attitude error at that ‖z₁‖")]
     end_rate: Annotated[float | None, Term("max ‖ω‖", "C.27", "rad/s", "k_ω_e √(δ_Q/k) + k_ω_d")]
 
 
@@ -156,14 +158,14 @@ def lemma_1(p: Known) -> Lemma:
 
 
 def attitude_error(delta_eps: float, half_angle: float) -> float:
-    """The largest ‖q^Q − q‖, of which neither d_ε of (C.31) nor d_ε̃ of (C.33) is more.
+    """The largest ‖q^Q − q‖, a bound of d_ε of (C.31) and of d_ε̃ of (C.33).
 
-    η = √(1 − ‖ε‖²) falls ever more steeply, so it errs most where ‖ε‖ is largest and ε^Q lies farther out still. What
-    Remark 2 scales to unit length comes nearer to ε by that.
+    η = √(1 − ‖ε‖²) is steepest at large ‖ε‖, so its error is largest where ‖ε‖ is largest and ε^Q lies outside of it.
+    Scaling to unit length (Remark 2) brings ε^Q nearer to ε.
 
     Args:
         delta_eps: ‖δ_ε‖.
-        half_angle: The farthest that the body turns from q = [1, 0], halved; at most π/2 [rad].
+        half_angle: Half the body's largest angle from q = [1, 0]; at most π/2 [rad].
     """
     outer = min(1.0, sin(half_angle) + delta_eps)
     inner = max(0.0, outer - delta_eps)
@@ -171,8 +173,8 @@ def attitude_error(delta_eps: float, half_angle: float) -> float:
 
 
 def theorem_1(p: Known, d: Lemma) -> Theorem:
-    """The condition of Theorem 1 and what follows from it; with a disturbance, that of Corollary 1."""
-    least_share = (1 + cos(p.half_angle_e)) / 2  # of ‖z₁‖² that is ‖ε̃‖²: 1 where e is small, ½ where η̃ = 0
+    """Condition and bounds of Theorem 1; with a disturbance, of Corollary 1."""
+    least_share = (1 + cos(p.half_angle_e)) / 2  # ‖ε̃‖²/‖z₁‖²: 1 where e is small, ½ where η̃ = 0
     c0 = min(p.C1_min * least_share, p.C2_min)  # (C.66)
     coriolis, alpha = d.delta_S2 * p.lambda_J * p.k_omega_d, d.delta_alpha2 * p.lambda_J
     delta_V1 = d.delta_Psi2 + coriolis + alpha  # (C.67)
@@ -214,5 +216,5 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
 
 
 def error_angle(z1: float) -> float:
-    """The attitude error [rad] of which ‖z₁‖ is this: by (C.19), ‖z₁‖ = √(2 − 2|η̃|) = 2 sin(angle / 4); at most π."""
+    """The attitude error [rad] at ‖z₁‖: by (C.19), ‖z₁‖ = √(2 − 2|η̃|) = 2 sin(angle / 4); at most π."""
     return min(pi, 4 * asin(min(1.0, z1 / 2)))

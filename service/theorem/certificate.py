@@ -1,11 +1,11 @@
-"""Theorem 1 and Corollary 1 for a configuration: whether bits, gains and reference satisfy them, and by how much.
+"""Certificate: whether bits, gains and reference satisfy Theorem 1 and Corollary 1, and by how much.
 
-All is computed from the effective configuration, by the equations of `bounds`. What the theorem needs and no
-configuration can know is assumed: the damping (law.damping_bound), the disturbance, that no command saturates, and how
-large the attitude error gets, because q's error grows without end where η nears 0. That last bound is by default
-controller.start_within_deg, within which a session begins; where the theorem guarantees less than that, it is widened
-until the two agree, so that no certificate contradicts itself. The theorem itself takes the plant's J, B and g for the
-law's, and continuous time; friction, lag and sensors are disturbances to it.
+All is computed from the effective configuration, by the equations of `bounds`. The theorem's other premises are
+assumed: the damping (law.damping_bound), the disturbance, that no command saturates, and the largest attitude error,
+because q's error grows without bound as η nears 0. That error is controller.start_within_deg by default, within which a
+session begins; where the guaranteed final error is larger, it is widened until the two agree, so that no certificate
+contradicts itself. The theorem assumes the law's J, B and g for the plant, and continuous time; friction, lag and
+sensor errors are disturbances to it.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ _AGREED: Final = 1e-9
 
 
 class CertificateTerm(BaseModel):
-    """One quantity of the theorem, as the paper calls it."""
+    """One quantity of the theorem, by its symbol in the paper."""
 
     model_config = ConfigDict(frozen=True)
 
     symbol: str
-    equation: str = Field(description="number in the paper, or the assumption or remark that it is from")
-    value: float | None = Field(description="null where condition (C.66) fails and there is none")
+    equation: str = Field(description="number in the paper, or assumption or remark")
+    value: float | None = Field(description="null where it does not exist because condition (C.66) fails")
     unit: str
     meaning: str
 
 
 class Certificate(BaseModel):
-    """What the theorem says of a configuration."""
+    """The theorem evaluated for a configuration."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -55,22 +55,22 @@ class Certificate(BaseModel):
     delta_V2: float = Field(description="δ_V2 of (C.71) [N·m]")
     delta_Q: float = Field(description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance [W]")
     k: float | None = Field(description="the largest k of (C.66) [N·m·s/rad]; null where it fails")
-    radius: float | None = Field(description="√(δ_Q/k), where ‖z‖ ends [1, rad/s]; null where (C.66) fails")
-    radius_deg: float | None = Field(description="the attitude error that this allows [deg]; null where (C.66) fails")
+    radius: float | None = Field(description="√(δ_Q/k), the final bound of ‖z‖ [1, rad/s]; null where (C.66) fails")
+    radius_deg: float | None = Field(description="the attitude error at that bound [deg]; null where (C.66) fails")
     terms: list[CertificateTerm]
     blame: str | None = Field(description="why it does not hold; null where it does")
-    remedies: list[Remedy] = Field(description="what would make it hold, the least of each kind")
+    remedies: list[Remedy] = Field(description="changes with which it would hold, the least of each kind")
 
     @property
     def verdict(self) -> str:
         """The certificate in a sentence."""
         disturbance = self.value("k_τ_d")
-        what = f"Corollary 1, with ‖τ_d‖ ≤ {disturbance:g} N·m," if disturbance else "Theorem 1"
+        name = f"Corollary 1, with ‖τ_d‖ ≤ {disturbance:g} N·m," if disturbance else "Theorem 1"
         if self.blame is not None:
-            return f"{what} does not hold: {self.blame}."
+            return f"{name} does not hold: {self.blame}."
         assert self.radius_deg is not None
         holds = (
-            f"{what} holds: c₀/2 = {self.c0 / 2:.4g} exceeds δ_V1 = {self.delta_V1:.4g} by {self.margin:.4g} N·m·s/rad"
+            f"{name} holds: c₀/2 = {self.c0 / 2:.4g} exceeds δ_V1 = {self.delta_V1:.4g} by {self.margin:.4g} N·m·s/rad"
         )
         if self.radius == 0:
             return f"{holds}; the error goes to 0."
@@ -89,7 +89,7 @@ class Certificate(BaseModel):
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Everything that a certificate is made of."""
+    """The quantities of a certificate."""
 
     known: Known
     lemma: Lemma
@@ -110,22 +110,22 @@ def certify(
     Args:
         wire: The quantizers.
         law: The model and the gains.
-        reference: What is followed.
+        reference: The reference.
         controller: How a session begins.
-        disturbance: k_τ_d, the largest ‖τ_d‖ to be reckoned with [N·m].
+        disturbance: k_τ_d, the largest assumed ‖τ_d‖ [N·m].
         attitude_error_deg: Assumed bound on the attitude error at all times; controller.start_within_deg if None.
 
     Raises:
-        BoundlessError: A live stream, whose set-points are not known beforehand.
+        BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
-    known_of = _known_of(reference, controller, disturbance, attitude_error_deg)
-    bounds = evaluate(known_of(wire, law))
+    inputs_of = _inputs_of(reference, controller, disturbance, attitude_error_deg)
+    bounds = evaluate(inputs_of(wire, law))
     t = bounds.theorem
     reasons, ways = _beyond_range(wire, bounds.known)
     if t.k is None:
         reasons.append(_blame(bounds.lemma, t))
-        ways += remedies(wire, law, lambda wire, law: evaluate(known_of(wire, law)).theorem.k is not None)
+        ways += remedies(wire, law, lambda wire, law: evaluate(inputs_of(wire, law)).theorem.k is not None)
     return Certificate(
         holds=not reasons,
         margin=t.margin,
@@ -151,11 +151,11 @@ def bounds_of(
     disturbance: float = 0.0,
     attitude_error_deg: float | None = None,
 ) -> Evaluated:
-    """What a certificate is made of, to hold a run against; arguments and errors as of `certify`."""
-    return evaluate(_known_of(reference, controller, disturbance, attitude_error_deg)(wire, law))
+    """The quantities of a certificate, to check a run against; arguments and errors as of `certify`."""
+    return evaluate(_inputs_of(reference, controller, disturbance, attitude_error_deg)(wire, law))
 
 
-def _known_of(
+def _inputs_of(
     reference: Reference, controller: ControllerSettings, disturbance: float, attitude_error_deg: float | None
 ) -> Callable[[WireSpec, LawSettings], Known]:
     if not 0 <= disturbance < inf:
@@ -165,10 +165,10 @@ def _known_of(
 
 
 def known(wire: WireSpec, law: LawSettings, *, desired: Extremes, disturbance: float, error: float) -> Known:
-    """What the theorem takes for granted of a configuration.
+    """Inputs of the theorem for a configuration.
 
     Args:
-        wire: The quantizers; what is not quantized errs by 0.
+        wire: The quantizers; a signal without one has the error 0.
         law: The model and the gains.
         desired: The reference's extremes.
         disturbance: k_τ_d [N·m].
@@ -199,9 +199,9 @@ def known(wire: WireSpec, law: LawSettings, *, desired: Extremes, disturbance: f
 
 
 def evaluate(p: Known) -> Evaluated:
-    """The bounds, with the assumed attitude error widened as far as the guaranteed one asks; at most 180°.
+    """The bounds, with the assumed attitude error widened to the guaranteed one if that is larger; at most 180°.
 
-    Both grow together: starting from what was assumed, the widening ends at the least error that agrees with itself.
+    Both grow together: from the assumed error the iteration ends at the least fixed point.
     """
     for _ in range(_ROUNDS):
         lemma = lemma_1(p)
@@ -215,7 +215,7 @@ def evaluate(p: Known) -> Evaluated:
 
 
 def _error(signal: SignalSpec, elements: int) -> float:
-    """‖δ_y‖ of (C.15) for a vector whose elements are quantized alike [signal's unit]."""
+    """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
     return sqrt(elements) * signal.quantizer().bound
 
 
@@ -231,13 +231,13 @@ def _blame(d: Lemma, t: Theorem) -> str:
     symbol, value = max(parts.items(), key=lambda part: part[1])
     origin = "the gain C₁, whatever the bits" if value == t.alpha else "quantization"
     return (
-        f"c₀/2 = {t.c0 / 2:.4g} does not exceed δ_V1 = {t.delta_V1:.4g} N·m·s/rad; to blame is {symbol} = {value:.4g}, "
-        f"which comes from {origin}"
+        f"c₀/2 = {t.c0 / 2:.4g} does not exceed δ_V1 = {t.delta_V1:.4g} N·m·s/rad; its largest term is "
+        f"{symbol} = {value:.4g}, which comes from {origin}"
     )
 
 
 def _beyond_range(wire: WireSpec, p: Known) -> tuple[list[str], list[Remedy]]:
-    """Why (C.28) or (C.29) cannot be true where the reference leaves a quantizer's range, and what would help."""
+    """Where the reference leaves a quantizer's range, so that (C.28) or (C.29) fails: reasons and remedies."""
     reasons, ways = list[str](), list[Remedy]()
     eps = sin(min(pi / 2, p.half_angle_d + p.half_angle_e))
     for name, reached, limit, unit in (
@@ -246,7 +246,7 @@ def _beyond_range(wire: WireSpec, p: Known) -> tuple[list[str], list[Remedy]]:
     ):
         if reached > limit:
             enough = ceil(100 * reached) / 100
-            reasons.append(f"the reference asks for up to {reached:.4g}{unit}, beyond {name}.limit = {limit:g}{unit}")
+            reasons.append(f"the reference reaches {reached:.4g}{unit}, beyond {name}.limit = {limit:g}{unit}")
             ways.append(
                 Remedy(text=f"a range that holds the reference, {name}", overrides=[f"{name}.limit={enough:g}"])
             )

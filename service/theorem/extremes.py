@@ -1,8 +1,8 @@
-"""How far and how fast a reference goes: the bounds k_ω_d and k_ω̇_d of Assumption 1, and the farthest turn.
+"""Extremes of a reference: the bounds k_ω_d and k_ω̇_d of Assumption 1, and the largest angle.
 
-They are taken over the samples that also hold an operator's references to their limits. Samples come within half a
-percent of the extremes, and Assumption 1 asks for bounds that are not reached: half a percent is added. A sinusoid is
-seen over eight turns of its slowest axis, which is all of it where the frequencies have small common multiples.
+They are maxima over the samples that also check an operator's references. Samples are within half a percent of the
+extremes, and Assumption 1 requires bounds that are not reached: half a percent is added. A sinusoid is sampled over
+eight periods of its slowest axis, which is all of it where the frequencies have small common multiples.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _SLACK: Final = 1.005
 
 
 class BoundlessError(AeroloopError):
-    """A reference of which no bounds are known; one line."""
+    """A reference without bounds; one line."""
 
 
 class Extremes(NamedTuple):
-    """What a reference never exceeds.
+    """Bounds that a reference never exceeds.
 
     Attributes:
         rate: k_ω_d, largest ‖ω_d‖ [rad/s].
@@ -38,10 +38,10 @@ class Extremes(NamedTuple):
 
 
 def extremes(reference: Reference) -> Extremes:
-    """The extremes of a reference that begins at its own beginning.
+    """The extremes of a reference from its first tick on.
 
     Raises:
-        BoundlessError: A stream, whose set-points are not known beforehand, or one too fast for numbers.
+        BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
     """
     if isinstance(reference, Stream):
         raise BoundlessError(
@@ -53,12 +53,12 @@ def extremes(reference: Reference) -> Extremes:
         rate, acceleration = plan.fastest(), float(np.linalg.norm(accelerations(samples), axis=1).max())
         half_angle = float(half_angles(samples).max())
     if not isfinite(rate + acceleration + half_angle):
-        raise BoundlessError("the reference is faster than numbers go: nothing can be certified")
+        raise BoundlessError("the reference is too fast for floating-point numbers: nothing can be certified")
     return Extremes(_SLACK * rate, _SLACK * acceleration, min(pi / 2, _SLACK * half_angle))
 
 
 def accelerations(angles: Angles) -> Floats:
-    """ω̇_d in a frame that yaws with the body, where its norm is the same as in any other [rad/s²]. Shape (n, 3).
+    """ω̇_d in a frame that yaws with the body; its norm is the same in every frame [rad/s²]. Shape (n, 3).
 
     ω_d = ψ̇ z + θ̇ y + φ̇ x for roll φ, pitch θ, yaw ψ about axes of which y turns with the yaw and x with both.
     """
@@ -74,7 +74,7 @@ def accelerations(angles: Angles) -> Floats:
 
 
 def half_angles(angles: Angles) -> Floats:
-    """Half the angle of each q_d from [1, 0], of whichever of ±q_d is nearer, 0…π/2 [rad]. Shape (n,)."""
+    """Half the angle of each q_d from [1, 0], for the nearer of ±q_d, 0…π/2 [rad]. Shape (n,)."""
     (a, b, c) = angles.angle.T / 2
     eta_d = np.cos(a) * np.cos(b) * np.cos(c) + np.sin(a) * np.sin(b) * np.sin(c)
     nearest: Floats = np.arccos(np.minimum(1.0, np.abs(eta_d)))

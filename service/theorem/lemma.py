@@ -1,8 +1,8 @@
-"""Lemma 1, (C.50)–(C.57), sample by sample: both sides of each inequality, for a state and what was known of it.
+"""Lemma 1, (C.50)–(C.57), sample by sample: both sides of each inequality, for true and received states.
 
-Where the true state is at hand, as in an emulator's log or a simulation, this shows whether the bounds hold: all sides
-are computed for thousands of samples at once. Two premises come with them, (C.28) and (C.29): a log whose sensors err
-by more than the quantizers breaks those first. The Lyapunov function is here too: it is of the same coordinates.
+With the true state, from an emulator's log or a simulation, this shows whether the bounds hold; all sides are computed
+for thousands of samples at once. The premises (C.28) and (C.29) are evaluated too: a log breaks those first if its
+sensors err by more than the quantizers. The Lyapunov function is here because it uses the same coordinates.
 
     symbol   name in code     unit, shape        symbol   name in code     unit, shape
     q, ω     q, omega         1, rad/s; (n, 4)   z₁, z₂   z1, z2           1 (n, 4), rad/s (n, 3)
@@ -26,12 +26,12 @@ Floats: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Samples:
-    """States of the body and what the controller had of them, at n instants.
+    """True states of the body and the states as received, at n instants.
 
     Attributes:
         q: True attitude, unit length, of either sign. Shape (n, 4).
         omega: True angular velocity, body frame [rad/s]. Shape (n, 3).
-        q_Q: Attitude as received, scaled by Remark 2, with the sign that the law gave it. Shape (n, 4).
+        q_Q: Attitude as received, scaled by Remark 2, with the sign chosen by the law. Shape (n, 4).
         omega_Q: Angular velocity as received [rad/s]. Shape (n, 3).
         q_d: Desired attitude. Shape (n, 4).
         omega_d: Desired angular velocity, inertial frame [rad/s]. Shape (n, 3).
@@ -53,7 +53,7 @@ class Inequality:
 
     Attributes:
         equation: Its number.
-        what: Its left-hand side, in the paper's letters.
+        what: Its left-hand side, in the paper's symbols.
         left: Shape (n,).
         right: Shape (n,).
     """
@@ -65,7 +65,7 @@ class Inequality:
 
     @property
     def broken(self) -> NDArray[np.bool_]:
-        """Where it does not hold, but for what floats round. Shape (n,)."""
+        """Where it does not hold, beyond rounding. Shape (n,)."""
         return self.left > self.right * (1 + 1e-9) + 1e-12
 
 
@@ -87,7 +87,7 @@ class Coordinates:
 
 
 def coordinates(q: Floats, omega: Floats, q_d: Floats, omega_d: Floats, sign: Floats, C1: Floats) -> Coordinates:
-    """z₁, z₂ and what they are made of; arguments as in `Samples`, C1 the gain's diagonal. Shape (3,)."""
+    """z₁, z₂ and their parts; arguments as in `Samples`, C1 the gain's diagonal. Shape (3,)."""
     s = sign[:, None]
     eta, eps, eta_d, eps_d = q[:, :1], q[:, 1:], q_d[:, :1], q_d[:, 1:]
     eta_e = eta_d * eta + (eps_d * eps).sum(axis=1, keepdims=True)  # (C.16), (C.32)
@@ -103,9 +103,9 @@ def lemma_inequalities(samples: Samples, law: LawSettings, p: Known, d: Lemma) -
     """Both sides of the premises (C.28), (C.29), of (C.26), (C.27) and of every inequality of Lemma 1.
 
     Args:
-        samples: What was the case.
+        samples: The states.
         law: The model and the gains.
-        p: What the bounds take for granted.
+        p: Inputs of the bounds.
         d: The bounds.
     """
     C1, J = np.array(law.C1), np.array(law.inertia)
@@ -146,7 +146,7 @@ def lemma_inequalities(samples: Samples, law: LawSettings, p: Known, d: Lemma) -
 
 
 def lyapunov(c: Coordinates, theta_error: Floats, law: LawSettings) -> Floats:
-    """V, of the true state.
+    """V of the true state.
 
     Args:
         c: The error coordinates.
@@ -176,7 +176,7 @@ def rotation(q: Floats) -> Floats:
 
 
 def times(matrices: Floats, vectors: Floats) -> Floats:
-    """A matrix for each row times its vector, or times one for all. Shape (n, 3)."""
+    """The matrix of each row times its vector, or times one common vector. Shape (n, 3)."""
     product: Floats = np.einsum("nij,nj->ni", matrices, np.broadcast_to(vectors, matrices.shape[:2]))
     return product
 

@@ -1,7 +1,6 @@
-"""What would satisfy condition (C.66): the fewest bits, or the least change of a gain, found by trying.
+"""Remedies: the fewest bits, or the least change of a gain, with which condition (C.66) holds, found by search.
 
-Nothing is solved here: each candidate is a whole configuration, and the certificate's own function says whether it
-satisfies the condition.
+Nothing is solved: each candidate is a whole configuration, which the certificate's own function checks.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ Holds = Callable[[WireSpec, LawSettings], bool]
 SIGNALS: Final = ("attitude", "rate", "voltage")
 GAINS: Final = ("C1", "C2")
 _STEP: Final = 1.1
-"""Gains are tried in steps of this factor; then the step that does it is halved, again and again."""
+"""Gains are tried in steps of this factor; then the step that satisfies the condition is bisected."""
 _MOST_STEPS: Final = 80
 _HALVINGS: Final = 20
 
 
 class Remedy(BaseModel):
-    """One change that would do, or the word that none of a kind does."""
+    """One change that satisfies the condition, or the statement that none of a kind does."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -43,7 +42,7 @@ def remedies(wire: WireSpec, law: LawSettings, holds: Holds) -> list[Remedy]:
     Args:
         wire: The quantizers; they do not satisfy it with `law`.
         law: The gains.
-        holds: Whether a configuration satisfies it.
+        holds: Returns whether a configuration satisfies it.
     """
     return [*_by_bits(wire, law, holds), *_by_gains(wire, law, holds)]
 
@@ -66,17 +65,17 @@ def _by_bits(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]
 
 
 def _candidates(wire: WireSpec, names: list[str]) -> Iterator[tuple[int, WireSpec]]:
-    """The wire with every number of bits that the signals named can have."""
+    """The wire with every number of bits allowed for the signals named."""
     for bits in range(MIN_BITS, MAX_BITS + 1):
         try:
             tried = with_bits(wire, names, bits)
         except ValueError:
-            continue  # some kinds of quantizer need more
+            continue  # some kinds of quantizer need more bits
         yield bits, tried
 
 
 def with_bits(wire: WireSpec, names: list[str], bits: int) -> WireSpec:
-    """The wire with so many bits for the signals named."""
+    """The wire with this number of bits for the signals named."""
     tree = wire.model_dump()
     for name in names:
         tree[name]["bits"] = bits
@@ -134,7 +133,7 @@ def _gains_remedy(law: LawSettings, factors: dict[str, float]) -> Remedy:
 
 
 def _rounded(before: float, after: float) -> float:
-    """Four digits, away from what it was, so that rounding does not undo the change."""
+    """Rounded to four digits, away from the old value, so that rounding does not undo the change."""
     unit = 10.0 ** (floor(log10(after)) - 3)
     steps = ceil(after / unit) if after > before else floor(after / unit)
     return float(f"{steps * unit:.4g}")

@@ -1,1 +1,1 @@
-"""Viewers."""
+"""Foxglove and Lichtblick: decoded topics, their schemas, a layout, and a live WebSocket server."""

@@ -1,7 +1,7 @@
-"""The body as a 3-D panel draws it: two rotors on a beam over a stand for the Aero, a box with a nose otherwise.
+"""3-D scene of the body: two rotors on a beam over a stand for the Aero, a box with a nose otherwise.
 
-Entities are fixed to frames, so that transforms move them; a pale twin hangs in the frame of the desired attitude.
-Lengths are in metres, about those of the bench; what is red points forward.
+Entities are fixed to frames, so that transforms move them; a transparent copy is fixed to the frame of the desired
+attitude. Lengths are in metres, about those of the bench; red points forward.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Rgb(NamedTuple):
     b: float
 
     def at(self, alpha: float) -> Color:
-        """The colour, more or less transparent."""
+        """The colour with an opacity, 0…1."""
         return Color(r=self.r, g=self.g, b=self.b, a=alpha)
 
 
@@ -47,23 +47,23 @@ SIDEWAYS: Final = Quaternion(x=sqrt(0.5), w=sqrt(0.5))
 
 
 def frame_of(vehicle: str) -> str:
-    """Name of the frame that moves as the body is measured to."""
+    """Name of the frame that has the measured attitude."""
     return vehicle
 
 
 def desired_frame_of(vehicle: str) -> str:
-    """Name of the frame that moves as the body should."""
+    """Name of the frame that has the desired attitude."""
     return f"{vehicle}_desired"
 
 
 def timestamp(at_ns: int) -> Timestamp:
-    """A time since 1970 [ns] as a viewer takes it, with 32 bits of seconds."""
+    """A time since 1970 [ns] in Foxglove's type, which has 32 bits of seconds."""
     seconds, rest = divmod(at_ns, _NS)
     return Timestamp(min(max(seconds, 0), 0xFFFFFFFF), rest)
 
 
 def scene(vehicle: str, kind: str, at_ns: int) -> bytes:
-    """An encoded SceneUpdate with the body, its pale twin and its stand.
+    """An encoded SceneUpdate with the body, its transparent copy and its stand.
 
     Args:
         vehicle: Names the frames.

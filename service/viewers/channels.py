@@ -1,16 +1,16 @@
-"""Raw messages, decoded: what Foxglove and Lichtblick show of a vehicle without any configuration.
+"""Decoder of raw messages into topics that Foxglove and Lichtblick show without any configuration.
 
-Sans-I/O. Topics stand under `/<vehicle>/`; poses, transforms, the scene and the log are in Foxglove's schemas, the rest
-are the models of views.py. Of traces, the plant's rows give the measurements that it sent and the controller's the
-commands that it sent, at the times of sending on their own wall clocks. The wire spec in a description decodes them,
-so they give nothing before it. Time is cut into slots, and the first row or message in a slot passes; at a bounded rate
-no other is looked at. What happens once always passes, and so do statuses, which come once a second.
+Sans-I/O. Topics are under `/<vehicle>/`; poses, transforms, the scene and the log have Foxglove's schemas, the rest
+are the models of views.py. The plant's trace rows give measurements, the controller's rows give commands, at the times
+of sending on their own wall clocks. The wire spec in a description decodes them; rows before it are dropped. Time is
+divided into slots, and the first row or message of a slot passes; the others are not decoded. Events, losses and
+statuses, which are published once a second, always pass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 from foxglove.messages import FrameTransform, Log, LogLevel, Pose, PoseInFrame, Quaternion, SceneUpdate, Vector3
 from pydantic import ValidationError
@@ -25,19 +25,19 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.viewers import views
 from aeroloop.service.viewers.body import WORLD, desired_frame_of, frame_of, scene, timestamp
+from aeroloop.service.viewers.schemas import Decoded, json_shape, protobuf_shape
 from aeroloop.service.viewers.schemas import Shape as Shape
-from aeroloop.service.viewers.schemas import json_shape, protobuf_shape
 
-LIMITED: Final = frozenset({"telemetry", "truth", "reference"})
-"""Messages that stream, and so are held to the rate; as the rows of traces are."""
+LIMITED: Final = frozenset(topic.name for topic in topics.TOPICS.values() if topic.decoded == "limited")
+"""Streaming messages, which are limited to the rate, like the rows of traces."""
 
 _FRAME: Final = Sent.FRAME.value
 
-UNLIMITED: Final = frozenset({"status", "event", "loss"})
+UNLIMITED: Final = frozenset(topic.name for topic in topics.TOPICS.values() if topic.decoded == "always")
 """Messages that always pass."""
 
 ROLES: Final = ("plant", "controller", "recorder")
-"""Whose statuses are known beforehand; those of others are decoded just the same."""
+"""Roles with a status topic from the start; statuses of other roles are decoded, too."""
 
 _POSE: Final = protobuf_shape(PoseInFrame.get_schema())
 _TRANSFORM: Final = protobuf_shape(FrameTransform.get_schema())
@@ -51,7 +51,7 @@ _LEVELS: Final = {
     "lost": LogLevel.Warning,
     "refused": LogLevel.Warning,
 }
-"""Of an event, by its kind; Info for all others."""
+"""Log level by kind of event; Info for all others."""
 
 SHAPES: Final = {
     "pose": _POSE,
@@ -75,24 +75,8 @@ def topic_of(vehicle: str, name: str) -> str:
     return f"/{vehicle}/{name}"
 
 
-class Decoded(NamedTuple):
-    """A message to show.
-
-    Attributes:
-        topic: Such as `/aero/pose`.
-        shape: How it is to be read; the same for every message of a topic.
-        data: The message itself.
-        at_ns: When that which it was made from was published, ns since 1970.
-    """
-
-    topic: str
-    shape: Shape
-    data: bytes
-    at_ns: int
-
-
 class _Wire:
-    """How a vehicle's frames are read, as its description says. Raises as pydantic does, KeyError or TypeError."""
+    """Frame formats of a vehicle by its description. Raises ValidationError, KeyError or TypeError."""
 
     def __init__(self, description: Description) -> None:
         spec = WireSpec.model_validate(description.config["wire"])
@@ -109,10 +93,10 @@ class _Wire:
 
 
 class Decoder:
-    """Decodes what is published.
+    """Decodes published messages.
 
     Args:
-        rate_hz: At most so many messages a second of each topic that streams, by time of publication; None: all.
+        rate_hz: Most messages per second of each streaming topic, by time of publication; None: all.
 
     Attributes:
         malformed: Messages, rows and descriptions so far that could not be read.
@@ -138,10 +122,10 @@ class Decoder:
         }
 
     def configure(self, description: Description) -> None:
-        """Read a vehicle's frames by this description from now on.
+        """Decode a vehicle's frames by this description from now on.
 
-        A controller's counts while there is none of a plant: the plant decides whose frames it takes. Other roles' do
-        not: what a recorder was configured with need not be what is on the wire.
+        A controller's is used until there is a plant's: the plant decides which frames it accepts. Other roles' are
+        ignored: a recorder's configuration need not match the wire.
         """
         known = self._wires.get(description.vehicle)
         if description.role == "plant" or (
@@ -153,10 +137,10 @@ class Decoder:
                 self.malformed += 1
 
     def take(self, address: topics.Address, payload: bytes, published_ns: int) -> list[Decoded]:
-        """What a message or a batch of a trace gives: nothing if it is not due, malformed, or of no interest.
+        """Decode a message or a batch of a trace: nothing if it is not due, malformed, or not shown.
 
         Args:
-            address: What its key says; a frame's gives nothing, as the traces have it.
+            address: Its parsed key; a frame's gives nothing, as the traces have it.
             payload: Its bytes.
             published_ns: When it was published, ns since 1970.
         """
@@ -172,7 +156,7 @@ class Decoder:
             return []
 
     def frame(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        """What a frame from the network gives, at whatever rate; silence in lockstep gives nothing."""
+        """Decode a frame from the network, without a limit of rate; silence in lockstep gives nothing."""
         wire, show = self._wires.get(address.vehicle), self._frames.get(address.topic.name)
         if wire is None or show is None or (payload == SILENCE and address.topic.name in wire.silent):
             return []
@@ -183,7 +167,7 @@ class Decoder:
             return []
 
     def rows(self, vehicle: str, batch: Batch) -> list[Decoded]:
-        """What the rows of a trace give: the plant's its measurements, the controller's its commands."""
+        """Decode the rows of a trace: measurements from the plant's, commands from the controller's."""
         wire, columns, base_ns = self._wires.get(vehicle), batch.columns, batch.header.wall_ns
         if wire is None:
             return []
@@ -203,7 +187,7 @@ class Decoder:
         return found
 
     def _due(self, name: str, vehicle: str, at_ns: int) -> bool:
-        """Whether it is the first of its source in its slot of time."""
+        """Whether it is the first of its topic and vehicle in its slot of time."""
         if not self._slot_ns:
             return True
         source, slot = (name, vehicle), at_ns // self._slot_ns
@@ -233,41 +217,41 @@ class Decoder:
         return [_shown(vehicle, "command", views.Voltages.of(codes, wire.voltage, wire.outermost), at_ns)]
 
     def _telemetry(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = Telemetry.model_validate_json(payload)
+        telemetry = Telemetry.model_validate_json(payload)
         vehicle, wire = address.vehicle, self._wires.get(address.vehicle)
-        tracking = views.Tracking.of(told, wire.period if wire else None)
+        tracking = views.Tracking.of(telemetry, wire.period if wire else None)
         return [
             _shown(vehicle, "tracking", tracking, at_ns),
-            *_posed(vehicle, "desired_", desired_frame_of(vehicle), told.desired, at_ns),
+            *_posed(vehicle, "desired_", desired_frame_of(vehicle), telemetry.desired, at_ns),
         ]
 
     def _truth(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = Truth.model_validate_json(payload)
-        return [_shown(address.vehicle, "truth", views.Attitude.of(told.attitude, told.rate), at_ns)]
+        truth = Truth.model_validate_json(payload)
+        return [_shown(address.vehicle, "truth", views.Attitude.of(truth.attitude, truth.rate), at_ns)]
 
     def _reference(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = verbs.Setpoint.model_validate_json(payload)
-        return [_shown(address.vehicle, "setpoint", views.SetpointView.of(told.attitude), at_ns)]
+        setpoint = verbs.Setpoint.model_validate_json(payload)
+        return [_shown(address.vehicle, "setpoint", views.SetpointView.of(setpoint.attitude), at_ns)]
 
     def _status(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = Status.model_validate_json(payload)
+        status = Status.model_validate_json(payload)
         vehicle, wire = address.vehicle, self._wires.get(address.vehicle)
-        status = Decoded(
-            topic_of(vehicle, f"status/{address.role}"), _STATUS, views.RoleStatus.of(told).encode(), at_ns
+        shown = Decoded(
+            topic_of(vehicle, f"status/{address.role}"), _STATUS, views.RoleStatus.of(status).encode(), at_ns
         )
         if address.role != "plant" or wire is None:
-            return [status]
+            return [shown]
         body = scene(vehicle, wire.kind, at_ns)  # again with every status, for a viewer that connects late
-        return [status, Decoded(topic_of(vehicle, "scene"), SHAPES["scene"], body, at_ns)]
+        return [shown, Decoded(topic_of(vehicle, "scene"), SHAPES["scene"], body, at_ns)]
 
     def _event(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = Event.model_validate_json(payload)
-        level = _LEVELS.get(told.kind, LogLevel.Info)
-        return [_logged(address.vehicle, level, told.role, f"{told.kind}: {told.text}", at_ns)]
+        event = Event.model_validate_json(payload)
+        level = _LEVELS.get(event.kind, LogLevel.Info)
+        return [_logged(address.vehicle, level, event.role, f"{event.kind}: {event.text}", at_ns)]
 
     def _loss(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        told = Loss.model_validate_json(payload)
-        text = f"{told.count} messages of {told.key} are not in the log ({told.reason})"
+        loss = Loss.model_validate_json(payload)
+        text = f"{loss.count} messages of {loss.key} are not in the log ({loss.reason})"
         return [_logged(address.vehicle, LogLevel.Warning, "recorder", text, at_ns)]
 
 

@@ -1,8 +1,9 @@
-"""What happens now, for Foxglove and Lichtblick: a WebSocket server of decoded topics.
+"""Live WebSocket server of decoded topics for Foxglove and Lichtblick.
 
-A process of its own that only listens. Frames and whatever else streams wait in rings of one, written by Zenoh's own
-threads, and are taken at a fixed pace: what comes between is never decoded. foxglove-sdk sends from threads of its own,
-and drops what a slow client does not take, so that it reaches neither the other clients nor the loop.
+A process of its own that only subscribes. Frames and other streaming topics wait in rings of one, written by Zenoh's
+own threads, and are taken at a fixed rate: what is published in between is never decoded. foxglove-sdk sends from
+threads of its own and drops what a slow client does not take, so a slow client delays neither other clients nor the
+loop.
 """
 
 from __future__ import annotations
@@ -23,31 +24,31 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.protocol.transport.publication import Delivery, RecoveringSubscriber, read_sample
-from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoded, Decoder, topic_of
-from aeroloop.service.viewers.schemas import Shape
+from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoder, topic_of
+from aeroloop.service.viewers.schemas import Decoded, Shape
 
 log: Final = logging.getLogger("aeroloop")
 
 KEPT: Final = 1024
-"""How many of what happens once may wait for the next turn."""
+"""Descriptions, and per topic events, losses or statuses, that may wait for the next `take`."""
 BACKLOG: Final = 256
 """Messages that wait for one slow client; beyond, its oldest are dropped. About a second of everything."""
 
 
 class FoxgloveServerError(AeroloopError):
-    """The server cannot be started; one line that says why and what to do."""
+    """The server cannot be started; one line with the reason and a remedy."""
 
 
 class LiveDecoder:
-    """What is published about a vehicle, decoded.
+    """Decodes what is published about a vehicle.
 
     Args:
-        session: An open session; it outlives the feed.
-        vehicle: Whose topics.
+        session: An open session; it must outlive the decoder.
+        vehicle: The vehicle.
     """
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
-        self._decoder = Decoder(None)  # the pace at which it is asked bounds the rate
+        self._decoder = Decoder(None)  # the rate of `take` bounds it
         self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle), KEPT)
         self._subscribers = {
             session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
@@ -56,7 +57,7 @@ class LiveDecoder:
         }
 
     def take(self) -> Iterator[Decoded]:
-        """What came since the last time: the newest of what streams, and all of what happens once. Never waits."""
+        """Messages since the last call: the newest of each streaming topic, all of the others. Never blocks."""
         for description in self._descriptions.take():
             try:
                 self._decoder.configure(Description.model_validate_json(description.payload))
@@ -81,19 +82,19 @@ class FoxgloveServer:
     """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
 
     Args:
-        vehicle: Whose topics are there from the start.
-        address: Where it listens.
+        vehicle: Vehicle whose topics exist from the start.
+        address: Address to listen on.
         port: Its port; 0 for any free one.
 
     Attributes:
-        url: Where clients find it.
+        url: URL for clients.
 
     Raises:
         FoxgloveServerError: It cannot listen there.
     """
 
     def __init__(self, vehicle: str, address: str, port: int) -> None:
-        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # clients that come and go are no news
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # no log line for each client
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         for name, shape in SHAPES.items():
@@ -123,7 +124,7 @@ class FoxgloveServer:
             channel.close()
 
     def send(self, message: Decoded) -> None:
-        """Send a message to the clients that subscribe to its topic. Never waits."""
+        """Send a message to the clients that subscribe to its topic. Never blocks."""
         channel = self._channels.get(message.topic) or self._open(message.topic, message.shape)
         channel.log(message.data, log_time=message.at_ns)
 
@@ -147,12 +148,12 @@ def serve(
     """Show a vehicle until `stop` is set.
 
     Args:
-        network: Where to join.
-        vehicle: Whose topics.
+        network: The network to join.
+        vehicle: The vehicle.
         stop: Set to end it.
-        address: Where to listen.
-        port: At which port; 0 for any free one.
-        rate_hz: How often what streams is taken, decoded and sent [Hz].
+        address: Address to listen on.
+        port: Its port; 0 for any free one.
+        rate_hz: Rate of taking, decoding and sending [Hz].
         ready: Called with the URL once clients can connect.
 
     Raises:

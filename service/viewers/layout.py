@@ -1,8 +1,8 @@
-"""A layout for Foxglove and Lichtblick that fits the topics of decoded.py.
+"""Layout for Foxglove and Lichtblick that fits the topics of channels.py.
 
 Both import the same JSON: `configById` with a panel's settings under `Type!name`, and `layout`, a tree of splits. The
 keys of the settings are those of Lichtblick's sources (suite-base/src/panels: 3D, Plot, StateTransitions, and Log,
-whose type is still RosOut); what a program does not know it leaves alone.
+whose type is still RosOut); both ignore unknown keys.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from aeroloop.service.viewers.channels import topic_of
 Tree = dict[str, Any]
 
 FOLLOWING_S: Final = 20
-"""What plots show of a live loop; of a log they show all."""
+"""Time span of plots of a live loop [s]; plots of a log show all of it."""
 
 COLOURS: Final = {"roll": ("#2ca02c", "#98df8a"), "pitch": ("#1f77b4", "#aec7e8"), "yaw": ("#d62728", "#ff9896")}
-"""Of what is measured, and of what it should follow."""
+"""Colours of measured and of desired values."""
 
 
 def layout(vehicle: str, actuators: int) -> str:
     """The layout as JSON, to be imported as a file.
 
     Args:
-        vehicle: Whose topics.
+        vehicle: The vehicle.
         actuators: 2 for u₂ and u₃, 3 for all.
     """
     motors = range(4 - actuators, 4)
@@ -95,7 +95,7 @@ def layout(vehicle: str, actuators: int) -> str:
 
 
 def _body(vehicle: str) -> Tree:
-    """The 3-D panel: the camera goes with the body and does not turn with it."""
+    """The 3-D panel: the camera follows the body and does not turn with it."""
     return {
         **_titled("Body"),
         "followTf": frame_of(vehicle),
@@ -158,7 +158,7 @@ def _line(vehicle: str, name: str, field: str, label: str, colour: str | None = 
 
 
 def _path(vehicle: str, name: str, field: str) -> str:
-    """A message path; a topic with a dot in it stands in quotes."""
+    """A message path; a topic with a special character, such as a dot, is quoted."""
     topic = topic_of(vehicle, name)
     return f"{topic}.{field}" if re.fullmatch(r"[A-Za-z0-9_/-]+", topic) else f'"{topic}".{field}'
 

@@ -1,8 +1,8 @@
-"""Schemas that viewers read: what an MCAP channel, or one on a WebSocket, says of its messages.
+"""Schemas of MCAP and WebSocket channels, in the subset that viewers accept.
 
-Lichtblick turns away a channel whose JSON schema has a `$ref`, an `anyOf`, a null or an array of arrays (its
-parseJsonSchema.ts). So a model's schema is put in line here, in the few words that it knows: a field that may be null
-is described by what it is when it is not, and what cannot be described is left out. It is in the messages all the same.
+Lichtblick rejects a channel whose JSON schema has a `$ref`, an `anyOf`, a null or an array of arrays (its
+parseJsonSchema.ts). So a model's schema is inlined and reduced here: a nullable field has the schema of its other type,
+and a field that cannot be described is left out of the schema, not of the messages.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from pydantic import BaseModel
 
-_SAID: Final[tuple[str, ...]] = ("description", "minimum", "exclusiveMinimum")
+_KEPT: Final[tuple[str, ...]] = ("description", "minimum", "exclusiveMinimum")
 
 
 class Shape(NamedTuple):
-    """How the messages of a topic are to be read.
+    """Schema and encoding of a topic's messages.
 
     Attributes:
         name: Such as `foxglove.PoseInFrame` or `aeroloop.Tracking`.
@@ -31,8 +31,24 @@ class Shape(NamedTuple):
     message_encoding: str
 
 
+class Decoded(NamedTuple):
+    """A message to show.
+
+    Attributes:
+        topic: Such as `/aero/pose`.
+        shape: Its schema; the same for every message of a topic.
+        data: The message itself.
+        at_ns: When its source was published, ns since 1970.
+    """
+
+    topic: str
+    shape: Shape
+    data: bytes
+    at_ns: int
+
+
 class Described(Protocol):
-    """A schema of foxglove-sdk's."""
+    """A schema of foxglove-sdk."""
 
     name: str
     encoding: str
@@ -40,7 +56,7 @@ class Described(Protocol):
 
 
 def protobuf_shape(schema: Described) -> Shape:
-    """The shape of one of Foxglove's own messages, of what its `get_schema()` says."""
+    """The shape of one of Foxglove's own messages, from its `get_schema()`."""
     return Shape(schema.name, schema.encoding, schema.data, "protobuf")
 
 
@@ -50,32 +66,32 @@ def json_shape(name: str, model: type[BaseModel]) -> Shape:
 
 
 def plain_schema(model: type[BaseModel]) -> dict[str, Any]:
-    """A model's JSON schema in the words that Lichtblick knows."""
+    """A model's JSON schema in the subset that Lichtblick accepts."""
     tree = model.model_json_schema(mode="serialization")
     return _plain(tree, tree.get("$defs", {})) or {"type": "object", "properties": {}}
 
 
-def _plain(schema: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
-    """A schema without references and alternatives; None if there is no such thing."""
+def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any] | None:
+    """A schema without references and alternatives; None if that is impossible."""
     if "$ref" in schema:
-        meant = known[schema["$ref"].rpartition("/")[2]]
-        return _plain({**meant, **{key: schema[key] for key in _SAID if key in schema}}, known)
-    said = {key: schema[key] for key in _SAID if key in schema}
+        target = definitions[schema["$ref"].rpartition("/")[2]]
+        return _plain({**target, **{key: schema[key] for key in _KEPT if key in schema}}, definitions)
+    kept = {key: schema[key] for key in _KEPT if key in schema}
     alternatives = [one for one in schema.get("anyOf") or schema.get("oneOf") or [] if one.get("type") != "null"]
     if alternatives:
-        found = [_plain(one, known) for one in alternatives]
+        found = [_plain(one, definitions) for one in alternatives]
         if all(one is not None and one["type"] == "object" for one in found):
             together = {name: field for one in found if one for name, field in one["properties"].items()}
-            return {"type": "object", "properties": together, **said}
-        return {**found[0], **said} if len(found) == 1 and found[0] else None
+            return {"type": "object", "properties": together, **kept}
+        return {**found[0], **kept} if len(found) == 1 and found[0] else None
     match schema.get("type"):
         case "object":
-            fields = {name: _plain(field, known) for name, field in schema.get("properties", {}).items()}
-            return {"type": "object", "properties": {name: field for name, field in fields.items() if field}, **said}
+            fields = {name: _plain(field, definitions) for name, field in schema.get("properties", {}).items()}
+            return {"type": "object", "properties": {name: field for name, field in fields.items() if field}, **kept}
         case "array":
-            items = _plain(schema.get("items") or schema.get("prefixItems", [{}])[0], known)
-            return {"type": "array", "items": items, **said} if items and items["type"] != "array" else None
+            items = _plain(schema.get("items") or schema.get("prefixItems", [{}])[0], definitions)
+            return {"type": "array", "items": items, **kept} if items and items["type"] != "array" else None
         case "number" | "integer" | "boolean" | "string" as kind:
-            return {"type": kind, **said}
+            return {"type": kind, **kept}
         case _:
             return None

@@ -1,7 +1,7 @@
-"""What a person is shown: messages in degrees, volts and microseconds.
+"""Views: messages in degrees, volts and microseconds, for display.
 
 Every field has its unit in its name; what has no valid value is null. Values are rounded far below a quantizer's step,
-so that they do not fill a log with digits that say nothing.
+so that a log has no meaningless digits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NO_MOTOR: Final = "null: no valid value, or no such motor"
 
 
 class View(BaseModel):
-    """A message for people."""
+    """A message for display."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -106,17 +106,17 @@ class Tracking(View):
     sign: int = Field(description="the equilibrium approached, z₁₊ or z₁₋")
 
     @classmethod
-    def of(cls, told: Telemetry, period: float | None) -> Self:
+    def of(cls, telemetry: Telemetry, period: float | None) -> Self:
         """Of the controller's telemetry, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
-        x, y, z = told.attitude_error
+        x, y, z = telemetry.attitude_error
         scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
-        measured = _product(told.desired, (scalar if told.sign >= 0 else -scalar, x, y, z))
+        measured = _product(telemetry.desired, (scalar if telemetry.sign >= 0 else -scalar, x, y, z))
         roll, pitch, yaw = _degrees(to_euler(measured))
-        desired_roll, desired_pitch, desired_yaw = _degrees(to_euler(told.desired))
-        error_p, error_q, error_r = _degrees(told.rate_error)
-        damping_1, damping_2, damping_3 = (round(theta, 6) for theta in told.damping_estimate)
+        desired_roll, desired_pitch, desired_yaw = _degrees(to_euler(telemetry.desired))
+        error_p, error_q, error_r = _degrees(telemetry.rate_error)
+        damping_1, damping_2, damping_3 = (round(theta, 6) for theta in telemetry.damping_estimate)
         return cls(
-            time_s=None if period is None else round(told.tick * period, 6),
+            time_s=None if period is None else round(telemetry.tick * period, 6),
             error_deg=_degree(angle(x, y, z)),
             roll_deg=roll,
             pitch_deg=pitch,
@@ -130,12 +130,12 @@ class Tracking(View):
             damping_1=damping_1,
             damping_2=damping_2,
             damping_3=damping_3,
-            sign=told.sign,
+            sign=telemetry.sign,
         )
 
 
 class RoleStatus(View):
-    """How a role is doing. Percentiles are of the last ten seconds."""
+    """Status of a role. Percentiles are of the last ten seconds."""
 
     state: str
     cause: str | None = Field(description="plant: why it may not be driven, where that is so")
@@ -143,7 +143,7 @@ class RoleStatus(View):
     rate_hz: float = Field(description="ticks (recorder: messages) a second since the last status [Hz]")
     skipped: int = Field(description="grid ticks of the session that were missed")
     refused: int = Field(description="malformed frames since start")
-    stale: int = Field(description="frames since start that came too late to be acted upon")
+    stale: int = Field(description="frames since start that were received too late to be acted upon")
     saturated: int = Field(description="values beyond a quantizer's range since start")
     latency_p50_us: float | None = Field(description="plant: from a measurement to the command that answers it [µs]")
     latency_p99_us: float | None = Field(description="the same, 99th percentile [µs]")
@@ -156,27 +156,27 @@ class RoleStatus(View):
     uptime_s: float = Field(description="since it joined the network [s]")
 
     @classmethod
-    def of(cls, told: Status) -> Self:
+    def of(cls, status: Status) -> Self:
         """Of what a role published."""
-        latency_p50, latency_p99 = _percentiles(told.recent_latency_us)
-        age_p50, age_p99 = _percentiles(told.age_us)
-        wake_p50, wake_p99 = _percentiles(told.timing.recent_wake if told.timing else None)
+        latency_p50, latency_p99 = _percentiles(status.recent_latency_us)
+        age_p50, age_p99 = _percentiles(status.age_us)
+        wake_p50, wake_p99 = _percentiles(status.timing.recent_wake if status.timing else None)
         return cls(
-            state=told.state,
-            cause=told.cause,
-            session=told.session,
-            rate_hz=round(told.rate_hz, 3),
-            skipped=told.skipped,
-            refused=told.refused,
-            stale=told.stale,
-            saturated=told.saturated,
+            state=status.state,
+            cause=status.cause,
+            session=status.session,
+            rate_hz=round(status.rate_hz, 3),
+            skipped=status.skipped,
+            refused=status.refused,
+            stale=status.stale,
+            saturated=status.saturated,
             latency_p50_us=latency_p50,
             latency_p99_us=latency_p99,
             age_p50_us=age_p50,
             age_p99_us=age_p99,
             wake_p50_us=wake_p50,
             wake_p99_us=wake_p99,
-            uptime_s=round(told.uptime_s, 1),
+            uptime_s=round(status.uptime_s, 1),
         )
 
 

@@ -1,11 +1,11 @@
-"""What the recorder costs and keeps up with: a real recorder process, and publishers that publish as the ends do.
+"""Recorder benchmark: load and losses of a real recorder process fed by publishers like the ends.
 
     uv run python -m tests.benchmarks.record
 
-First what a loop at 500 Hz publishes, traces of both ends with telemetry at 25 Hz and truth at 50 Hz: CPU time of the
-recorder by its process's own account, and MB an hour, with and without decoded channels. Then 20 000 JSON messages a
-second for 10 s from two publishers: every message is looked for in the log. Nothing is asserted; CPU time on a shared
-machine depends on what else runs, so compare figures of the same minutes.
+First the messages of a loop at 500 Hz, traces of both ends with telemetry at 25 Hz and truth at 50 Hz: CPU time of the
+recorder's process and MB an hour, with and without decoded channels. Then 20 000 JSON messages a second for 10 s from
+two publishers; every message is searched in the log. Nothing is asserted; CPU time on a shared machine depends on other
+work, so compare figures of the same minutes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.service.config import Settings, load
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
-from tests.service.recording.ends import VEHICLE, Ends, description_of
+from tests.support.made_messages import VEHICLE, Ends, description_of
 
 LOOP_S = 20.0
 FLOOD_PER_S = 20_000

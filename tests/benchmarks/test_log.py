@@ -1,7 +1,7 @@
-"""What reading a log costs: review and replay of a minute at 500 Hz, in µs a tick.
+"""Log benchmark: review and replay of a minute at 500 Hz, in µs a tick.
 
-Run with `uv run pytest tests/benchmarks/test_log.py --benchmark-enable`; of another length, such as an hour, with
-`AEROLOOP_BENCHMARK_LOG_S=3600` before it. Figures are for reading: nothing is asserted about time.
+Run with `uv run pytest tests/benchmarks/test_log.py --benchmark-enable`; for another length, such as an hour, set
+`AEROLOOP_BENCHMARK_LOG_S=3600`. No time is asserted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from aeroloop.service.config import load
 from aeroloop.service.logs.replay import EndReplay, replay
 from aeroloop.service.review.review import review
-from tests.service.logs.made_log import make_log
+from tests.support.made_log import make_log
 
 ROUNDS = 3
 

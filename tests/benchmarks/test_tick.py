@@ -1,6 +1,6 @@
-"""What a controller tick costs, from frame bytes to frame bytes, beside the same law in plain NumPy.
+"""Tick benchmark: a controller tick from frame bytes to frame bytes, and the same law in plain NumPy.
 
-Run with `uv run pytest tests/benchmarks --benchmark-enable`. Figures are for reading: nothing is asserted about time.
+Run with `uv run pytest tests/benchmarks --benchmark-enable`. No time is asserted.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
-from tests.service import numpy_twin as twin
-from tests.service.twin_body import body_of
+from tests.support import numpy_twin as twin
+from tests.support.twin_body import body_of
 
 PERIOD = 0.002
 TICKS = 2000

@@ -1,10 +1,10 @@
-"""What tests on a bus of this process share."""
+"""Fixtures of tests on a CAN bus inside this process."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.can.in_process import Flaws
+from tests.support.can_in_process import Flaws
 
 
 @pytest.fixture

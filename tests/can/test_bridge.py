@@ -1,7 +1,7 @@
-"""The bridge between a real Zenoh and a bus in this process, where the test is the node: when it trips, and why.
+"""Bridge between a real Zenoh and a bus in this process, with the test as the node: trips and their causes.
 
-That a node trips, is silent, or comes back is tried on real processes too; here the node says whatever a test wants, at
-the moment it wants.
+tests/can/test_buses.py has a node that trips, falls silent or returns as real processes; here the test chooses what the
+node sends, and when.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from aeroloop.protocol.messages.operator import Answer, Ask
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.can_link import CanLink, Heartbeat, fingerprint, number_of
+from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint, number_of
+from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.can.in_process import virtual
-from tests.protocol.gathering import PATIENCE_S, Gathering, eventually
+from tests.support.can_in_process import virtual
+from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 WIRE = WireSpec()
 LOOP = LoopSettings(realtime="off")
@@ -203,7 +204,7 @@ def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
 def test_it_trips_when_the_node_has_and_tells_the_nodes_cause(ends: Ends, cause: TripCause | None) -> None:
     ends.hold()
     ends.say(PlantState.TRIPPED, cause)
-    assert ends.trip() == f"node 1 tripped: {cause or 'no cause told'}: 0 V"
+    assert ends.trip() == f"node 1 tripped: {cause or 'no cause reported'}: 0 V"
     ends.hold()  # armed by the claim; that the node was tripped before is not held against it
     assert sum(event.kind == "tripped" for event in ends.events) == 1
 

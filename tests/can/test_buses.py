@@ -1,8 +1,8 @@
-"""The loop over CAN buses of several kinds, on real processes: figures to the last bit, and what goes wrong.
+"""Loop over several kinds of CAN bus on real processes: figures to the last bit, and faults of the bus.
 
-UDP multicast and serial adapters (slcan) stand for all: classic and FD, with a kernel in between and without. Real
-SocketCAN has a test of its own. What needs real time says how much slack it allows: this suite must pass on a shared
-machine with two cores, where a process can be kept waiting for hundreds of milliseconds.
+UDP multicast and serial adapters (slcan) cover classic CAN and CAN FD, with and without a kernel in between;
+test_socketcan.py covers SocketCAN. A test in real time states its slack: the suite must pass on a shared machine with
+two cores, where a process may wait for hundreds of milliseconds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import pytest
 
 from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_link import CanSettings, Heartbeat
+from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat
 from aeroloop.service.config import load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
@@ -30,7 +30,7 @@ from aeroloop.service.review.review import review
 from aeroloop.service.testing.fork_server import fork_server
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.process_group import free_rendezvous
-from tests.can.slcan_adapter import SlcanAdapter
+from tests.support.slcan_adapter import SlcanAdapter
 
 AEROLOOP: Final = [sys.executable, "-P", "-m", "aeroloop"]
 FIGURES: Final = {

@@ -1,4 +1,4 @@
-"""A link on a CAN bus, in one process: frames byte for byte, heartbeats, what is refused, and what becomes a fault."""
+"""CAN link in one process: frames byte for byte, heartbeats, refused frames, faults."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_link import (
+from aeroloop.protocol.transport.can_format import (
     COMMAND_ID,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     CanError,
-    CanLink,
     CanSettings,
     Heartbeat,
     check_widths,
     fingerprint,
     number_of,
 )
+from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.can.in_process import Flaws, Stranger, virtual
-from tests.protocol.gathering import PATIENCE_S, eventually
+from tests.support.can_in_process import Flaws, Stranger, virtual
+from tests.support.zenoh_network import PATIENCE_S, eventually
 
 PAPER = WireSpec()
 PERIOD_NS = 2_000_000

@@ -1,4 +1,4 @@
-"""A bus on which only changes are sent: in lockstep an empty frame stands for the others, in real time none comes."""
+"""On-change policy on a CAN bus: an empty frame for a silent tick in lockstep, no frame in real time."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.hosts.can_node import CanFront
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.transport.can_link import COMMAND_ID, MEASUREMENT_ID, CanLink
+from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
+from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil
-from tests.can.closed_loop import PATIENCE_S, run_on_bus
-from tests.can.in_process import Stranger, virtual
 from tests.can.test_relay import FIRST_MEASUREMENT_NS, NOW, PERIOD_NS, WATCHDOG_NS, Still, command, measurement
+from tests.support.can_closed_loop import PATIENCE_S, run_on_bus
+from tests.support.can_in_process import Stranger, virtual
 
 POLICIES: list[tuple[Policy, Policy]] = [
     ("on_change", "on_change"),

@@ -1,7 +1,7 @@
-"""The two sides of a CAN bus, without the other: what the bridge lets pass, and whom the node follows.
+"""Relay of the bridge and node on a CAN bus, each without the other: frames passed on, commands obeyed.
 
-The relay is sans-I/O, so its promises about time are exact to the nanosecond. The node has a real endpoint and a bus
-inside this process; its loop is turned by the test.
+The relay is sans-I/O, so its times are exact to the nanosecond. The node has a real endpoint and a bus inside this
+process; the test steps its loop.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Outcome
-from aeroloop.protocol.transport.can_link import (
+from aeroloop.protocol.transport.can_format import (
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
-    CanLink,
     CanSettings,
     Heartbeat,
     fingerprint,
 )
+from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.can.in_process import Flaws, Stranger, virtual
-from tests.protocol.gathering import PATIENCE_S
+from tests.support.can_in_process import Flaws, Stranger, virtual
+from tests.support.zenoh_network import PATIENCE_S
 
 WIRE = WireSpec()
 PERIOD_NS = 2_000_000

@@ -1,7 +1,7 @@
-"""SocketCAN itself: frames, links and the closed loop on `vcan0`, wherever it has to come from.
+"""SocketCAN: frames, links and the closed loop on a `vcan0` from tests/support/kernel.py.
 
-The tests that need `vcan0` are in a class that pytest collects only where it is up. The test outside runs pytest on
-this file once more, where it is.
+Pytest collects the class of tests on `vcan0` only where `vcan0` is up. The test outside the class runs pytest on this
+file once more where it is.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ import can
 import pytest
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_link import CanLink, CanSettings, Heartbeat
+from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat
+from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
-from tests.can.closed_loop import run_on_bus
-from tests.can.in_process import virtual
-from tests.can.kernel import NoSocketCan, run_with_socketcan, vcan_is_up
-from tests.protocol.gathering import eventually
+from tests.support.can_closed_loop import run_on_bus
+from tests.support.can_in_process import virtual
+from tests.support.kernel import NoSocketCan, run_with_socketcan, vcan_is_up
+from tests.support.zenoh_network import eventually
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -1,10 +1,10 @@
-"""Clocks that are wrong, step, or run fast at either end: loop, watchdog, log, review and replay are as without.
+"""Clocks that are wrong, step or run fast at either end: loop, watchdog, log, review and replay must not change.
 
-libfaketime gives one process another clock, as far as it can (0.9.10, Python 3.11). With a true monotonic clock it
-breaks clock_nanosleep, by which the plant and the recorder sleep; with a false one sem_clockwait, by which a controller
-waits. So the controller's clock is false but for the monotonic one, and all of the plant's are. What remains, steps of
-the plant's and the recorder's clocks and a controller whose clock runs fast, is done to Python's `time`, through which
-alone this program reads clocks.
+libfaketime gives one process another clock, with limits (0.9.10, Python 3.11). With a true monotonic clock it breaks
+clock_nanosleep, in which plant and recorder sleep; with a false one it breaks sem_clockwait, in which a controller
+waits. So the controller's clocks are false except for the monotonic one, and all of the plant's are false. The other
+cases, steps of the plant's and the recorder's clocks and a fast clock of the controller, patch Python's `time`, the
+only way in which this program reads clocks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What goes wrong, on real processes: each time 0 V in time, the cause named, recovery as promised, and a whole log.
+"""Faults on real processes: 0 V in time, the cause in the log, recovery, and a whole log.
 
-How soon the motors are at 0 V is read from the log: publication times of the last command and of the truth, which is
-told at every tick here. To the watchdog's 100 ms comes the slack that a test on a shared machine with two cores needs.
+The time to 0 V comes from the log: times of the last command and of the truth, which is published at every tick here.
+Bounds are the watchdog's 100 ms plus slack for a shared machine with two cores.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.models import Event, Truth
 from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.process_group import free_rendezvous
-from tests.hil.cable import Cable
+from tests.support.cable import Cable
 
 AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 WATCHDOG_S = 0.1

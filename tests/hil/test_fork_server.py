@@ -1,4 +1,4 @@
-"""The fork server: exit codes, signals, and nothing left behind, however a process ends."""
+"""Fork server: exit codes, signals, and no process left behind, however a process ends."""
 
 from __future__ import annotations
 

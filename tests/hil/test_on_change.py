@@ -1,6 +1,6 @@
-"""A loop that sends only what is new, as a user runs it: real processes, an operator's verbs, and what its log tells.
+"""On-change policy on real processes: frames sent, an operator's verbs, and the log.
 
-Most of it looks at one run in real time, of a body at rest that an operator turns and that rests again.
+Most tests share one run in real time of a body at rest that an operator turns and that rests again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What an operator can do to a running loop, by the command line, and what the log says of it afterwards."""
+"""Operator's verbs on a running loop, by the command line, and their traces in the log."""
 
 from __future__ import annotations
 

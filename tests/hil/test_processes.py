@@ -1,8 +1,7 @@
-"""The whole system as a user starts it: real processes, real sockets, real logs.
+"""Whole system as a user starts it: real processes, real sockets, real logs.
 
-What can be proved in lockstep is proved there, where the clock does not matter. What needs real time says how much
-slack it allows: this suite must pass on a shared machine with two cores, where a process can be kept waiting for
-hundreds of milliseconds.
+Tests that need no clock run in lockstep. A test in real time states its slack: the suite must pass on a shared machine
+with two cores, where a process may wait for hundreds of milliseconds.
 """
 
 from __future__ import annotations

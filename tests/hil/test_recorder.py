@@ -1,7 +1,7 @@
-"""The recorder as a process beside a running loop: late, killed, cut off, rotated, on a disk that is really full.
+"""Recorder process beside a running loop: late, killed, cut off, rotated, on a full disk.
 
-Each end writes down every tick and keeps the last minute of it, so a log lacks no tick of either end in any of these
-cases; `log review` and `log replay` say so.
+Each end caches its last minute of trace, so in all of these cases a log lacks no tick of either end; `log review` and
+`log replay` confirm it.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
-from tests.hil.cable import Cable
 from tests.hil.test_processes import AEROLOOP, aeroloop, events, eventually
-from tests.protocol.gathering import free_port
+from tests.support.cable import Cable
+from tests.support.zenoh_network import free_port
 
 RATE = 100
 """Slow, so that several of these tests run beside each other: most of their time they wait."""

@@ -1,4 +1,4 @@
-"""Daemons as services: they tell the service manager how they are, and log what it can read."""
+"""Daemons under systemd: notifications of readiness, life and stop; unit files and their command lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SPEC.md and the code say the same: its golden vectors are read from the text itself and tried on the code."""
+"""SPEC.md against the code: golden vectors are parsed from the text and tried on the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A configuration whose counter of frames is too short to show that a frame is late is refused, with what would do."""
+"""Counter bits: a frame counter too short to detect late frames is refused, with a remedy."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Sensors and motors that fail: what the loop does about it, in lockstep and in one process, each with its bound.
+"""Sensor and motor faults in lockstep in one process: the response of the loop, each with its bound.
 
-A fault that the loop cannot ride out ends at 0 V with its cause named. The bounds of those that it can are twice what
-was measured, so that another random number does not break them, and far from what a loop that diverges would give.
+A fault that the loop cannot ride out ends at 0 V with its cause named. For the others the bound is twice the measured
+value, so that another random number does not break it, and far below that of a diverging loop.
 """
 
 from __future__ import annotations

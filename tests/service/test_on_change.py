@@ -1,4 +1,4 @@
-"""Sending only on change costs nothing but frames: in lockstep the same figures to the last bit, in fewer of them."""
+"""On-change policy in lockstep: the same figures to the last bit, with fewer frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever quantizer a signal names, the whole loop has it: experiment, log, replay, certificate and command line."""
+"""Kinds of quantizers through the whole loop: experiment, log, replay, certificate and command line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aeroloop.service.logs.replay import SessionReplay, replay
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.review import read, review
 from aeroloop.service.theorem.certificate import Certificate, certify
-from tests.service.logs.made_log import AN_OPERATORS_WORDS, lockstep, make_log
+from tests.support.made_log import AN_OPERATORS_WORDS, lockstep, make_log
 
 SIGNALS = ("attitude", "rate", "voltage")
 OTHERS = [kind for kind in get_args(Kind) if kind != "uniform"]

@@ -1,10 +1,10 @@
-"""A free rigid body with three motors, by another law than the paper's, through full turns and quantized feedback.
+"""Free rigid body with three motors and its own inertia, B and gains, through full turns and quantized feedback.
 
-The plant's own q turns on and on and never jumps; the law sees only what the frames say of ε. Whatever the bits, it
-must see the same q but for the quantizers, and so neither let go of the body nor shake it by more than their steps.
+The plant's q turns on without a jump; the law receives only the quantized ε of the frames. For any number of bits it
+must reconstruct the same q up to the quantizers, and neither lose the body nor shake it by more than their steps.
 
-How much the law's moment M = B u can change with what it is told is worked out in `_Slopes`; both the largest step of
-a voltage between two ticks and the largest attitude error follow from it.
+`_Slopes` derives how much the law's moment M = B u can change with its inputs; the largest step of a voltage between
+two ticks and the largest attitude error follow from it.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import Settings, load, with_bits
 from aeroloop.service.control.controller import Controller
-from tests.service import numpy_twin as twin
-from tests.service.numpy_twin import Array
-from tests.service.twin_body import body_of
+from tests.support import numpy_twin as twin
+from tests.support.numpy_twin import Array
+from tests.support.twin_body import body_of
 
 BODY = (
     "inertia=[0.03, 0.02, 0.025]",

@@ -1,6 +1,6 @@
-"""Quanser's board as a process: a driver that the board's clock paces, and that shows its state on the lights.
+"""Driver of Quanser's board: the board's clock paces it, the board's lights show its state.
 
-The amplifier is on while there is a session, and off otherwise, whatever the outputs say.
+The amplifier is on during a session only, whatever the analog outputs are.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from aeroloop.protocol.wire.spec import WireSpec
 
 
 class BoardDriver(Driver):
-    """Drives the Aero on Quanser's board, or on the fake of it with `via = "quanser-fake"`.
+    """Drives the Aero on Quanser's board, or on the fake board with `via = "quanser-fake"`.
 
     Args:
-        loop: The grid; the board keeps it.
-        wire: How frames are read and written.
-        settings: The board, and how the plant end looks after itself.
-        stop: Set when it is to end.
+        loop: Loop settings; the board's clock keeps the period.
+        wire: Format of the frames.
+        settings: The board, watchdog and limits.
+        stop: Set to end the loop.
 
     Raises:
         QuanserError: The interface is missing, or the board cannot be opened.
@@ -43,9 +43,9 @@ class BoardDriver(Driver):
         super().__init__(self._board, loop, wire, settings, stop)
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        self._show()  # a claim or a release that came since the last tick
+        self._show()  # after a claim or a release since the last tick
         echo = super()._tick(arrival, k)
-        self._show()  # what the tick itself has changed, a trip first of all
+        self._show()  # after a trip or a first command in the tick
         return echo
 
     def _show(self) -> None:

@@ -1,52 +1,59 @@
-"""A stand-in for `quanser.hardware`, with an emulated Aero on the board.
+"""Fake of `quanser.hardware`: a board with an emulated Aero, for tests and `plant.via = "quanser-fake"`.
 
-What Quanser's documentation says of the interface holds here: types and channels, what must come before what, a reader
-task with a buffer that overflows, a watchdog that takes the outputs and keeps them. Where the documentation is silent
-it is as unhelpful as a board might be: a watchdog that has not expired refuses to be cleared, and clearing one that has
-puts the outputs back to what they were. A wrong use raises MisuseError, which nothing takes for a board's failure.
+It follows Quanser's documentation: types and channels, the order of calls, overflows of a reader task's buffer, a
+watchdog that takes over the outputs and holds them. Where the documentation is silent it does the worst that a board
+might: a watchdog that has not expired refuses to be cleared, and clearing an expired one restores the outputs of before
+the expiry. A wrong use raises MisuseError, which no code treats as a failure of the board.
 
-The board's time is a count of samples. With `realtime` they come due on an absolute grid, whether anybody reads them or
-not; without, `task_read` lets the next period pass at once, so that a run repeats bit for bit. Before the task is
-started no time passes. Not emulated: rotor encoders, accelerometer, tachometers and currents, which read 0; more than
-one task; writer tasks, PWM and digital inputs; a clear that fails for good.
+The board's time is a count of samples. With `realtime` samples fall due on an absolute grid, read or not; without,
+`task_read` lets the next period pass at once, so that a run repeats bit for bit. No time passes before the task is
+started. Not emulated: rotor encoders, accelerometer, tachometers and currents, which read 0; more than one task; writer
+tasks, PWM and digital inputs; a clear that fails permanently.
 """
+# ruff: noqa: D102 (interface.Board describes the calls)
 
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partialmethod
 from math import atan2, ceil, isnan, pi
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from aeroloop.plant_emulator.hosts.quanser.interface import Board, Channels, Counts, Doubles, Lines
+from aeroloop.plant_emulator.hosts.quanser.interface import Board, Channels, Counts
 from aeroloop.plant_emulator.plant import State
 from aeroloop.plant_emulator.settings import PlantSettings
 
 BOARDS: Final = {"quanser_aero2_usb": (2048, 2048, 2880, 4096), "quanser_aero_usb": (2048, 2048, 2048, 4096)}
 """Encoder counts a turn: rotors, pitch, yaw."""
-LARGEST_VOLTAGE: Final = 24.0
-"""Of a motor [V]."""
 
-_ANALOG: Final = frozenset({0, 1})
-_DIGITAL: Final = frozenset({0, 1})
-_ENCODERS: Final = frozenset(range(4))
-_OTHER_INPUTS: Final = frozenset({*range(3000, 3003), *range(4000, 4003), *range(14000, 14004)})
-_LEDS: Final = frozenset(range(11000, 11003))
+_ENCODERS: Final = range(4)
+_OTHER_INPUTS: Final = (*range(3000, 3003), *range(4000, 4003), *range(14000, 14004))
 _CALLS_KEPT: Final = 10_000
+
+Kind = Literal["analog", "digital", "other"]
+
+_OUTPUTS: Final[dict[Kind, tuple[range, Any, Any, float, float]]] = {
+    "analog": (range(2), np.float64, np.float64, -24.0, 24.0),  # voltages of the motors [V]
+    "digital": (range(2), np.int8, np.int32, 0, 1),  # amplifiers of the motors
+    "other": (range(11000, 11003), np.float64, np.float64, 0.0, 1.0),  # red, green, blue
+}
+"""Channels, types of the values written and of those at expiry, least and largest value."""
 
 
 class MisuseError(AssertionError):
-    """The interface was used as it must not be."""
+    """A call that the interface does not allow."""
 
 
 class HILError(Exception):
-    """The board refuses or fails."""
+    """The board refuses a call or fails."""
 
     def get_error_message(self) -> str:
-        """What went wrong."""
+        """Message of the error."""
         return str(self.args[0])
 
 
@@ -57,7 +64,7 @@ class Clock:
 
 
 class BufferOverflowMode:
-    """What happens to samples that nobody reads in time."""
+    """What happens to samples that are not read in time."""
 
     ERROR_ON_OVERFLOW = 0
     OVERWRITE_ON_OVERFLOW = 1
@@ -66,33 +73,27 @@ class BufferOverflowMode:
     SYNCHRONIZED = 4
 
 
+@dataclass
 class Task:
-    """A reader task: what it samples, and the samples that nobody has read.
+    """A reader task: its channels and its unread samples."""
 
-    Args:
-        size: Samples that its buffer holds.
-        encoders: Encoder channels.
-        other: Other channels.
-    """
-
-    def __init__(self, size: int, encoders: list[int], other: list[int]) -> None:
-        self.encoders, self.other = encoders, other
-        self.samples: deque[tuple[list[int], list[float]]] = deque(maxlen=size)
-        self.mode = BufferOverflowMode.ERROR_ON_OVERFLOW
-        self.overflows = 0
-        self.running = self.deleted = False
+    encoders: list[int]
+    other: list[int]
+    samples: deque[tuple[list[int], list[float]]]
+    mode: int = BufferOverflowMode.ERROR_ON_OVERFLOW
+    overflows: int = 0
+    running: bool = False
+    deleted: bool = False
 
     @property
     def full(self) -> bool:
         """Whether a further sample would overflow."""
         return len(self.samples) == self.samples.maxlen
 
-    def offer(self, encoders: list[int], other: list[float]) -> None:
-        """Take in a sample, as the overflow mode says."""
-        if self.full:
-            self.overflows += 1
-        if not self.full or self.mode == BufferOverflowMode.OVERWRITE_ON_OVERFLOW:
-            self.samples.append((encoders, other))
+    @property
+    def waiting(self) -> bool:
+        """Whether the board waits for its reader, and time with it."""
+        return self.full and self.mode == BufferOverflowMode.WAIT_ON_OVERFLOW
 
 
 class FakeQuanser:
@@ -101,22 +102,23 @@ class FakeQuanser:
     Args:
         settings: The Aero. Its joints have the card's encoders, and its IMU the gyro of `settings.sensors`.
         period: Time between samples [s].
-        card_type: SessionKey board is plugged in, a key of BOARDS.
-        realtime: Whether samples come due by the clock, or when they are read.
+        card_type: Type of the board, a key of BOARDS.
+        realtime: Whether samples fall due by the clock, or when they are read.
 
     Raises:
         ValueError: Not an Aero.
 
     Attributes:
         HIL: Makes a board's handle, as the class in the module does.
-        calls: Names of the calls, the last 10 000.
+        calls: Names of the last 10 000 calls.
         time: Samples since the task was started.
         analog: Voltages on the analog outputs [V].
-        enabled: Whether each motor's amplifier is.
+        enabled: 1 for each motor's amplifier that is on.
         leds: Red, green, blue.
-        expired: Whether the watchdog has.
-        reads_while_expired: Whether a reader task goes on while the outputs are held; the documentation is silent.
-        counts_overflows: Whether it can tell how many samples were lost.
+        expired: Whether the watchdog has expired.
+        shorts: So many `task_read` return without a sample from now on.
+        reads_while_expired: Whether reads succeed after the watchdog has expired; the documentation is silent.
+        counts_overflows: Whether the board counts lost samples.
     """
 
     HILError: type[Exception] = HILError
@@ -124,16 +126,11 @@ class FakeQuanser:
     BufferOverflowMode: Any = BufferOverflowMode
 
     def __init__(
-        self,
-        settings: PlantSettings,
-        period: float,
-        *,
-        card_type: str = "quanser_aero2_usb",
-        realtime: bool = False,
+        self, settings: PlantSettings, period: float, *, card_type: str = "quanser_aero2_usb", realtime: bool = False
     ) -> None:
         if settings.kind != "aero":
             raise ValueError("behind Quanser's board there is an Aero: set plant.kind to 'aero'")
-        self.HIL = self._handle
+        self.HIL: Callable[[], Board] = lambda: FakeHIL(self)
         self.card_type, self.period, self.realtime = card_type, period, realtime
         self.calls: deque[str] = deque(maxlen=_CALLS_KEPT)
         self.reads_while_expired = self.counts_overflows = True
@@ -144,26 +141,25 @@ class FakeQuanser:
 
         self.holder: FakeHIL | None = None
         self.task: Task | None = None
-        self.time = 0
-        self.analog, self.enabled, self.leds = [0.0, 0.0], [False, False], [0.0, 0.0, 0.0]
-        self.at_expiry: dict[str, list[Any]] = {}
+        self.time = self.shorts = 0
+        self.analog, self.enabled, self.leds = [0.0, 0.0], [0, 0], [0.0, 0.0, 0.0]
+        self.outputs: dict[Kind, list[Any]] = {"analog": self.analog, "digital": self.enabled, "other": self.leds}
+        self.at_expiry: dict[Kind, list[Any]] = {}
+        self.before_expiry: dict[Kind, list[Any]] = {}
         self.expired = False
-        self.watchdog: int | None = None  # samples that it lets pass; None: it does not run
-        self._before_expiry: list[list[Any]] = [[], [], []]
-        self._reloaded = 0
-        self._raw = [0, 0, 0, 0]
-        self._zeros = [0, 0, 0, 0]
+        self.watchdog: int | None = None  # its timeout in samples; None: it does not run
+        self.reloaded = 0  # time of the watchdog's last reload
+        self.started_ns = 0
+        self._raw, self._zeros = [0, 0, 0, 0], [0, 0, 0, 0]
         self._unplugged = False
-        self._failing: dict[str, int] = {}
-        self._short = 0
-        self._started_ns = 0
+        self._failing: Counter[str] = Counter()
         self._count()
 
-    # ── for whoever tests ──
+    # ── for tests ──
 
     @property
     def motor_voltages(self) -> tuple[float, ...]:
-        """Voltages that reach the motors [V]: 0 where the amplifier is off."""
+        """Voltages at the motors [V]: 0 where the amplifier is off."""
         return tuple(volts if on else 0.0 for volts, on in zip(self.analog, self.enabled, strict=True))
 
     def truth(self) -> State:
@@ -177,36 +173,39 @@ class FakeQuanser:
         self._failing[call] = n
 
     def short_next(self, n: int = 1) -> None:
-        """Let the next n `task_read` return without a sample, as those of a task that was stopped do."""
-        self._short = n
+        """Let the next n `task_read` return without a sample, as those of a stopped task do."""
+        self.shorts = n
 
     def unplug(self) -> None:
-        """Take the board off the computer: every call fails from now on. The board itself goes on."""
+        """Disconnect the board from the computer: every call fails from now on, the board runs on."""
         self._unplugged = True
 
     def let_pass(self, periods: int) -> None:
-        """Let periods pass while nobody reads."""
+        """Let periods pass without a read."""
         for _ in range(periods):
             self.step()
 
-    # ── the board ──
+    def set_counts(self, channel: int, count: int) -> None:
+        """Set an encoder's present count."""
+        self._zeros[channel] = self._raw[channel] - count
 
-    def _handle(self) -> Board:
-        return FakeHIL(self)
+    # ── the board ──
 
     def step(self) -> None:
         """Let one period pass."""
         task = self.task
         if task is None or not task.running:
             raise MisuseError("no task runs, so there is no sample to wait for")
-        if task.full and task.mode == BufferOverflowMode.WAIT_ON_OVERFLOW:
+        if task.waiting:
             return
-        self.look_at_watchdog()
+        self._check_watchdog()
         self._plant.actuate(self.motor_voltages)
         self._plant.advance()
         self.time += 1
         self._count()
-        task.offer(*self.sample(task.encoders, task.other))
+        task.overflows += task.full
+        if not task.full or task.mode == BufferOverflowMode.OVERWRITE_ON_OVERFLOW:
+            task.samples.append(self.sample(task.encoders, task.other))
 
     def wait(self) -> None:
         """Let periods pass until there is a sample to read."""
@@ -216,69 +215,45 @@ class FakeQuanser:
                 time.sleep(ahead * 1e-9)
             self.step()
 
-    def start(self) -> None:
-        """Begin to sample."""
-        self._started_ns = time.monotonic_ns() - round(self.time * self.period * 1e9)
-
     def sample(self, encoders: Sequence[int], other: Sequence[int]) -> tuple[list[int], list[float]]:
-        """What these channels read now."""
+        """Present values of these channels."""
         counts = [self._raw[channel] - self._zeros[channel] for channel in encoders]
         gyro = self._plant.measure().rate
         return counts, [gyro[channel - 3000] if channel in range(3000, 3003) else 0.0 for channel in other]
 
-    def set_counts(self, channel: int, count: int) -> None:
-        """Let an encoder read this count now."""
-        self._zeros[channel] = self._raw[channel] - count
-
-    def look_at_watchdog(self) -> None:
-        """Let the watchdog expire if its time is over."""
-        if self.watchdog is None or self.expired or self.time - self._reloaded < self.watchdog:
-            return
-        self.expired = True
-        self._before_expiry = [self.analog, self.enabled, self.leds]
-        self.analog, self.enabled = list(self.at_expiry["analog"]), list(self.at_expiry["digital"])
-        self.leds = list(self.at_expiry.get("other", self.leds))
-
-    def reload(self) -> None:
-        """The watchdog counts from 0 again."""
-        self._reloaded = self.time
-
-    def clear(self) -> None:
-        """Give the outputs back, as they were."""
-        self.analog, self.enabled, self.leds = self._before_expiry
-        self.expired = False
-        self._reloaded = self.time
-
     def called(self, name: str) -> None:
-        """Note a call, and let it fail if it shall. Samples that are due by now have come."""
+        """Record a call and fail it if a test requested that. Samples due by now are taken first."""
         self.calls.append(name)
         if self.realtime and self.task is not None and self.task.running:
-            full = self.task.mode == BufferOverflowMode.WAIT_ON_OVERFLOW
-            while time.monotonic_ns() >= self._due_ns() and not (full and self.task.full):
+            while time.monotonic_ns() >= self._due_ns() and not self.task.waiting:
                 self.step()
-        self.look_at_watchdog()
-        if self._unplugged:
-            raise HILError("the board is not connected")
-        if self._failing.get(name, 0):
+        self._check_watchdog()
+        _refuse(self._unplugged, "the board is not connected")
+        if self._failing[name]:
             self._failing[name] -= 1
             raise HILError(f"{name} was told to fail")
 
-    def falls_short(self) -> bool:
-        """Whether this `task_read` is to return without a sample."""
-        if self._short:
-            self._short -= 1
-            return True
-        return False
+    def restore(self, outputs: dict[Kind, list[Any]]) -> None:
+        """Set outputs by their kind."""
+        for kind, values in outputs.items():
+            self.outputs[kind][:] = values
+
+    def _check_watchdog(self) -> None:
+        """Let the watchdog expire if its time is over."""
+        if self.watchdog is not None and not self.expired and self.time - self.reloaded >= self.watchdog:
+            self.expired = True
+            self.before_expiry = {kind: list(values) for kind, values in self.outputs.items()}
+            self.restore(self.at_expiry)
 
     def _due_ns(self) -> int:
-        """When the next sample comes, on `time.monotonic_ns()`."""
-        return self._started_ns + round((self.time + 1) * self.period * 1e9)
+        """Time of the next sample, on `time.monotonic_ns()`."""
+        return self.started_ns + round((self.time + 1) * self.period * 1e9)
 
     def _count(self) -> None:
-        """Turn encoders 2 and 3 to where the emulated ones, counts themselves, say that the joints are."""
+        """Set encoders 2 and 3 to the joint angles, which the emulated encoders have already quantized to counts."""
         w, x, y, z = self._plant.measure().attitude
         if isnan(w):
-            self._unplugged = True  # an Aero that has left the numbers has no encoders
+            self._unplugged = True  # the emulated state is not finite
             return
         pitch = atan2(2 * (w * y - x * z), 1 - 2 * (x * x + y * y))  # R = R_z(yaw) R_y(pitch)
         yaw = atan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z))
@@ -289,7 +264,7 @@ class FakeQuanser:
 
 
 class FakeHIL:
-    """A handle of the board: checks every call, then lets the board do it.
+    """Handle of the board: checks every call and passes it to the board. `interface.Board` describes the calls.
 
     Args:
         device: The board.
@@ -297,25 +272,22 @@ class FakeHIL:
 
     def __init__(self, device: FakeQuanser) -> None:
         self._device = device
-        self._set: set[str] = set()  # expiration states
+        self._set: set[Kind] = set()  # kinds of expiration states set by this handle
 
     def open(self, card_type: str, card_identifier: str, /) -> None:
-        """Take hold of the board."""
         device = self._device
         device.called("open")
-        if not isinstance(card_type, str) or not isinstance(card_identifier, str):
-            raise MisuseError("a board is named by two strings")
-        if card_type != device.card_type or card_identifier.split("@")[0] != "0":
-            raise HILError(f"there is no {card_type} '{card_identifier}'")
-        if device.holder is self:
-            raise MisuseError("open is called twice")
-        if device.holder is not None:
-            raise HILError("the board is in use")
+        strings = isinstance(card_type, str) and isinstance(card_identifier, str)
+        _require(strings, "a board is named by two strings")
+        there = card_type == device.card_type and card_identifier.split("@")[0] == "0"
+        _refuse(not there, f"there is no {card_type} '{card_identifier}'")
+        _require(device.holder is not self, "open is called twice")
+        _refuse(device.holder is not None, "the board is in use")
         device.holder = self
         self._virtual = "@" in card_identifier
 
     def close(self) -> None:
-        """Let go of it. The outputs stay as they are; what is left of a task goes. No harm if it is not open."""
+        """Close the board and drop its task. Outputs stay as they are. Nothing happens if it is not open."""
         device = self._device
         if device.holder is not self:
             device.calls.append("close")
@@ -324,313 +296,230 @@ class FakeHIL:
         device.called("close")
 
     def is_valid(self) -> bool:
-        """Whether it is held."""
+        """Whether this handle has the board open."""
         return self._device.holder is self
 
     # ── immediate input and output ──
 
-    def write_analog(self, channels: Channels, n: int, volts: Doubles, /) -> None:
-        """Set motors' voltages [V]."""
-        names = self._output("write_analog", channels, n, _ANALOG, volts, np.float64)
-        if not all(abs(value) <= LARGEST_VOLTAGE for value in volts.tolist()):  # NaN is none, either
-            raise MisuseError(f"motors take ±{LARGEST_VOLTAGE:g} V, not {volts.tolist()}")
+    def _write(self, kind: Kind, channels: Channels, n: int, values: Any) -> None:
+        self._begin(f"write_{kind}")
+        there, dtype, _, low, high = _OUTPUTS[kind]
+        numbers = _numbers(channels, n, there)
+        _array(values, dtype, n)
+        within = all(low <= value <= high for value in values.tolist())  # false for NaN
+        _require(within, f"{kind} outputs take {low:g} to {high:g}, not {values.tolist()}")
         self._refuse_if_expired()
-        for channel, value in zip(names, volts.tolist(), strict=True):
-            self._device.analog[channel] = value
+        unguarded = kind == "digital" and values.any() and self._device.watchdog is None
+        _require(not unguarded, "an amplifier is switched on while no watchdog runs")
+        for number, value in zip(numbers, values.tolist(), strict=True):
+            self._device.outputs[kind][number - there[0]] = value
 
-    def write_digital(self, channels: Channels, n: int, lines: Lines, /) -> None:
-        """Enable motors' amplifiers, under a watchdog."""
-        names = self._output("write_digital", channels, n, _DIGITAL, lines, np.int8)
-        if not set(lines.tolist()) <= {0, 1}:
-            raise MisuseError(f"a digital line is 0 or 1, not {lines.tolist()}")
-        self._refuse_if_expired()
-        if lines.any() and self._device.watchdog is None:
-            raise MisuseError("an amplifier is enabled while no watchdog runs")
-        for channel, value in zip(names, lines.tolist(), strict=True):
-            self._device.enabled[channel] = bool(value)
-
-    def write_other(self, channels: Channels, n: int, values: Doubles, /) -> None:
-        """Set lights."""
-        names = self._output("write_other", channels, n, _LEDS, values, np.float64)
-        if not all(0 <= value <= 1 for value in values.tolist()):
-            raise MisuseError(f"a light is 0…1, not {values.tolist()}")
-        self._refuse_if_expired()
-        for channel, value in zip(names, values.tolist(), strict=True):
-            self._device.leds[channel - 11000] = value
+    write_analog = partialmethod(_write, "analog")
+    write_digital = partialmethod(_write, "digital")
+    write_other = partialmethod(_write, "other")
 
     def set_encoder_counts(self, channels: Channels, n: int, counts: Counts, /) -> None:
-        """Say what encoders read now."""
-        names = self._output("set_encoder_counts", channels, n, _ENCODERS, counts, np.int32)
+        self._begin("set_encoder_counts")
+        numbers = _numbers(channels, n, _ENCODERS)
+        _array(counts, np.int32, n)
         self._refuse_if_expired()
-        for channel, count in zip(names, counts.tolist(), strict=True):
+        for channel, count in zip(numbers, counts.tolist(), strict=True):
             self._device.set_counts(channel, count)
 
-    def read(
-        self,
-        analog: Channels | None,
-        n_analog: int,
-        encoders: Channels | None,
-        n_encoders: int,
-        digital: Channels | None,
-        n_digital: int,
-        other: Channels | None,
-        n_other: int,
-        analog_buffer: Doubles | None,
-        encoder_buffer: Counts | None,
-        digital_buffer: Lines | None,
-        other_buffer: Doubles | None,
-        /,
-    ) -> None:
-        """Read inputs at once."""
+    def read(self, *inputs_and_buffers: Any) -> None:
         self._begin("read")
-        _none("read", analog, n_analog, digital, n_digital)
-        _no_buffer("read", analog_buffer, digital_buffer)
-        names = _names(encoders, n_encoders, _ENCODERS), _names(other, n_other, _OTHER_INPUTS)
-        _array(encoder_buffer, np.int32, len(names[0]), writeable=True)
-        _array(other_buffer, np.float64, len(names[1]), writeable=True)
+        inputs, buffers = inputs_and_buffers[:8], inputs_and_buffers[8:]
+        numbers = _inputs(*inputs)
+        _check_buffers(*numbers, *buffers)
         self._refuse_if_expired()
-        _fill(self._device.sample(*names), encoder_buffer, other_buffer)
+        _fill(self._device.sample(*numbers), *buffers)
 
     # ── the reader task ──
 
-    def task_create_reader(
-        self,
-        samples_in_buffer: int,
-        analog: Channels | None,
-        n_analog: int,
-        encoders: Channels | None,
-        n_encoders: int,
-        digital: Channels | None,
-        n_digital: int,
-        other: Channels | None,
-        n_other: int,
-        /,
-    ) -> object:
-        """A task, which does not run yet."""
+    def task_create_reader(self, samples_in_buffer: int, /, *inputs: Any) -> object:
         self._begin("task_create_reader")
-        _none("task_create_reader", analog, n_analog, digital, n_digital)
-        if type(samples_in_buffer) is not int or samples_in_buffer < 1:
-            raise MisuseError(f"a buffer holds one sample or more, not {samples_in_buffer!r}")
-        if self._device.task is not None:
-            raise HILError("this board has one task")
-        names = _names(encoders, n_encoders, _ENCODERS), _names(other, n_other, _OTHER_INPUTS)
-        self._device.task = Task(samples_in_buffer, *names)
+        numbers = _inputs(*inputs)
+        holds = type(samples_in_buffer) is int and samples_in_buffer >= 1
+        _require(holds, f"a buffer holds one sample or more, not {samples_in_buffer!r}")
+        _refuse(self._device.task is not None, "this board has one task")
+        self._device.task = Task(*numbers, deque(maxlen=samples_in_buffer))
         return self._device.task
 
     def task_set_buffer_overflow_mode(self, task: Any, mode: int, /) -> None:
-        """What happens to samples that nobody reads in time."""
-        self._begin("task_set_buffer_overflow_mode")
-        self._known(task)
-        if task.running:
-            raise MisuseError("the overflow mode is set while the task runs")
-        if mode >= BufferOverflowMode.WAIT_ON_OVERFLOW and not self._virtual:
-            raise HILError("only virtual boards can wait for their reader")
+        self._begin("task_set_buffer_overflow_mode", task)
+        _require(not task.running, "the overflow mode is set while the task runs")
+        waits = mode >= BufferOverflowMode.WAIT_ON_OVERFLOW
+        _refuse(waits and not self._virtual, "only virtual boards can wait for their reader")
         task.mode = mode
 
     def task_get_buffer_overflows(self, task: Any, /) -> int:
-        """Samples lost since the task was started."""
-        self._begin("task_get_buffer_overflows")
-        overflows = self._known(task).overflows
-        if not self._device.counts_overflows:
-            raise HILError("this board does not count overflows")
-        return overflows
+        self._begin("task_get_buffer_overflows", task)
+        _refuse(not self._device.counts_overflows, "this board does not count overflows")
+        return int(task.overflows)
 
     def task_start(self, task: Any, clock: int, frequency: float, samples: int, /) -> None:
-        """Begin to sample, for ever and at the Aero's own period."""
         device = self._device
-        self._begin("task_start")
-        if self._known(task).running:
-            raise MisuseError("the task is started twice")
-        if clock != Clock.HARDWARE_CLOCK_0:
-            raise MisuseError("a hardware clock paces the loop")
-        if abs(frequency * device.period - 1) > 1e-9:
-            raise MisuseError(f"the emulated Aero steps at {1 / device.period:g} Hz, not at {frequency:g} Hz")
-        if samples != 2**32 - 1:
-            raise MisuseError("the task would end by itself")
+        self._begin("task_start", task)
+        _require(not task.running, "the task is started twice")
+        _require(clock == Clock.HARDWARE_CLOCK_0, "a hardware clock must pace the loop")
+        other = abs(frequency * device.period - 1) > 1e-9
+        _require(not other, f"the emulated Aero steps at {1 / device.period:g} Hz, not at {frequency:g} Hz")
+        _require(samples == 2**32 - 1, "the task would end by itself")
         task.running = True
         task.samples.clear()
         task.overflows = 0
-        device.start()
+        device.started_ns = time.monotonic_ns() - round(device.time * device.period * 1e9)
 
-    def task_read(
-        self,
-        task: Any,
-        samples: int,
-        analog_buffer: Doubles | None,
-        encoder_buffer: Counts | None,
-        digital_buffer: Lines | None,
-        other_buffer: Doubles | None,
-        /,
-    ) -> int:
-        """Wait for the oldest sample of the buffer. A failed read leaves the buffers as they were."""
+    def task_read(self, task: Any, samples: int, /, *buffers: Any) -> int:
         device = self._device
         failure: HILError | None = None
         try:
             self._begin("task_read")
         except HILError as error:
             failure = error
-        known = self._known(task)
-        if not known.running:
-            raise MisuseError("a task is read that was not started")
-        if samples != 1:
-            raise MisuseError(f"one sample makes a period, not {samples}")
-        _no_buffer("task_read", analog_buffer, digital_buffer)
-        _array(encoder_buffer, np.int32, len(known.encoders), writeable=True)
-        _array(other_buffer, np.float64, len(known.other), writeable=True)
+        _check_task(task)
+        _require(task.running, "a task is read that was not started")
+        _require(samples == 1, f"one sample makes a period, not {samples}")
+        _check_buffers(task.encoders, task.other, *buffers)
         if failure is None and device.expired and not device.reads_while_expired:
             failure = HILError("the watchdog has expired")
-        if failure is None and known.overflows and known.mode == BufferOverflowMode.ERROR_ON_OVERFLOW:
+        if failure is None and task.overflows and task.mode == BufferOverflowMode.ERROR_ON_OVERFLOW:
             failure = HILError("the task's buffer has overflowed")
-        if failure is None or not device.realtime:  # by the clock, the sample comes whether the read fails or not
+        if failure is None or not device.realtime:  # by the clock, the sample falls due whether the read fails or not
             device.wait()
-            sample = known.samples.popleft()
+            sample = task.samples.popleft()
         if failure is not None:
             raise failure
-        if device.falls_short():
+        if device.shorts:
+            device.shorts -= 1
             return 0
-        _fill(sample, encoder_buffer, other_buffer)
+        _fill(sample, *buffers)
         return 1
 
     def task_stop(self, task: Any, /) -> None:
-        """Sample no more."""
-        self._begin("task_stop")
-        if not self._known(task).running:
-            raise MisuseError("a task is stopped that does not run")
+        self._begin("task_stop", task)
+        _require(task.running, "a task is stopped that does not run")
         task.running = False
 
     def task_delete(self, task: Any, /) -> None:
-        """Give the task back."""
-        self._begin("task_delete")
-        if self._known(task).running:
-            raise HILError("the task still runs")
+        self._begin("task_delete", task)
+        _refuse(task.running, "the task still runs")
         task.deleted = True
         self._device.task = None
 
     # ── the watchdog ──
 
-    def watchdog_set_analog_expiration_state(self, channels: Channels, n: int, volts: Doubles, /) -> None:
-        """What voltages go to when it expires [V]."""
-        self._expiration("analog", channels, n, _ANALOG, volts, np.float64)
+    def _set_expiration(self, kind: Kind, channels: Channels, n: int, values: Any) -> None:
+        self._begin(f"watchdog_set_{kind}_expiration_state")
+        there, _, dtype, *_ = _OUTPUTS[kind]
+        numbers = _numbers(channels, n, there)
+        _array(values, dtype, n)
+        _require(self._device.watchdog is None, "an expiration state is set while the watchdog runs")
+        _require(numbers == list(there), f"an expiration state omits {kind} outputs")
+        self._device.at_expiry[kind] = values.tolist()
+        self._set.add(kind)
 
-    def watchdog_set_digital_expiration_state(self, channels: Channels, n: int, states: Counts, /) -> None:
-        """What amplifiers go to then: 0 for low, in an enumeration of 4 bytes."""
-        self._expiration("digital", channels, n, _DIGITAL, states, np.int32)
-
-    def watchdog_set_other_expiration_state(self, channels: Channels, n: int, values: Doubles, /) -> None:
-        """What lights go to then."""
-        self._expiration("other", channels, n, _LEDS, values, np.float64)
+    watchdog_set_analog_expiration_state = partialmethod(_set_expiration, "analog")
+    watchdog_set_digital_expiration_state = partialmethod(_set_expiration, "digital")
+    watchdog_set_other_expiration_state = partialmethod(_set_expiration, "other")
 
     def watchdog_start(self, timeout: float, /) -> None:
-        """Begin to count [s]."""
         device = self._device
         self._begin("watchdog_start")
-        if not timeout > 0:
-            raise MisuseError(f"a watchdog's time is positive, not {timeout}")
-        if not {"analog", "digital"} <= self._set:
-            raise MisuseError("the watchdog is started before it knows what to do")
-        if device.watchdog is not None:
-            raise MisuseError("the watchdog is started twice")
+        _require(timeout > 0, f"a watchdog's timeout is positive, not {timeout}")
+        _require({"analog", "digital"} <= self._set, "the watchdog is started before its expiration states are set")
+        _require(device.watchdog is None, "the watchdog is started twice")
         self._refuse_if_expired()
         device.watchdog = ceil(timeout / device.period - 1e-9)
-        device.reload()
+        device.reloaded = device.time
 
     def watchdog_reload(self) -> bool:
-        """Count from 0 again. False if it has expired."""
         self._begin("watchdog_reload")
-        if self._device.watchdog is None:
-            raise MisuseError("a watchdog is reloaded that does not run")
-        self._device.reload()
+        _require(self._device.watchdog is not None, "a watchdog is reloaded that does not run")
+        self._device.reloaded = self._device.time
         return not self._device.expired
 
     def watchdog_is_expired(self) -> bool:
-        """Whether it has."""
         self._begin("watchdog_is_expired")
         return self._device.expired
 
     def watchdog_clear(self) -> None:
-        """Let outputs be written again, and put them back to what they were."""
+        """Allow writes again, and restore the outputs of before the expiry."""
+        device = self._device
         self._begin("watchdog_clear")
-        if not self._device.expired:
-            raise HILError("the watchdog has not expired")
-        self._device.clear()
+        _refuse(not device.expired, "the watchdog has not expired")
+        device.restore(device.before_expiry)
+        device.expired = False
+        device.reloaded = device.time
 
     def watchdog_stop(self) -> None:
-        """Count no more. An expired one stays so."""
         self._begin("watchdog_stop")
         self._device.watchdog = None
 
     # ── checks ──
 
-    def _begin(self, call: str) -> None:
+    def _begin(self, call: str, *tasks: object) -> None:
         self._device.called(call)
-        if self._device.holder is not self:
-            raise MisuseError(f"{call} on a board that is not open")
+        _require(self._device.holder is self, f"{call} on a board that is not open")
+        for task in tasks:
+            _check_task(task)
 
     def _refuse_if_expired(self) -> None:
-        if self._device.expired:
-            raise HILError("the watchdog has expired")
-
-    def _known(self, task: object) -> Task:
-        if not isinstance(task, Task) or task.deleted:
-            raise MisuseError("there is no such task")
-        return task
-
-    def _output(
-        self, call: str, channels: Channels, n: int, there: frozenset[int], values: object, dtype: type[np.generic]
-    ) -> list[int]:
-        self._begin(call)
-        names = _names(channels, n, there)
-        _array(values, dtype, n)
-        return names
-
-    def _expiration(
-        self, kind: str, channels: Channels, n: int, there: frozenset[int], values: Any, dtype: type[np.generic]
-    ) -> None:
-        names = self._output(f"watchdog_set_{kind}_expiration_state", channels, n, there, values, dtype)
-        if self._device.watchdog is not None:
-            raise MisuseError("an expiration state is set while the watchdog runs")
-        if names != sorted(there):
-            raise MisuseError(f"an expiration state leaves {kind} outputs out")
-        self._device.at_expiry[kind] = [bool(value) if kind == "digital" else value for value in values.tolist()]
-        self._set.add(kind)
+        _refuse(self._device.expired, "the watchdog has expired")
 
 
-def _names(channels: object, n: int, there: frozenset[int]) -> list[int]:
-    """Channel numbers, of an array that C can read."""
+def _require(allowed: bool, message: str) -> None:
+    if not allowed:
+        raise MisuseError(message)
+
+
+def _refuse(refused: bool, message: str) -> None:
+    if refused:
+        raise HILError(message)
+
+
+def _check_task(task: object) -> None:
+    _require(isinstance(task, Task) and not task.deleted, "there is no such task")
+
+
+def _numbers(channels: Any, n: int, there: Sequence[int]) -> list[int]:
+    """Channel numbers, from an array that C can read."""
     if channels is None and n == 0:
         return []
-    if type(n) is not int or n < 1:
-        raise MisuseError(f"a number of channels is an int of 1 or more, not {n!r}")
+    _require(type(n) is int and n >= 1, f"a number of channels is an int of 1 or more, not {n!r}")
     _array(channels, np.uint32, n)
-    names: list[int] = channels.tolist()  # type: ignore[attr-defined]  # it is an array
-    if len(set(names)) != n or not set(names) <= there:
-        raise MisuseError(f"there are channels {sorted(there)}, each once, not {names}")
-    return names
+    numbers: list[int] = channels.tolist()
+    once = len(set(numbers)) == n and set(numbers) <= set(there)
+    _require(once, f"the channels are {list(there)}, each once, not {numbers}")
+    return numbers
 
 
-def _array(array: object, dtype: type[np.generic], n: int, *, writeable: bool = False) -> None:
-    """C sees bare memory: of another type or too short, it would be read wrongly, or past its end."""
+def _array(array: Any, dtype: type[np.generic], n: int, *, writeable: bool = False) -> None:
+    """Check an array for C, which would misread another type and read past the end of a shorter one."""
     if array is None and n == 0:
         return
-    if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != (n,):
-        said = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else repr(array)
-        raise MisuseError(f"an array of {n} {dtype.__name__} is wanted, not {said}")
-    if not array.flags.c_contiguous or (writeable and not array.flags.writeable):
-        raise MisuseError("the array is not C's to use: contiguous, and writeable where it is read into")
+    fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.shape == (n,)
+    _require(fits, f"an array of {n} {dtype.__name__} is required, not {array!r}")
+    usable = array.flags.c_contiguous and (array.flags.writeable or not writeable)
+    _require(usable, "C needs an array that is contiguous, and writeable if it is read into")
 
 
-def _none(call: str, analog: object, n_analog: int, digital: object, n_digital: int) -> None:
-    if analog is not None or n_analog or digital is not None or n_digital:
-        raise MisuseError(f"{call}: this stand-in reads encoders and other channels only")
+def _inputs(
+    analog: Any, n_analog: int, encoders: Any, n_encoders: int, digital: Any, n_digital: int, other: Any, n_other: int
+) -> tuple[list[int], list[int]]:
+    """Numbers of the encoder and the other channels to read."""
+    unread = analog is None and not n_analog and digital is None and not n_digital
+    _require(unread, "the fake reads encoders and other channels only")
+    return _numbers(encoders, n_encoders, _ENCODERS), _numbers(other, n_other, _OTHER_INPUTS)
 
 
-def _no_buffer(call: str, analog: object, digital: object) -> None:
-    if analog is not None or digital is not None:
-        raise MisuseError(f"{call}: a buffer without channels")
+def _check_buffers(encoders: list[int], others: list[int], analog: Any, counts: Any, digital: Any, other: Any) -> None:
+    _require(analog is None and digital is None, "a buffer without channels")
+    _array(counts, np.int32, len(encoders), writeable=True)
+    _array(other, np.float64, len(others), writeable=True)
 
 
-def _fill(sample: tuple[list[int], list[float]], encoders: Counts | None, other: Doubles | None) -> None:
-    if encoders is not None:
-        encoders[:] = sample[0]
-    if other is not None:
-        other[:] = sample[1]
+def _fill(sample: tuple[list[int], list[float]], _: None, counts: Any, __: None, other: Any) -> None:
+    for buffer, values in zip((counts, other), sample, strict=True):
+        if buffer is not None:
+            buffer[:] = values

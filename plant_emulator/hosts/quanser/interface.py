@@ -1,6 +1,6 @@
-"""Quanser's HIL interface, as far as it is used: what a board can be asked, and the types that each call takes.
+"""Types of the used part of Quanser's HIL interface.
 
-The interface comes with Quanser's SDK and is imported when a plant is made. Its arrays cross to C as bare memory, so
+The interface is part of Quanser's SDK and is imported when a plant is made. It passes arrays to C as bare memory, so
 their types are part of the call: channels uint32, analog and other float64, encoder counts int32, digital lines int8.
 """
 
@@ -23,17 +23,17 @@ Lines: TypeAlias = NDArray[np.int8]
 
 
 class QuanserError(AeroloopError):
-    """Quanser's board cannot be used; one line that says why."""
+    """Quanser's board cannot be used; the message is one line with the reason."""
 
 
 class Board(Protocol):
-    """What is used of `quanser.hardware.HIL`. Every call raises HILError where the board refuses."""
+    """Used part of `quanser.hardware.HIL`. Every call raises HILError if the board refuses it."""
 
     def open(self, card_type: str, card_identifier: str, /) -> None:
-        """Take hold of a board."""
+        """Open a board."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close it."""
 
     def write_analog(self, channels: Channels, n: int, volts: Doubles, /) -> None:
         """Set analog outputs [V]."""
@@ -45,7 +45,7 @@ class Board(Protocol):
         """Set other outputs."""
 
     def set_encoder_counts(self, channels: Channels, n: int, counts: Counts, /) -> None:
-        """Say what the encoders count now."""
+        """Set the encoders' present counts."""
 
     def read(
         self,
@@ -78,16 +78,16 @@ class Board(Protocol):
         n_other: int,
         /,
     ) -> object:
-        """A task that will sample inputs by a clock of the board."""
+        """Create a task that samples inputs by a clock of the board."""
 
     def task_set_buffer_overflow_mode(self, task: Any, mode: int, /) -> None:
-        """What happens to samples that nobody reads in time."""
+        """Set what happens to samples that are not read in time."""
 
     def task_get_buffer_overflows(self, task: Any, /) -> int:
-        """How many samples have been lost to others since the task was started."""
+        """Return the number of samples lost since the task was started."""
 
     def task_start(self, task: Any, clock: int, frequency: float, samples: int, /) -> None:
-        """Begin to sample at a frequency [Hz]."""
+        """Start sampling at a frequency [Hz]."""
 
     def task_read(
         self,
@@ -99,41 +99,41 @@ class Board(Protocol):
         other_buffer: Doubles | None,
         /,
     ) -> int:
-        """Wait for samples and read them. Returns how many were read; buffers hold no more than that."""
+        """Wait for samples and read them. Returns how many were read; only these are in the buffers."""
 
     def task_stop(self, task: Any, /) -> None:
-        """Sample no more."""
+        """Stop sampling."""
 
     def task_delete(self, task: Any, /) -> None:
-        """Give the task back."""
+        """Delete the task."""
 
     def watchdog_set_analog_expiration_state(self, channels: Channels, n: int, volts: Doubles, /) -> None:
-        """What analog outputs go to when the watchdog expires [V]."""
+        """Set the analog outputs at expiry of the watchdog [V]."""
 
     def watchdog_set_digital_expiration_state(self, channels: Channels, n: int, states: Counts, /) -> None:
-        """What digital outputs go to then: an enumeration of 4 bytes each, 0 for low."""
+        """Set the digital outputs at expiry: an enumeration of 4 bytes each, 0 for low."""
 
     def watchdog_set_other_expiration_state(self, channels: Channels, n: int, values: Doubles, /) -> None:
-        """What other outputs go to then."""
+        """Set the other outputs at expiry."""
 
     def watchdog_start(self, timeout: float, /) -> None:
-        """Begin to count [s]."""
+        """Start the watchdog with a timeout [s]."""
 
     def watchdog_reload(self) -> bool:
-        """Count from 0 again. False if it has expired."""
+        """Restart the timeout. False if the watchdog has expired."""
 
     def watchdog_is_expired(self) -> bool:
-        """Whether it has expired: outputs are at their expiration states, and the board lets nobody at them."""
+        """Whether it has expired: outputs are at their expiration states, and writes are refused."""
 
     def watchdog_clear(self) -> None:
-        """Let outputs be written again, and perhaps put them back to what they were."""
+        """Allow writes again, and perhaps restore the outputs of before the expiry."""
 
     def watchdog_stop(self) -> None:
-        """Count no more. An expired one stays so."""
+        """Stop the watchdog. An expired one stays expired."""
 
 
 class Hardware(Protocol):
-    """What is used of the module `quanser.hardware`."""
+    """Used part of the module `quanser.hardware`."""
 
     HIL: Callable[[], Board]
     HILError: type[Exception]
@@ -142,11 +142,11 @@ class Hardware(Protocol):
 
 
 def quanser() -> Hardware:
-    """The module `quanser.hardware`. Raises QuanserError where it is missing."""
+    """Import `quanser.hardware`. Raises QuanserError if it is missing."""
     try:
         hardware: Any = import_module("quanser.hardware")
         enumerations: Any = import_module("quanser.hardware.enumerations")
-    except (ImportError, OSError) as error:  # OSError: the package is there, the libraries that it loads are not
+    except (ImportError, OSError) as error:  # OSError: the package is installed, the libraries that it loads are not
         raise QuanserError(
             f"Quanser's Python interface is missing ({error}): install the Quanser SDK, then in this environment "
             "`pip install --find-links <SDK's folder>/python quanser_api`"
@@ -155,6 +155,6 @@ def quanser() -> Hardware:
         HIL=hardware.HIL,
         HILError=hardware.HILError,
         Clock=hardware.Clock,
-        BufferOverflowMode=enumerations.BufferOverflowMode,  # not every version offers it one level up
+        BufferOverflowMode=enumerations.BufferOverflowMode,  # not every version exports it one level up
     )
     return cast(Hardware, names)

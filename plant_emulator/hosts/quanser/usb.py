@@ -1,10 +1,9 @@
-"""The Quanser Aero on its USB board, by way of Quanser's HIL interface, as a plant.
+"""Quanser Aero on its USB board as a plant, by Quanser's HIL interface.
 
-The board samples by a clock of its own and `advance` waits for the next sample, so the board paces the loop. A sample
-is this period's or it is NaN: one that could not be read is never replaced by the last. Each good sample reloads the
-board's watchdog, which otherwise goes to 0 V and switches the amplifier off by itself; it is not reloaded after a read
-or a write that failed, so that a plant which does not do as it is told has 0 V before long. An expired watchdog
-is cleared when 0 V are commanded, never under a voltage.
+The board samples by its own clock and `advance` waits for the next sample, so the board paces the loop. A measurement
+is this period's sample or NaN; a failed read never repeats the last one. Each good sample reloads the board's watchdog,
+which on expiry sets 0 V and switches the amplifier off. It is not reloaded after a failed read or write, so that a
+plant that cannot be commanded soon has 0 V. An expired watchdog is cleared only while 0 V is commanded.
 """
 
 from __future__ import annotations
@@ -50,35 +49,35 @@ COLOURS: Final[Mapping[PlantState, tuple[float, float, float]]] = {
 """Blue, yellow, green, red."""
 
 REST_S: Final = 0.5
-"""The amplifier is switched off after 0 V for longer than this [s], if nobody says when it is driven."""
+"""Without calls of `enable`, the amplifier is switched off after 0 V for longer than this [s]."""
 
-_SAMPLES_IN_BUFFER: Final = 1  # so that what is read is the newest, and the board counts those it overwrote
-_FOR_EVER: Final = 2**32 - 1  # samples; what Quanser's own class passes
+_SAMPLES_IN_BUFFER: Final = 1  # a read returns the newest sample, and the board counts those it overwrote
+_UNLIMITED: Final = 2**32 - 1  # samples; as in Quanser's own class for this board
 
 
 class QuanserPlant(Plant):
     """The Aero on its board.
 
-    Its encoders are relative: hold it level where yaw shall be 0 while it is made. The board's time begins with the
-    first `actuate` or `advance`.
+    Its encoders are relative: keep the Aero level and at yaw 0 while this object is made. Sampling starts at the first
+    `actuate` or `advance`.
 
-    Each `advance` is one period. If its owner was late, the newest sample is measured and `passed` is the number of
-    periods that went by; as many calls less one return at once, for periods that are over, and measure nothing. Who
-    raises his tick by `passed` stays in the board's time.
+    Each `advance` is one period. After a late call the newest sample is measured and `passed` is the number of periods
+    that passed; the next `passed` − 1 calls return at once and measure NaN. A caller that raises its tick index by
+    `passed` stays on the board's clock.
 
     Args:
         settings: The board and its channels.
         period: Time between samples [s].
-        hardware: What stands in for the module `quanser.hardware`; the module itself if None.
+        hardware: Replacement of the module `quanser.hardware`; the module itself if None.
 
     Raises:
-        QuanserError: The interface is missing, or the board cannot be opened and made ready.
+        QuanserError: The interface is missing, or the board cannot be opened and prepared.
 
     Attributes:
         overrun: Samples lost so far because they were not read in time.
-        failures: Calls of the interface that failed so far, reads without a sample among them.
-        failure: What the last of them said, or None.
-        expiries: How often the board's watchdog has expired.
+        failures: Failed calls of the interface so far, including reads without a sample.
+        failure: Message of the last failure, or None.
+        expiries: Expiries of the board's watchdog so far.
     """
 
     actuators = 2
@@ -106,26 +105,26 @@ class QuanserPlant(Plant):
         self._state: PlantState | None = None
         self._lit: PlantState | None = None
         self._held: tuple[float, ...] = (0.0, 0.0)
-        self._driven: bool | None = None  # None: nobody says
+        self._driven: bool | None = None  # None: `enable` was never called
         self._amplified = False
-        self._rested = 0  # periods under 0 V
+        self._rested = 0  # periods at 0 V
         self._rest = round(REST_S / period)
 
         self._task: object = None
         self._running = self._closed = self._expired = False
-        self._obeyed = True  # since the last sample: every output was written
-        self._tells_overflows = True
+        self._written = True  # whether every write since the last sample succeeded
+        self._counts_overflows = True
         self._samples_read = self._index = self._owed = 0  # index: of the last sample, on the board's clock
         self._advanced_ns = 0
         self._open()
 
-    # ── the four methods of a plant ──
+    # ── Plant ──
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Hold voltages [V], clipped to the limit; NaN is 0 V. Shape (2,).
 
-        If nobody calls `enable`, the amplifier is switched on by the first that is not 0, and off after half a second
-        of 0 V. After the board's watchdog has expired, only 0 V clear it; until then nothing is written.
+        Without calls of `enable`, the amplifier is switched on by the first voltage other than 0, and off after half a
+        second of 0 V. An expired board watchdog is cleared by 0 V only; until then nothing is written.
 
         Raises:
             QuanserError: The board cannot be started.
@@ -138,7 +137,7 @@ class QuanserPlant(Plant):
         self._write_outputs()
 
     def advance(self) -> None:
-        """Wait for the board's next sample; a failed one takes a period, too.
+        """Wait for the board's next sample; a failed read takes a period, too.
 
         Raises:
             QuanserError: The board cannot be started.
@@ -149,8 +148,8 @@ class QuanserPlant(Plant):
             return
         self._start()
         passed = self._read()
-        alive = self._keep_alive(reload=passed > 0 and self._obeyed)
-        self._obeyed = True
+        alive = self._keep_alive(reload=passed > 0 and self._written)
+        self._written = True
         if passed and alive:
             self._measurement = self._seen(passed)
         else:
@@ -167,13 +166,13 @@ class QuanserPlant(Plant):
         self._advanced_ns = time.monotonic_ns()
 
     def measure(self) -> Measurement:
-        """What the sensors said at the last sample; NaN if it could not be had."""
+        """Values of the last sample; NaN if it could not be read."""
         return self._measurement
 
     def close(self) -> None:
-        """0 V, amplifier off, lights off, and the board given back. Every step is tried, whatever fails before it.
+        """Set 0 V, switch amplifier and lights off, and close the board. A failed step does not prevent the next.
 
-        If neither 0 V nor the amplifier's switch could be written, the watchdog is left to do it.
+        If neither 0 V nor amplifier-off could be written, the watchdog is left running, so that it expires.
         """
         if self._closed:
             return
@@ -190,10 +189,10 @@ class QuanserPlant(Plant):
             self._try(board.task_delete, self._task)
         self._try(board.close)
 
-    # ── what a board has besides ──
+    # ── amplifier and lights ──
 
     def enable(self, driven: bool) -> None:
-        """Say whether the plant is driven: from now on the amplifier is on if it is, and motors have 0 V if not."""
+        """Switch the amplifier by hand from now on: on if driven; otherwise off, with motors at 0 V."""
         self._driven = driven
         self._start()
         if not self._expired:
@@ -202,7 +201,7 @@ class QuanserPlant(Plant):
                 self._amplify(False)
 
     def show(self, state: PlantState) -> None:
-        """Show a state in the colour of the lights. While its watchdog is expired, the board shows red by itself."""
+        """Show a state as a colour. While its watchdog is expired, the board shows red by itself."""
         self._state = state
         if state is not self._lit and not self._expired:
             lit = self._try(self._board.write_other, LEDS, len(LEDS), self._colours[state])
@@ -231,7 +230,7 @@ class QuanserPlant(Plant):
         board.write_digital(MOTORS, n, np.zeros(n, dtype=np.int8))
         board.watchdog_set_analog_expiration_state(MOTORS, n, self._no_volts)
         board.watchdog_set_digital_expiration_state(MOTORS, n, np.zeros(n, dtype=np.int32))
-        with suppress(self._error):  # a light may be wrong, the motors may not
+        with suppress(self._error):  # lights are not safety-relevant; the motors' states above are
             board.watchdog_set_other_expiration_state(LEDS, len(LEDS), self._colours[PlantState.TRIPPED])
         board.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(2, dtype=np.int32))
 
@@ -246,13 +245,13 @@ class QuanserPlant(Plant):
         board.task_set_buffer_overflow_mode(self._task, mode)
 
     def _start(self) -> None:
-        """Arm the watchdog and let the board sample, once."""
+        """Start the watchdog and the sampling task, once."""
         if self._running or self._closed:
             return
         board = self._board
         try:
             board.watchdog_start(self._settings.board_watchdog_s)
-            board.task_start(self._task, self._hardware.Clock.HARDWARE_CLOCK_0, 1 / self._period, _FOR_EVER)
+            board.task_start(self._task, self._hardware.Clock.HARDWARE_CLOCK_0, 1 / self._period, _UNLIMITED)
         except self._error as error:
             raise QuanserError(f"cannot start {self._settings.card_type}: {_text(error)}") from error
         self._running = True
@@ -260,16 +259,16 @@ class QuanserPlant(Plant):
         try:
             board.task_get_buffer_overflows(self._task)
         except self._error:  # some boards may not count them
-            self._tells_overflows = False
+            self._counts_overflows = False
 
     # ── samples ──
 
     def _read(self) -> int:
-        """Wait for the newest sample. Returns the periods that passed, or 0 if there is none."""
+        """Wait for the newest sample. Returns the periods that passed, or 0 if the read failed."""
         board = self._board
         try:
             read = board.task_read(self._task, 1, None, self._counts, None, self._gyro)
-            lost = board.task_get_buffer_overflows(self._task) if self._tells_overflows else 0
+            lost = board.task_get_buffer_overflows(self._task) if self._counts_overflows else 0
         except self._error as error:
             self._failed(_text(error))
             return 0
@@ -278,10 +277,10 @@ class QuanserPlant(Plant):
             return 0
         self._samples_read += 1
         before, self._index = self._index, self._samples_read + lost
-        return max(1, self._index - before)  # a failed read counted as a period, even if its sample came later
+        return max(1, self._index - before)  # a failed read counted as a period, even if its sample followed
 
     def _seen(self, passed: int) -> Measurement:
-        """The measurement of the sample in the buffers, after so many periods."""
+        """Measurement of the sample in the buffers, this many periods after the last one."""
         settings = self._settings
         pitch, yaw = (step * count for step, count in zip(self._steps, self._counts.tolist(), strict=True))
         attitude = attitude_of(pitch, yaw)
@@ -302,7 +301,7 @@ class QuanserPlant(Plant):
         return Measurement(attitude, rate)
 
     def _wait_out_the_period(self) -> None:
-        """Nothing came to pace the loop: it must not spin."""
+        """After a failed read, sleep to the end of the period, so that the loop does not spin."""
         ahead = self._advanced_ns + self._period * 1e9 - time.monotonic_ns()
         if ahead > 0:
             time.sleep(ahead * 1e-9)
@@ -317,18 +316,18 @@ class QuanserPlant(Plant):
         settings = self._settings
         for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, volts, strict=True):
             self._volts[channel] = sign * voltage
-        self._obeyed &= self._try(self._board.write_analog, MOTORS, len(MOTORS), self._volts)
+        self._written &= self._try(self._board.write_analog, MOTORS, len(MOTORS), self._volts)
 
     def _amplify(self, on: bool) -> bool:
         lines: Lines = np.full(len(MOTORS), on, dtype=np.int8)
         done = self._try(self._board.write_digital, MOTORS, len(MOTORS), lines)
         if done:
             self._amplified = on
-        self._obeyed &= done
+        self._written &= done
         return done
 
     def _keep_alive(self, *, reload: bool) -> bool:
-        """Reload the watchdog, or see how it is. False if it has expired or cannot be asked."""
+        """Reload the watchdog or read its state. False if it has expired or cannot be read."""
         if self._expired:
             return False
         try:
@@ -344,10 +343,10 @@ class QuanserPlant(Plant):
         return alive
 
     def _clear(self) -> bool:
-        """Get the outputs back after the watchdog has expired, at 0 V and armed. False if they cannot be had."""
+        """Clear the expired watchdog and restart it with outputs at 0 V. False if a step failed."""
         board, n = self._board, len(MOTORS)
         self._unlock()
-        # Clearing may put outputs back as they were: each step is tried, whatever fails before it.
+        # Clearing may restore the outputs of before the expiry, so a failed step must not prevent the next.
         armed = self._try(board.watchdog_start, self._settings.board_watchdog_s)
         still = self._try(board.write_analog, MOTORS, n, self._no_volts)
         done = self._amplify(False) and still and armed
@@ -357,10 +356,10 @@ class QuanserPlant(Plant):
         return done
 
     def _unlock(self) -> None:
-        """Let outputs be written, whatever the watchdog was doing; whether they can, the next write tells."""
+        """Stop and clear the watchdog, so that outputs can be written; failures show at the next write."""
         with suppress(self._error):
             self._board.watchdog_stop()
-        with suppress(self._error):  # one that has not expired may refuse
+        with suppress(self._error):  # a watchdog that has not expired may refuse
             self._board.watchdog_clear()
 
     def _try(self, call: Callable[..., object], *args: object) -> bool:

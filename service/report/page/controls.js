@@ -1,4 +1,4 @@
-// What brings the page to life: drawing what comes into sight, jumps to events, the theme, the search, printing.
+// Interaction: drawing of what is in sight, jumps to events, theme, search, printing.
 
 const figures = [...document.querySelectorAll(".drawing")];
 const inSight = new Set();
@@ -8,8 +8,8 @@ const draw = (figure) => (figure.classList.contains("group") ? drawGroup(figure)
 
 /** Draw what is in sight and not up to date, once before the next frame. */
 function refresh() {
-  refresh.asked ??= requestAnimationFrame(() => {
-    refresh.asked = null;
+  refresh.pending ??= requestAnimationFrame(() => {
+    refresh.pending = null;
     for (const figure of inSight) if (!upToDate.has(figure)) (upToDate.add(figure), draw(figure));
   });
 }

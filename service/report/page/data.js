@@ -1,4 +1,4 @@
-// What came with the page: arrays out of base64, colours out of the style sheet, numbers as text.
+// Data of the page: arrays from base64, colours from the style sheet, numbers as text.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const several = data.runs.length > 1;
@@ -16,7 +16,7 @@ for (const group of data.groups)
       line.y = floats(line.values, Float32Array);
       line.x = data.runs[line.run].time;
       if (line.sparse) {
-        // Told less often than every tick: what is between is not a gap.
+        // Published less often than every tick: missing values are not gaps.
         line.x = line.x.filter((_, i) => !Number.isNaN(line.y[i]));
         line.y = line.y.filter((value) => !Number.isNaN(value));
       }
@@ -36,7 +36,7 @@ function colour(name) {
   return found;
 }
 
-/** Text that plotly, which knows a few tags, shows as it is. */
+/** Text escaped for plotly, which interprets a few tags. */
 function plain(text) {
   return text.replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
 }
@@ -49,7 +49,7 @@ function duration(us) {
 
 /** Ticks of a logarithmic axis of durations [µs], from one exponent of ten to another. */
 function durationTicks(from, to) {
-  const room = innerWidth < 600 ? 1.2 : 2.5; // decades whose ticks can be told apart
+  const room = innerWidth < 600 ? 1.2 : 2.5; // decades whose ticks do not overlap
   const digits = to - from > 2 * room ? [1] : to - from > room ? [1, 3] : [1, 2, 5];
   const tickvals = [];
   for (let power = Math.floor(from); power <= to; power++) tickvals.push(...digits.map((digit) => digit * 10 ** power));

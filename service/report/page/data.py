@@ -1,7 +1,7 @@
-"""What the browser draws, as JSON: lines as base64 of little-endian floats, so that an hour of them opens at once.
+"""Data of the page's drawings, as JSON: lines as base64 of little-endian floats, so that an hour of them opens at once.
 
 Times are float64, because a float32 of a day's run is 4 ms coarse; values are float32, which is finer than any
-quantizer here. The panels of several runs are laid over each other by group and label.
+quantizer here. The panels of several runs are overlaid by group and label.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ SPREADS: Final = {
     "command_delay": "From the controller to the plant",
     "period": "Period between measurements",
 }
-"""SessionKey distributions are drawn, in this order, and what they are called."""
+"""Distributions in the order of drawing, with their titles."""
 
 GRAVE: Final = frozenset({"tripped", "fault", "lost", "refused"})
-"""Kinds of events that one looks for first."""
+"""Kinds of events that are highlighted."""
 
-Spoken = dict[str, Any]
+Json = dict[str, Any]
 
 
 def page_data(reports: Sequence[Report]) -> str:
@@ -42,12 +42,12 @@ def page_data(reports: Sequence[Report]) -> str:
             for name in spread_names(reports)
         ],
     }  # fmt: skip
-    # JSON has no other place for these than inside strings, and no end of a script or start of a comment without them.
+    # These occur inside JSON strings only; without them, no text can end the script or start a comment.
     return dumps(data, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def group_titles(reports: Sequence[Report]) -> dict[str, str]:
-    """Groups of panels in order, and what each is called; runs that call it differently are both heard."""
+    """Groups of panels in order, with the title of each; if titles differ between runs, all of them."""
     titles: dict[str, dict[str, None]] = {}
     for report in reports:
         for panel in report.panels:
@@ -62,18 +62,18 @@ def spread_names(reports: Sequence[Report]) -> list[str]:
 
 
 def grave(mark: Mark) -> bool:
-    """Whether it is something that one looks for first."""
+    """Whether an event is highlighted."""
     return mark.kind in GRAVE
 
 
 def period_s(report: Report) -> float | None:
-    """The loop's period [s], as configured; None if the log does not say."""
+    """The loop's period [s], as configured; None if the log does not have it."""
     rate = report.settings.get("loop", {}).get("rate_hz")
     return 1 / rate if isinstance(rate, int | float) and rate > 0 else None
 
 
 def _span(reports: Sequence[Report]) -> tuple[float, float]:
-    """The time that the whole page is about, with a little room, so that nothing hides in its edges."""
+    """Time span of the page, with a margin, so that events at its ends are visible."""
     times = [float(time) for report in reports for time in (*report.time[:1], *report.time[-1:])]
     times += [mark.time_s for report in reports for mark in report.findings.marks if mark.time_s is not None]
     start, end = (min(times), max(times)) if times else (0.0, 1.0)
@@ -81,7 +81,7 @@ def _span(reports: Sequence[Report]) -> tuple[float, float]:
     return start - room, end + room
 
 
-def _run(report: Report) -> Spoken:
+def _run(report: Report) -> Json:
     period = period_s(report) or 0.0
     return {
         "name": report.name,
@@ -91,7 +91,7 @@ def _run(report: Report) -> Spoken:
     }
 
 
-def _groups(reports: Sequence[Report]) -> Iterator[Spoken]:
+def _groups(reports: Sequence[Report]) -> Iterator[Json]:
     for group in group_titles(reports):
         panels: dict[str, list[tuple[int, Panel]]] = {}
         for run, report in enumerate(reports):
@@ -102,7 +102,7 @@ def _groups(reports: Sequence[Report]) -> Iterator[Spoken]:
         yield {"id": group, "panels": [_panel(label, alike, reports, shared) for label, alike in panels.items()]}
 
 
-def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool) -> Spoken:
+def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool) -> Json:
     least, most = _extent([line.values for _, panel in alike for line in panel.lines])
     unit = alike[0][1].unit
     return {
@@ -121,7 +121,7 @@ def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Rep
 def _lines(
     alike: Sequence[tuple[int, Panel]], reports: Sequence[Report], shared: bool
 ) -> Iterator[tuple[int, int, Line]]:
-    """Run, how manieth of its kind, line; of desired ones that are shared, the longest."""
+    """Run, index within its kind, and line; of shared desired lines, the longest run's only."""
     longest = max((run for run, _ in alike), key=lambda run: reports[run].findings.duration_s)
     for run, panel in alike:
         count = {True: 0, False: 0}
@@ -132,7 +132,7 @@ def _lines(
 
 
 def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> bool:
-    """Whether every run desires the same here, so that one line can stand for all."""
+    """Whether the desired values of all runs agree, so that one line can stand for all."""
     desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
     one_each = len(desired) in (0, len(alike)) and len(alike) == len(reports)
     return one_each and all(_agree(*desired[0], *other) for other in desired[1:])
@@ -152,7 +152,7 @@ def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -
 
 
 def _sparse(values: Array) -> bool:
-    """Whether most times have no value: a line that is told less often than every tick, and has no gaps there."""
+    """Whether most times have no value: the line is published less often than every tick, and has no gaps there."""
     return bool(2 * np.isfinite(values).sum() < len(values))
 
 
@@ -167,7 +167,7 @@ def _decimals(largest: float) -> int:
     return min(9, max(0, 3 - floor(log10(largest)))) if largest > 0 and isfinite(largest) else 3
 
 
-def _spread(report: Report, name: str) -> Spoken | None:
+def _spread(report: Report, name: str) -> Json | None:
     spread = report.findings.timing.get(name)
     return None if spread is None else spread.model_dump(include={"p50", "p99", "p999", "max", "bins"})
 

@@ -1,6 +1,6 @@
-"""What happened in a run: events, gaps, how its durations were spread, what its wire carried.
+"""Tables of events, gaps, durations and wire traffic.
 
-Whatever has a time is a button that takes every time axis there.
+Every time is a button that moves all time axes there.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from aeroloop.service.report.rows import micros, percent, seconds
 from aeroloop.service.review.report import Report
 
 Column = tuple[str, bool]
-"""Its head, and whether it holds numbers."""
-
+"""A column's head, and whether it holds numbers."""
 
 TEXT = "Text"
-"""The column that takes the room that is left, and wraps."""
+"""The column that takes the remaining width, and wraps."""
 
 
 def table(columns: Sequence[Column], rows: Sequence[Sequence[Html | str]], *, tall: bool = False) -> Html:
@@ -35,7 +34,7 @@ def table(columns: Sequence[Column], rows: Sequence[Sequence[Html | str]], *, ta
 
 
 def events(reports: Sequence[Report]) -> Html:
-    """Everything that was told, in order of time, run by run."""
+    """Events in order of time, run by run."""
     rows = []
     for index, report in enumerate(reports):
         for mark in report.findings.marks:
@@ -43,9 +42,9 @@ def events(reports: Sequence[Report]) -> Html:
             kind = tag("span", mark.kind, class_="kind grave" if grave(mark) else "kind")
             rows.append([*run_cell(reports, index), where, kind, mark.role, mark.text])
     if not rows:
-        return tag("p", "Nothing was told: no event, no change, no loss.", class_="quiet")
+        return tag("p", "None: no event, no change, no loss.", class_="quiet")
     return table(
-        [*run_column(reports), ("Time [s]", True), ("What", False), ("Who", False), (TEXT, False)], rows, tall=True
+        [*run_column(reports), ("Time [s]", True), ("What", False), ("Role", False), (TEXT, False)], rows, tall=True
     )
 
 
@@ -62,8 +61,8 @@ def gaps(reports: Sequence[Report]) -> Html:
             where = jump(gap.time_s, index, f"gap of {gap.ticks} ticks")
             rows.append([*run_cell(reports, index), where, f"{gap.tick:,}", f"{gap.ticks:,}", lasts])
     columns: list[Column] = [("Time [s]", True), ("From tick", True), ("Ticks", True), ("Length [ms]", True)]
-    said = f"{total:,} in all" + (f", the longest {len(rows):,} of them listed" if len(rows) < total else "")
-    return joined([tag("p", f"{said}.", class_="quiet"), table([*run_column(reports), *columns], rows, tall=True)])
+    summary = f"{total:,} in all" + (f", the longest {len(rows):,} of them listed" if len(rows) < total else "")
+    return joined([tag("p", f"{summary}.", class_="quiet"), table([*run_column(reports), *columns], rows, tall=True)])
 
 
 def timing(reports: Sequence[Report]) -> Html:
@@ -90,12 +89,12 @@ def timing(reports: Sequence[Report]) -> Html:
 
 
 def spread_title(name: str) -> str:
-    """What a distribution is called."""
+    """Title of a distribution."""
     return SPREADS.get(name, name)
 
 
 def wire(reports: Sequence[Report]) -> Html:
-    """What each direction carried, and how often a value was at its quantizer's end."""
+    """Frames and bits of each direction, and how often a value was at its quantizer's outermost level."""
     streams, values = [], []
     for name, way in (("measurement", "plant → controller"), ("command", "controller → plant")):
         for index, report in enumerate(reports):
@@ -129,7 +128,7 @@ def wire(reports: Sequence[Report]) -> Html:
 
 
 def _quantizer(signal: dict[str, Any]) -> tuple[str, str, str]:
-    """Kind, bits, limit; a log of before there were kinds has the uniform one."""
+    """Kind, bits, limit; an old log without a kind has the uniform one."""
     if not signal:
         return "–", "–", "–"
     bits, limit = signal.get("bits"), signal.get("limit")
@@ -138,7 +137,7 @@ def _quantizer(signal: dict[str, Any]) -> tuple[str, str, str]:
 
 
 def jump(time_s: float, run: int, what: str) -> Html:
-    """A button that takes every time axis to a time of a run."""
+    """A button that moves every time axis to a time of a run."""
     shown = seconds(time_s)
     return tag("button", shown, type="button", class_="jump", data_time=time_s, data_run=run,
                aria_label=f"Show {shown} s: {what}")  # fmt: skip
@@ -150,5 +149,5 @@ def run_cell(reports: Sequence[Report], index: int) -> list[Html]:
 
 
 def run_column(reports: Sequence[Report]) -> list[Column]:
-    """The head of it."""
+    """The head of that cell's column."""
     return [("Run", False)] if len(reports) > 1 else []

@@ -1,4 +1,4 @@
-"""HTML that cannot be broken into: every text is escaped unless it came out of `tag` itself."""
+"""HTML builder that escapes every text, except markup that `tag` itself returned."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def tag(name: str, *children: Child, **attributes: str | float | bool | None) ->
     Args:
         name: Such as `td`.
         children: Markup, text to be escaped, or several of them; None is nothing.
-        attributes: `class_="number"`, `data_time=1.5`; True stands alone, False and None are left out.
+        attributes: `class_="number"`, `data_time=1.5`; True gives a bare attribute, False and None none.
     """
     inside = "".join(_markup(child) for child in children)
     start = "".join([name, *(_attribute(key, value) for key, value in attributes.items())])

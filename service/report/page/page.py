@@ -1,7 +1,7 @@
-"""Puts the page together: template, sections, data, scripts and plotly.js in one text that needs no network.
+"""Assembly of the page: template, sections, data, scripts and plotly.js in one text that needs no network.
 
-Every script is named by its hash in the page's content security policy, so that the browser runs these and no other,
-whatever a log contains.
+The page's content security policy lists every script by its hash, so that the browser runs no other script, whatever a
+log contains.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from aeroloop.service.report.page.markup import Html, joined, tag
 from aeroloop.service.review.report import Report
 
 SCRIPTS: Final = ("data.js", "window.js", "panels.js", "spreads.js", "controls.js")
-"""In the order in which each uses those before it."""
+"""In order of dependence."""
 
 PROVED: Final[tuple[str, ...]] = ("z_norm", "lyapunov")
-"""Groups of panels that are the theorem's."""
+"""Groups of panels in the theorem's section."""
 
 TIME_UNITS: Final = frozenset({"s", "ms", "µs"})
 
 
 def page(reports: Sequence[Report]) -> str:
-    """The page of one run, or of several laid over each other.
+    """The page of one run, or of several overlaid.
 
     Args:
         reports: At least one.
@@ -61,7 +61,7 @@ def page(reports: Sequence[Report]) -> str:
 
 
 def write_page(reports: Sequence[Report], out: Path) -> None:
-    """Write the page into a file, in one step. Raises ReviewError if that cannot be."""
+    """Write the page into a file, in one step. Raises ReviewError if that fails."""
     text = page(reports)
     partial = out.with_name(f".{out.name}.partial")
     try:
@@ -73,7 +73,7 @@ def write_page(reports: Sequence[Report], out: Path) -> None:
 
 
 def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
-    """What the page has: id, title, contents."""
+    """Sections of the page: id, title, contents."""
     broken, promised = verdict.broken(reports), theorem.theorem(reports)
     in_time = {panel.group for report in reports for panel in report.panels if panel.unit in TIME_UNITS}
     titles = group_titles(reports)
@@ -121,7 +121,7 @@ def _groups(reports: Sequence[Report], titles: dict[str, str]) -> Html:
 
 
 def _drawing(kind: str, name: str, title: str, panels: int = 1) -> Html:
-    """Where a drawing goes; it has its height from the start, so that nothing moves when it is drawn."""
+    """Placeholder of a drawing; it has its height from the start, so that drawing moves nothing."""
     key = tag("span", class_="key")
     plot = tag("div", class_="plot", style=f"--panels: {panels}", tabindex=0, role="group", aria_label=title)
     return tag("figure", tag("figcaption", tag("span", title, class_="name"), key), plot, class_=f"drawing {kind}",
@@ -132,8 +132,8 @@ def _thinned(reports: Sequence[Report]) -> Html:
     most = max(report.thinned for report in reports)
     if most <= 2:
         return Html("")
-    said = f"Lines are thinned out: two points, the least and the largest value, stand for up to {most:,} ticks."
-    return tag("p", said, class_="quiet", id="thinned")
+    text = f"Lines are thinned out: two points, the least and the largest value, stand for up to {most:,} ticks."
+    return tag("p", text, class_="quiet", id="thinned")
 
 
 def _search() -> Html:
@@ -146,7 +146,7 @@ def _script(code: str) -> Html:
 
 
 def _policy(scripts: Sequence[Html]) -> Html:
-    """Nothing from anywhere but this file, and of this file only these scripts."""
+    """Content security policy: nothing from outside of this file, and only these scripts."""
     hashes = [_hash(script.removeprefix("<script>").removesuffix("</script>")) for script in scripts]
     rules = f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:"
     return tag("meta", http_equiv="Content-Security-Policy", content=rules)

@@ -1,6 +1,6 @@
 // Drawings over time: the panels of a group under each other on one time axis, with events and gaps across all of them.
 
-const MARKS_ACROSS = 500; // more marks than this across a drawing are not told apart
+const MARKS_ACROSS = 500; // marks closer than this share of a drawing are merged
 
 /** A line's colour by its meaning: measured, desired, or its run. */
 function lineColour(line) {

@@ -1,4 +1,4 @@
-"""How the runs were set up: what differs, every key of the configuration, and facts about software and host."""
+"""Setup of the runs: differences, every key of the configuration, and facts about software and host."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ def differing(reports: Sequence[Report]) -> Html:
 
 
 def configuration(reports: Sequence[Report]) -> Html:
-    """Every key, a table a section, to be opened or searched."""
+    """Every key, in a searchable table per section."""
     return _sections(reports, [report.settings for report in reports])
 
 
 def facts(reports: Sequence[Report]) -> Html:
-    """What each role said of its software and its host."""
+    """Software and host of each role."""
     return _sections(reports, [report.facts for report in reports])
 
 
 def shown(value: Any) -> str:
-    """A value as the configuration writes it: `true`, `"text"`, `[1, 2]`; nothing is a dash."""
+    """A value as the configuration writes it: `true`, `"text"`, `[1, 2]`; None is a dash."""
     if value is None:
         return "–"
     return value if isinstance(value, str) else dumps(value, ensure_ascii=False, default=str)
@@ -44,7 +44,7 @@ def _sections(reports: Sequence[Report], tables: Sequence[dict[str, Any]]) -> Ht
             section, dot, _ = key.partition(".")
             sections.setdefault(section if dot else "", {})[key] = None
     if not sections:
-        return tag("p", "The log does not say.", class_="quiet")
+        return tag("p", "Not in the log.", class_="quiet")
     parts = []
     for section, found in sorted(sections.items()):
         rows = [(key, [keys.get(key) for keys in flattened]) for key in found]

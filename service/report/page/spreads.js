@@ -1,4 +1,4 @@
-// How durations are spread: counts over logarithmic bins, both axes logarithmic, with the percentiles marked.
+// Distributions of durations: counts over logarithmic bins, both axes logarithmic, with the percentiles marked.
 
 const RATIO = 2 ** (1 / 16); // from one bin's edge to the next
 const NONE = 0.5; // stands for no count on a logarithmic axis
@@ -36,7 +36,7 @@ function spreadTrace(run, index) {
   };
 }
 
-/** A percentile as a vertical line; of a single run it says which and how much. */
+/** A percentile as a vertical line; for a single run, with its name and value. */
 function markPercentiles(layout, run, index) {
   Object.entries(percentiles).forEach(([key, name], row) => {
     const at = Math.log10(run[key]);

@@ -1,4 +1,4 @@
-"""What the theorem promises, what the run did, and whether each inequality of Lemma 1 held where the truth is known."""
+"""Section on the theorem: its guarantee, what the run did, whether each inequality of Lemma 1 held at true states."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ UNMET: Final = {
     "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
     "Assumption 3": "the attitude error is larger than the certificate assumes",
 }
-"""Premises that a true state may not satisfy, and what that means."""
+"""Premises that a true state may violate, and what that means."""
 
 
 def theorem(reports: Sequence[Report]) -> Html:
-    """Verdict, figures, inequalities; empty if no run was held against it."""
+    """Verdict, figures, inequalities; empty if no run was checked against it."""
     if all(report.findings.theorem is None for report in reports):
         return Html("")
     rows = [row for row in figure_rows([report.findings for report in reports]) if row.key.startswith(THEOREM)]
-    said = [_said(reports, index) for index, report in enumerate(reports) if report.findings.theorem is not None]
-    return joined([*said, figures_table(reports, rows), _lemma(reports)])
+    verdicts = [_verdict(reports, index) for index, report in enumerate(reports) if report.findings.theorem is not None]
+    return joined([*verdicts, figures_table(reports, rows), _lemma(reports)])
 
 
 def judged(found: TheoremFindings) -> str:
-    """SessionKey true states the inequalities are judged by, in a sentence or two."""
+    """How many true states judge the inequalities, in a sentence or two."""
     if not found.samples:
         return ""
     left_out = [f"At {count:,} {UNMET.get(name, name)}." for name, count in found.outside.items() if count]
@@ -47,7 +47,7 @@ def judged(found: TheoremFindings) -> str:
     return " ".join([f"{found.samples:,} true states belong to a tick.", *left_out, f"Lemma 1 is judged by {by}."])
 
 
-def _said(reports: Sequence[Report], index: int) -> Html:
+def _verdict(reports: Sequence[Report], index: int) -> Html:
     report = reports[index]
     found = report.findings.theorem
     assert found is not None

@@ -1,4 +1,4 @@
-"""The top of the page: which run this is, whether it held, its figures, and what of the file could not be read."""
+"""Top of the page: name of each run, verdict, figures, and what of the files could not be read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from aeroloop.service.review.report import Check, Findings, Report
 
 
 class Judgement(NamedTuple):
-    """What is said of a run in a word, and whether that is good; None if nobody asked and nothing went wrong."""
+    """Verdict on a run in a word, and whether it is good; None without limits and without a failure."""
 
     word: str
     good: bool | None
@@ -19,7 +19,7 @@ class Judgement(NamedTuple):
 
 
 def judgement(run: Findings) -> Judgement:
-    """By the limits that were asked for; without any, by what happened."""
+    """Verdict by the limits of `--require`; without any, by trips and missing figures."""
     broken = [check for check in run.checks if not check.holds]
     if broken:
         return Judgement("Not held", False, f"{len(broken)} of {_count(len(run.checks), 'limit')} broken.")
@@ -39,7 +39,7 @@ def run_name(report: Report, index: int, of: int) -> Html:
 
 
 def masthead(reports: Sequence[Report]) -> Html:
-    """What the page is about."""
+    """Heading: the names of the runs."""
     if len(reports) > 1:
         names = joined(tag("li", run_name(r, i, len(reports)), " ", _when(r)) for i, r in enumerate(reports))
         return joined([tag("h1", f"{len(reports)} runs compared"), tag("ul", names, class_="runs")])
@@ -140,7 +140,7 @@ def figures_table(reports: Sequence[Report], rows: Sequence[Row]) -> Html:
 
 
 def broken(reports: Sequence[Report]) -> Html:
-    """What of the files could not be read, and what the recorder knows it has not written; empty if nothing."""
+    """Damages of the files, missing rows and losses of the recorder; empty if there are none."""
     items = []
     for index, report in enumerate(reports):
         name = run_name(report, index, len(reports)) if len(reports) > 1 else Html("")

@@ -15,7 +15,7 @@ function showTime(from, to, marked = timeWindow.marked) {
   const middle = Math.min(Math.max((from + to) / 2, start + width / 2), end - width / 2);
   timeWindow.shown = [middle - width / 2, middle + width / 2];
   timeWindow.marked = marked;
-  tellTime();
+  printTime();
   for (const follow of timeWindow.followers) follow();
 }
 
@@ -26,7 +26,7 @@ function showAround(time) {
   showTime(time - half, time + half, time);
 }
 
-/** Move as a button or a key says. */
+/** Move by the name of a button or a key. */
 function moveTime(how) {
   const [from, to] = timeWindow.shown;
   const width = to - from;
@@ -37,7 +37,7 @@ function moveTime(how) {
   if (how === "out") showTime(from - width / 2, to + width / 2);
 }
 
-function tellTime() {
+function printTime() {
   const [from, to] = timeWindow.shown;
   const digits = Math.min(3, Math.max(0, 2 - Math.floor(Math.log10(to - from))));
   document.getElementById("shown").value = signed(`${from.toFixed(digits)} – ${to.toFixed(digits)} s`);
@@ -55,4 +55,4 @@ function moveByKey(event) {
 for (const button of document.querySelectorAll("[data-move]"))
   button.addEventListener("click", () => moveTime(button.dataset.move));
 
-tellTime();
+printTime();

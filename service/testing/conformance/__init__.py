@@ -1,1 +1,1 @@
-"""Conformance."""
+"""Conformance suite of the plant end, run with `pytest --pyargs`."""

@@ -1,9 +1,9 @@
-"""The contract of the plant end, whatever stands there: the same assertions for each.
+"""Conformance suite of the plant end: the same assertions for every plant.
 
-Against a real plant: `pytest --pyargs aeroloop.service.testing.conformance --hil-plant=can --hil-config=FILE`. It
-moves: it turns by some 20° in pitch and 30° in yaw, and goes to its voltage limit for half a second.
+Against a real plant: `pytest --pyargs aeroloop.service.testing.conformance --hil-plant=can --hil-config=FILE`. The
+plant moves: it turns by some 20° in pitch and 30° in yaw, and runs at its voltage limit for half a second.
 
-Real time, on real processes. To the watchdog's 100 ms comes slack for a machine that other work keeps waiting.
+Runs in real time on real processes. Bounds are the watchdog's 100 ms plus slack for a busy machine.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from aeroloop.service.testing.hil import Hil, HilLog
 
 SLACK_S = 0.3
 WATCHDOG_S = 0.1
+pytestmark = pytest.mark.processes
+
 PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
-"""For what does not try the watchdog."""
+"""For tests of other things than the watchdog."""
 
 
 def times(log: HilLog, kind: str, role: str) -> list[int]:
-    """When a role told an event of this kind [ns]."""
-    told = [(at, event) for at, event in log.messages("event") if isinstance(event, Event)]
-    return [at for at, event in told if event.kind == kind and event.role == role]
+    """Times at which a role published an event of this kind [ns]."""
+    events = [(at, event) for at, event in log.messages("event") if isinstance(event, Event)]
+    return [at for at, event in events if event.kind == kind and event.role == role]
 
 
 def test_it_measures_at_its_rate_and_the_loop_tracks(hil: Hil) -> None:
@@ -35,8 +37,8 @@ def test_it_measures_at_its_rate_and_the_loop_tracks(hil: Hil) -> None:
     hil.run(3.0)
     figures = hil.log.figures
     rate = hil.settings.loop.rate_hz
-    # Ticks that a stall makes a plant end skip are never made up for, and how many that is, is the machine's: on two
-    # shared cores 296 of 500 a second came once. Most must come, as of commands, and none may go faster.
+    # A plant end skips ticks in a stall and never makes up for them; how many depends on the machine: on two shared
+    # cores 296 of 500 a second arrived once. Most measurements and commands must arrive, and none faster than the rate.
     assert figures.measurement.frames_per_s is not None
     assert rate / 2 < figures.measurement.frames_per_s < 1.01 * rate
     assert figures.command.frames_per_s is not None
@@ -60,15 +62,15 @@ def test_the_first_measurement_of_a_session_has_counter_0_and_the_next_ones_coun
     counters = form.counters
     measured = [(at, counter) for at, frame in frames if (counter := form.counter(frame)) is not None]
     assert measured[0][1] == 0
-    # Ticks that a busy machine makes the plant skip count all the same: its counter goes with the time, so one offset
-    # fits all frames, but for how late each was. Up to a period late a tick is still taken, and worse is published
-    # where a stall or a bridge comes between. A counter of frames slips by each skipped tick, and no offset fits.
+    # The counter follows the time and counts skipped ticks too, so one offset fits all frames within their lateness. A
+    # tick up to a period late is still taken; a stall or a bridge publishes it later. A counter of frames would slip at
+    # each skipped tick, and no offset would fit.
     half = counters / 2
     behind = [(counter - (at - measured[0][0]) / period_ns) % counters for at, counter in measured]
     fits = max(sum(abs((one - offset + half) % counters - half) < 1.5 for one in behind) for offset in behind)
     assert fits > 0.8 * len(behind)
     steps = [(after - before) % counters for (_, before), (_, after) in itertools.pairwise(measured)]
-    assert steps.count(1) > len(steps) / 2  # it counts one by one, and a fifth of its ticks has been seen to be skipped
+    assert steps.count(1) > len(steps) / 2  # it counts by one; up to a fifth of the ticks was skipped here
 
 
 def test_without_commands_it_trips_within_the_watchdog_and_says_why(hil: Hil) -> None:
@@ -82,7 +84,7 @@ def test_without_commands_it_trips_within_the_watchdog_and_says_why(hil: Hil) ->
     assert "no fresh command" in log.trips[0] or "no command in time" in log.trips[0] or "is gone" in log.trips[0]
 
 
-def test_after_a_trip_nobody_drives_it_before_it_is_armed(hil: Hil) -> None:
+def test_after_a_trip_no_controller_drives_it_before_it_is_armed(hil: Hil) -> None:
     hil.start(settings=PATIENT)
     hil.stop()
     hil.eventually("tripped", lambda: hil.state("plant") == "tripped")
@@ -95,10 +97,10 @@ def test_after_a_trip_nobody_drives_it_before_it_is_armed(hil: Hil) -> None:
 
 def test_an_operators_stop_acts_at_once(hil: Hil) -> None:
     hil.start(settings=PATIENT)
-    asked = time.time_ns()
+    stopped = time.time_ns()
     hil.stop()
     hil.eventually("tripped", lambda: hil.state("plant") == "tripped")
-    assert (times(hil.log, "tripped", "plant")[0] - asked) * 1e-9 < SLACK_S
+    assert (times(hil.log, "tripped", "plant")[0] - stopped) * 1e-9 < SLACK_S
 
 
 def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil) -> None:
@@ -117,14 +119,14 @@ def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil) -> None:
 
 def test_without_a_valid_measurement_it_trips_and_says_so(hil: Hil, hil_plant: str) -> None:
     if hil_plant not in ("emulator", "can-node"):
-        pytest.skip("only an emulated plant's sensors can be told to fail; the board's fake has tests of its own")
+        pytest.skip("only an emulated plant's sensors fail on request; the board's fake has other tests")
     hil.start(settings={**PATIENT, "plant.faults": ["rate:off@0.3"]}, drive=False)
     hil.processes.start("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped"))
     assert "no valid" in hil.log.trips[0]
 
 
-def test_when_it_is_stopped_it_says_so_and_its_controller_looks_for_it_again(hil: Hil) -> None:
+def test_when_its_process_stops_it_publishes_that_and_its_controller_searches_again(hil: Hil) -> None:
     hil.start(settings=PATIENT)
     assert hil.processes.stop("plant") == 0
     hil.eventually("searching", lambda: hil.state("controller") == "searching")

@@ -1,4 +1,4 @@
-"""The grid of what a loop costs: its front, its cells, its command."""
+"""Grid of `lab burden`: cells, Pareto front, command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a frame costs on a classic CAN bus, beside hand-computed values and frames built bit by bit."""
+"""CAN frame sizes, against hand-computed values and frames built bit by bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiment in one process: repeatable, and on the ideal plant as good as the paper's law can be."""
+"""Experiment in one process: repeatable, and on the ideal plant as exact as the paper's law."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from aeroloop.service.config import Settings, load, with_bits
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
-from tests.service.numpy_twin import Sinusoids
+from tests.support.numpy_twin import Sinusoids
 
 IDEAL = load(overrides=["plant.ideal=true"])
 DURATION = 50.0

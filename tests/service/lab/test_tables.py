@@ -1,4 +1,4 @@
-"""The calibrated bench and the tables that it predicts."""
+"""Calibrated plant and the tables predicted with it."""
 
 from __future__ import annotations
 

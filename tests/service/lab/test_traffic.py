@@ -1,4 +1,4 @@
-"""What a direction sends, counted on made-up codes, and beside a loop that really sends on change."""
+"""Traffic of one direction, on synthetic codes and beside a loop that sends on change."""
 
 from __future__ import annotations
 

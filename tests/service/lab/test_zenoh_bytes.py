@@ -1,4 +1,4 @@
-"""What the counting relay counts: every byte of a made-up stream, and of frames on a Zenoh link more than they hold."""
+"""Counting relay: every byte of a synthetic stream, and the overhead of frames on a Zenoh link."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Thousands of ticks at once have the very bits of one tick after another, however they are cut and wherever begun."""
+"""Batch evaluation of ticks: bit for bit equal to tick-by-tick evaluation, for any split and any start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A log with everything decoded has every raw message as it was, and nothing decoded twice."""
+"""Decoded log: every raw message unchanged, and every message decoded once."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from aeroloop.protocol.messages import topics
 from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.files import LogFiles
-from aeroloop.service.logs.mcap_file import CONTRACT_METADATA
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.logs.table_files import ExportError
 from aeroloop.service.review.review import review
 from aeroloop.service.viewers.channels import Decoder
-from tests.service.logs.made_log import SESSION, VEHICLE, make_log
-from tests.service.logs.retold import Said, tell
+from tests.support.edited_log import Said, tell
+from tests.support.made_log import SESSION, VEHICLE, make_log
 
 TICKS = 400
 
@@ -59,7 +59,7 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
     assert len(recorded) > len(raw)
     rng.shuffle(recorded)
     descriptions = [
-        (CONTRACT_METADATA, {"key": topics.key("description", VEHICLE, role=role), "json": one.model_dump_json()})
+        (DESCRIPTION_METADATA, {"key": topics.key("description", VEHICLE, role=role), "json": one.model_dump_json()})
         for (_, role), one in files.descriptions.items()
     ]
     tell(tmp_path / "recorded.mcap", recorded, descriptions)
@@ -89,7 +89,7 @@ def test_what_several_files_repeat_is_written_once_and_the_last_description_stay
             writer.start()
             writer.add_attachment(1, 1, "protocol/SPEC.md", "text/markdown", b"the same")
             for json in descriptions:
-                writer.add_metadata(CONTRACT_METADATA, {"key": "k", "json": json})
+                writer.add_metadata(DESCRIPTION_METADATA, {"key": "k", "json": json})
             channel = writer.register_channel("other", "", writer.register_schema("s", "", b""))
             writer.add_message(channel, i + 1, b"", i + 1, i)
             writer.finish()

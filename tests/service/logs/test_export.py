@@ -1,4 +1,4 @@
-"""What is exported is what was judged: the same ticks and numbers in every kind of file, and nothing invented."""
+"""Export: the same ticks and numbers as the review in every format, and null for missing values."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from aeroloop.service.logs.table import Rows, TruthColumns, euler_deg, groups
 from aeroloop.service.logs.table_files import ExportError, ParquetFile
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
-from tests.service.logs.made_log import SESSION, START_NS, VEHICLE, made, write
-from tests.service.logs.retold import PERIOD_NS
+from tests.support.edited_log import PERIOD_NS
+from tests.support.made_log import SESSION, START_NS, VEHICLE, made, write
 
 TICKS = 400
 SKIPPED = range(100, 148)

@@ -1,6 +1,6 @@
-"""What is written here, a reader that was not written here reads: all of it, from the front and by the index.
+"""Independent MCAP reader on logs of this project: the whole file, as a stream and by the index.
 
-The reader is Foxglove's own, in tests/readers. It checks every checksum, and gives up on what is not whole.
+The reader is Foxglove's own, in tests/readers. It checks every checksum and refuses a damaged file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from aeroloop.service.logs.recover import RecoverError, recover
 from aeroloop.service.recording import rolling
 from aeroloop.service.review.review import review
 from aeroloop.service.settings import RecorderSettings
-from tests.service.logs.made_log import make_log
+from tests.support.made_log import make_log
 
 READERS = Path(__file__).parents[2] / "readers"
 INSTALL = "npm install --no-package-lock --prefix tests/readers"

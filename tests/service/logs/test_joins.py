@@ -1,4 +1,4 @@
-"""Reading is a join on the tick: what was joined is what happened, whatever went wrong, and both ends replay."""
+"""Join of both traces on the tick: correct after any fault, and both ends replay."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Missing
 from aeroloop.service.review.review import read, review
-from tests.service.logs.made_log import SESSION, VEHICLE, Logged, made, make_log, write
-from tests.service.logs.retold import Said, edited, retell, told
-from tests.service.logs.rough_log import Known, rough_loop
+from tests.support.edited_log import Said, edited, retell, told
+from tests.support.made_log import SESSION, VEHICLE, Logged, made, make_log, write
+from tests.support.rough_log import Known, rough_loop
 
 SEEDS = range(8)
 
 
 def end_of(message: Logged) -> str:
-    """SessionKey end's batch a message is; empty if it is none."""
+    """Which end's batch a message is; empty if it is none."""
     return message.key.rpartition("/")[2] if "/trace/" in message.key else ""
 
 

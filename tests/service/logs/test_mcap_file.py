@@ -1,4 +1,4 @@
-"""What is whole in an MCAP file is read, what is not is named, and what a file claims costs no memory."""
+"""MCAP reader: whole records are read, damaged ones are named, and forged sizes allocate no memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from aeroloop.service.logs.files import LogFiles, ReviewError
 from aeroloop.service.logs.mcap_file import (
-    CONTRACT_METADATA,
+    DESCRIPTION_METADATA,
     MAX_CHUNK,
     MAX_RECORD,
     Damage,
@@ -35,7 +35,7 @@ from aeroloop.service.logs.mcap_file import (
 from aeroloop.service.logs.recover import recover
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.review.review import review
-from tests.service.logs.made_log import AN_OPERATORS_WORDS, make_log
+from tests.support.made_log import AN_OPERATORS_WORDS, make_log
 
 TICKS: Final = 600
 HEAD: Final = struct.Struct("<BQ")
@@ -342,7 +342,7 @@ def test_of_all_messages_only_the_first_and_the_wanted_are_touched(whole: Path) 
 def test_the_record_behind_the_header_opens_the_file(whole: Path, tmp_path: Path) -> None:
     head = opening(whole)
     assert head is not None
-    assert head.name == CONTRACT_METADATA
+    assert head.name == DESCRIPTION_METADATA
     for data in (b"", MAGIC, b"something else", whole.read_bytes()[:100]):
         (tmp_path / "a.mcap").write_bytes(data)
         assert opening(tmp_path / "a.mcap") is None

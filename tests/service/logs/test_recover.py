@@ -1,4 +1,4 @@
-"""What is whole in a broken log is recovered, told, and read by a reader that is not ours."""
+"""Recovery of a broken log: whole records kept, losses reported, output valid for an independent reader."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from aeroloop.service.logs.recover import RecoverError, recover
 from aeroloop.service.review.review import review
-from tests.service.logs.made_log import make_log
+from tests.support.made_log import make_log
 
 TICKS = 400
 

@@ -1,4 +1,4 @@
-"""A replay gives the very bytes that were logged, or names the first that differs; broken files give what they hold."""
+"""Replay of logs: the same bytes or the first difference; whole parts of broken files."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from aeroloop.service.config import load
 from aeroloop.service.figures import Figures, StreamFigures
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.files import LogFiles, ReviewError
-from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from aeroloop.service.logs.mcap_file import CHANGE_METADATA, DESCRIPTION_METADATA
 from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import read, review
-from tests.service.logs.made_log import AN_OPERATORS_WORDS, START_NS, lockstep, made, make_log, write
-from tests.service.logs.retold import Said, retell, tell
+from tests.support.edited_log import Said, retell, tell
+from tests.support.made_log import AN_OPERATORS_WORDS, START_NS, lockstep, made, make_log, write
 
 TICKS = 600
 
@@ -101,7 +101,7 @@ def tell_with(log: Path, out: Path, description: dict[str, str]) -> Path:
         messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
         known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
     others = [(name, entries) for name, entries in known if entries.get("key") != description["key"]]
-    return tell(out, messages, [(CONTRACT_METADATA, description), *others])
+    return tell(out, messages, [(DESCRIPTION_METADATA, description), *others])
 
 
 def test_with_another_law_it_says_what_would_have_been_commanded(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What tests of a recording share: a session, a clock and a disk."""
+"""Fixtures of recording tests: a session, a clock and a disk."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from aeroloop.protocol.messages.operator import Change, Gains, Hold
 from aeroloop.protocol.transport.publication import Delivery
 from aeroloop.service.config import load
 from aeroloop.service.recording import rolling
-from tests.service.recording.ends import SESSION, VEHICLE, Ends, description_of
-from tests.service.recording.recording import Arrived, Clock, Disk, EventLog
+from tests.support.made_messages import SESSION, VEHICLE, Ends, description_of
+from tests.support.made_recording import Arrived, Clock, Disk, EventLog
 
 TICKS = 600
 START_NS = 1_800_000_000_000_000_000

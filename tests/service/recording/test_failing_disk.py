@@ -1,4 +1,4 @@
-"""A log on a disk that is full, broken or gone: in the end every message stands once, and it was told of once."""
+"""Log on a full, broken or missing disk: in the end every message is written once and each failure reported once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aeroloop.service.logs.mcap_file import Damage, records
 from aeroloop.service.logs.recover import recover
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError
-from tests.service.recording.recording import (
+from tests.support.made_recording import (
     EVERYTHING,
     Clock,
     Disk,

@@ -1,6 +1,6 @@
-"""The recorder over real Zenoh sessions, in this process, where its disk and its memory are the test's to fill.
+"""Recorder over real Zenoh sessions in this process, with disk and memory under the test's control.
 
-What it promises as a process of its own is in tests/hil.
+tests/hil covers the recorder as a process.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.service.config import load
-from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CONTRACT_METADATA
+from aeroloop.service.logs.mcap_file import CHANGE_METADATA, DESCRIPTION_METADATA
 from aeroloop.service.recording import backlog, rolling
 from aeroloop.service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
 from aeroloop.service.recording.recorder import Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
-from tests.protocol.gathering import Gathering, eventually
 from tests.service.recording.conftest import CHANGES
-from tests.service.recording.ends import Ends, description_of
+from tests.support.made_messages import Ends, description_of
+from tests.support.zenoh_network import Gathering, eventually
 
 KEY = "aeroloop/aero/telemetry"
 ROOM = 50
@@ -183,7 +183,7 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         changes = [told for name, told in metadata if name == CHANGE_METADATA]
         assert {told["key"] for told in changes} == {"aeroloop/aero/trace/controller"}
         assert [Change.model_validate_json(told["json"]) for told in changes] == list(CHANGES.values())
-        descriptions = {told["key"]: told["json"].encode() for name, told in metadata if name == CONTRACT_METADATA}
+        descriptions = {told["key"]: told["json"].encode() for name, told in metadata if name == DESCRIPTION_METADATA}
         assert descriptions[description] == published[description][0]
 
 

@@ -1,4 +1,4 @@
-"""A run in several files: every message once, every file enough by itself, the oldest forgotten, none written over."""
+"""Rotated run: every message once, every file readable alone, the oldest deleted, none overwritten."""
 
 from __future__ import annotations
 
@@ -11,11 +11,17 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.service.logs.mcap_file import CHANGE_METADATA, CHUNK_BYTES, CONTRACT_METADATA, RECORDER_METADATA, records
+from aeroloop.service.logs.mcap_file import (
+    CHANGE_METADATA,
+    CHUNK_BYTES,
+    DESCRIPTION_METADATA,
+    RECORDER_METADATA,
+    records,
+)
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RecorderError
 from tests.service.recording.conftest import START_NS
-from tests.service.recording.recording import (
+from tests.support.made_recording import (
     TICK_S,
     Arrived,
     Clock,
@@ -95,7 +101,7 @@ def test_every_file_has_all_that_it_takes_to_read_it_alone(rotated: Path, story:
         before = [change for change in story.changes if START_NS + change.tick * 2_000_000 + 77 < begins]
         assert [Change.model_validate_json(entries["json"]) for entries in changes] == before
         ticks.append(len(before))
-        assert [entries for name, entries in found if name == CONTRACT_METADATA] == [
+        assert [entries for name, entries in found if name == DESCRIPTION_METADATA] == [
             {"key": story.key, "json": story.description.decode()}
         ]
         (said,) = [entries["json"] for name, entries in found if name == RECORDER_METADATA]

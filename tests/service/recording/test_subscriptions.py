@@ -1,4 +1,4 @@
-"""Every number that is not taken is counted once, under the reason for which it was lost; and memory is bounded."""
+"""Subscriptions: every lost message is counted once, under its cause, and memory is bounded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import zenoh
 from aeroloop.protocol.transport.publication import CachedPublisher, Delivery
 from aeroloop.service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlog
 from aeroloop.service.recording.subscriptions import Subscriptions
-from tests.protocol.gathering import Gathering, eventually
+from tests.support.zenoh_network import Gathering, eventually
 
 EVENT, TRUTH = "aeroloop/aero/event", "aeroloop/v2/truth"
 

@@ -1,7 +1,7 @@
-"""Lemma 1 and the theorem's last step, on random states through the real quantizers: no bound is ever exceeded.
+"""Lemma 1 and the theorem's last step, on random states through the real quantizers: no bound is exceeded.
 
 Half of the states are aimed: ε and ω at the corners of the quantizers' cells, as far from [1, 0] as the bounds allow,
-with little error. There a bound that is half as large would be exceeded, so the check is worth something.
+with little error. There a bound of half the size would be exceeded, so the check has power.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from aeroloop.service.control.reference import Plan, reference_function
 from aeroloop.service.theorem.certificate import Evaluated, evaluate, known
 from aeroloop.service.theorem.extremes import extremes
 from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
-from tests.service import numpy_twin as twin
-from tests.service.twin_body import body_of
+from tests.support import numpy_twin as twin
+from tests.support.twin_body import body_of
 
 LAW = LawSettings(
     inertia=(0.02, 0.03, 0.01),

@@ -1,0 +1,130 @@
+"""CAN format: identifiers, heartbeats and settings of a bus. Bytes only; `can_link` opens the bus.
+
+    id            from → to                what
+    0x100 + node  plant → controller       measurement frames
+    0x200 + node  controller → plant       command frames
+    0x300 + node  plant → controller       heartbeat: state, cause of the last trip, fingerprint of the wire
+    0x380 + node  controller → plant       heartbeat: state, number of the session, fingerprint
+
+A CAN bus has no sessions and no names. The controller's heartbeat replaces them: while its state is granted and its
+fingerprint is the plant's own, the plant is in the session whose number it carries.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any, Final, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.wire.frames import MIN_COUNTER_BITS, FrameFormat
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+
+MEASUREMENT_ID: Final = 0x100
+COMMAND_ID: Final = 0x200
+PLANT_HEARTBEAT_ID: Final = 0x300
+CONTROLLER_HEARTBEAT_ID: Final = 0x380
+MAX_NODE: Final = 127
+CLASSIC_BYTES: Final = 8
+FD_LENGTHS: Final = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+HEARTBEAT_S: Final = 0.1
+
+_STATES: Final = list(PlantState)
+_CAUSES: Final = list(TripCause)
+_FINGERPRINT_BYTES: Final = 7
+
+
+class CanError(AeroloopError):
+    """The bus cannot be used; one line with the reason and what to do."""
+
+
+class CanSettings(BaseModel):
+    """The CAN bus, and which node of it is the plant. `options` go to python-can's interface as they are."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    interface: str = Field(
+        default="udp_multicast", description="python-can's: socketcan, slcan, gs_usb, pcan, udp_multicast, virtual…"
+    )
+    channel: str = Field(default="239.74.163.2", description="the interface's: can0, /dev/ttyACM0, a multicast group…")
+    node: int = Field(default=1, ge=1, le=MAX_NODE, description="number of the plant on the bus")
+    fd: bool = Field(default=False, description="CAN FD, which frames of more than 8 bytes need")
+    short_counter: bool = Field(
+        default=False,
+        description="accept a counter that is too short to distinguish every late frame from a fresh one; a classic "
+        "CAN frame of 10-bit signals needs counter_bits = 4",
+    )
+    silent_s: float = Field(
+        default=0.5, ge=0.2, le=60, description="a peer from which nothing is received for this long is gone [s]"
+    )
+    options: dict[str, Any] = Field(default={}, description="for the interface, such as bitrate = 1000000")
+
+
+def check_widths(settings: CanSettings, wire: WireSpec) -> None:
+    """Raise CanError if a frame does not fit the bus, with what would fit."""
+    longest = 64 if settings.fd else CLASSIC_BYTES
+    for name, frame, signals in (
+        ("measurement", wire.measurement, "wire.attitude.bits and wire.rate.bits"),
+        ("command", wire.command, "wire.voltage.bits"),
+    ):
+        if frame.size <= longest:
+            continue
+        widest = max(
+            bits
+            for bits in range(MIN_BITS, MAX_BITS + 1)
+            if FrameFormat([bits] * len(frame.widths), wire.counter_bits).size <= longest
+        )
+        ways = ["set can.fd = true", f"{signals} to {widest} at the most"]
+        if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
+            ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
+        ways_out = ", or ".join(ways)
+        raise CanError(
+            f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}: {ways_out}"
+        )
+
+
+def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:
+    """First seven bytes of SHA-256 over wire, period and lockstep, on which both ends must agree."""
+    agreed = {"wire": wire.agreed(), "period_ns": period_ns, "lockstep": lockstep}
+    return hashlib.sha256(json.dumps(agreed, sort_keys=True).encode()).digest()[:_FINGERPRINT_BYTES]
+
+
+class Heartbeat(NamedTuple):
+    """State of one end, sent ten times a second and on a change.
+
+    Attributes:
+        state: Plant: its state. Controller: the state that it requests.
+        number: Plant: 0, or which of `TripCause` tripped it, from 1. Controller: number of the session, 0…15.
+        fingerprint: Of its wire, period and lockstep.
+        at_ns: When it was received, on `time.monotonic_ns()`; 0 in one that is sent.
+    """
+
+    state: PlantState
+    number: int
+    fingerprint: bytes
+    at_ns: int = 0
+
+    @property
+    def cause(self) -> TripCause | None:
+        """Cause of the last trip, from a plant's heartbeat."""
+        return _CAUSES[self.number - 1] if 0 < self.number <= len(_CAUSES) else None
+
+    def pack(self) -> bytes:
+        """Eight bytes: number:4, state:4, fingerprint:56."""
+        return bytes([self.number << 4 | _STATES.index(self.state)]) + self.fingerprint
+
+    @classmethod
+    def unpack(cls, data: bytes, at_ns: int) -> Heartbeat | None:
+        """A heartbeat, or None if it is malformed."""
+        if len(data) != 1 + _FINGERPRINT_BYTES or data[0] & 0x0F >= len(_STATES):
+            return None
+        return cls(_STATES[data[0] & 0x0F], data[0] >> 4, bytes(data[1:]), at_ns)
+
+
+def number_of(cause: TripCause | None) -> int:
+    """A cause's number on the bus; 0 for none."""
+    return 0 if cause is None else cause.number

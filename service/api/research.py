@@ -1,0 +1,118 @@
+"""Functions of the public API: configuration, lockstep experiment, certificate, and a recorded run as arrays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from aeroloop.plant_emulator.plant import Plant
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab import experiment
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review import review
+from aeroloop.service.theorem import certificate
+from aeroloop.service.theorem.certificate import Certificate
+
+
+def load_settings(file: Path | str | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:
+    """Load a configuration: defaults, then a TOML file, then the environment, then overrides.
+
+    Args:
+        file: A TOML file, as for `--config`.
+        overrides: `section.key` to value, as for `--set`; `"cont"` for bits that are not quantized.
+
+    Raises:
+        AeroloopError: What is wrong and where, in one line.
+    """
+    settings = [f"{key}={json.dumps(value)}" for key, value in (overrides or {}).items()]
+    return load(Path(file) if file is not None else None, settings)
+
+
+def run_experiment(
+    settings: Settings | None = None,
+    duration_s: float = 50.0,
+    *,
+    plant: Plant | None = None,
+    controller: Controller | None = None,
+    watch: Callable[[int, bytes, bytes], None] | None = None,
+) -> Figures:
+    """Run controller and plant in lockstep in this process, through real frames; it repeats bit for bit.
+
+    Args:
+        settings: The configuration; the defaults (the paper's experiment at 8 and 6 bits) if None.
+        duration_s: Duration on the law's clock [s].
+        plant: Plant to control; the emulated one of the configuration if None.
+        controller: Controller to run; the configuration's if None.
+        watch: Called at every tick with the tick index, the measurement frame and the command frame; an empty frame
+            is one that was not sent.
+
+    Returns:
+        Figures of merit, such as `z_track` [s] and `u_total` [V²·s].
+
+    Raises:
+        ValueError: The plant tripped, or the configuration makes no loop.
+    """
+    return experiment.run_experiment(
+        settings or load_settings(), duration_s, watch=watch, plant=plant, controller=controller
+    )
+
+
+def certify(
+    settings: Settings | None = None, *, disturbance: float = 0.0, attitude_error_deg: float | None = None
+) -> Certificate:
+    """Evaluate the paper's Theorem 1 (Corollary 1 with a disturbance) for a configuration, as `aeroloop lab certify`.
+
+    Args:
+        settings: The configuration; the defaults if None.
+        disturbance: Largest ‖τ_d‖ [N·m].
+        attitude_error_deg: Assumed bound of the attitude error [deg]; `controller.start_within_deg` if None.
+    """
+    chosen = settings or load_settings()
+    return certificate.certify(
+        chosen.wire,
+        chosen.law,
+        chosen.reference,
+        chosen.controller,
+        disturbance=disturbance,
+        attitude_error_deg=attitude_error_deg,
+    )
+
+
+class RecordedRun(NamedTuple):
+    """The longest session of a log.
+
+    Attributes:
+        settings: Configuration of the run.
+        figures: Figures of merit, as `aeroloop log review`.
+        ticks: One row a tick in each column; see `Ticks` for names, shapes and units.
+    """
+
+    settings: Settings
+    figures: Figures
+    ticks: Ticks
+
+    @property
+    def time(self) -> npt.NDArray[np.floating]:
+        """Time of each tick on the law's clock [s]. Shape (n,)."""
+        return self.ticks.k * self.settings.loop.period
+
+
+def read_run(*paths: Path | str) -> RecordedRun:
+    """Read the longest session of a log as arrays.
+
+    Args:
+        paths: Logs, folders of logs, or the files of a rotated run.
+
+    Raises:
+        AeroloopError: Not a log, or one without a session.
+    """
+    blocks: list[Ticks] = []
+    read = review.read(*map(Path, paths), watch=blocks.append)
+    return RecordedRun(read.session.settings, read.figures, Ticks.joined(blocks))

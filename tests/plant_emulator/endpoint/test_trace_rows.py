@@ -1,0 +1,209 @@
+"""Rows of the plant's trace: one per tick of a session, with the actions between ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Operation, Outcome, Sent, batches_per_s
+from aeroloop.protocol.transport.publication import KEPT_S
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Transmit
+from tests.support.plant_stage import RUN, Stage
+
+LOOP = LoopSettings(realtime="off", trace_s=10)
+WIRE = WireSpec()
+PLANT = PlantSettings()
+OFF = (0.0, 0.0)
+
+
+def answer(stage: Stage, measurement: bytes) -> None:
+    """At once, with the same voltages."""
+    counter = stage.wire.measurement.counter(measurement)
+    assert counter is not None
+    stage.wires.deliver(stage.wire.command.pack(counter, (3, -3)), stage.endpoint.ticked)
+
+
+def at(what: dict[int, Callable[[Stage], object]]) -> Callable[[Stage], None]:
+    """Do this after these ticks."""
+
+    def between(stage: Stage) -> None:
+        if act := what.pop(stage.endpoint.ticked, None):
+            act(stage)
+
+    return between
+
+
+def rows(batches: list[Batch], column: str) -> list[object]:
+    """A column of all batches."""
+    return [value for batch in batches for value in batch.columns[column].tolist()]
+
+
+def operations(batches: list[Batch]) -> list[Operation]:
+    return [operation for batch in batches for operation in batch.tail.operations]
+
+
+def inject(text: str) -> Callable[[Stage], None]:
+    def do(stage: Stage) -> None:
+        assert isinstance(stage.driver, Emulator)
+        stage.driver.inject(Fault.parse(text))
+
+    return do
+
+
+def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:
+    between = at({4: Stage.claim, 20: lambda stage: stage.endpoint.release("s1"), 30: Stage.claim})
+    batches = Stage(LOOP, WIRE, PLANT, between=between, answer=answer).run(400).batches
+    # The grid is waited for again after a grant, which takes its time.
+    assert rows(batches, "tick") == [*range(6, 21), *range(32, 401)]
+    assert rows(batches, "session_tick") == [*range(15), *range(369)]
+    with_rows = [batch.header for batch in batches if batch.header.rows]
+    assert [(header.session, header.rows, header.final) for header in with_rows] == [
+        ("s1", 15, True),
+        ("s2", MAX_ROWS, False),
+        ("s2", 369 - MAX_ROWS, True),
+    ]
+    assert [header.first_row for header in with_rows] == [0, 15, 15 + MAX_ROWS]
+    assert {header.run for header in with_rows} == {RUN}
+    assert [(operation.kind, operation.tick) for operation in operations(batches)] == [
+        ("claim", 4),
+        ("release", 20),
+        ("claim", 30),
+    ]
+
+
+def test_a_row_says_what_came_what_was_made_of_it_and_what_was_measured() -> None:
+    stage = Stage(LOOP, WIRE, PLANT, between=at({0: Stage.claim}), answer=answer).run(50)
+    batches = stage.batches
+    assert b"".join(stage.sent) == b"".join(batch.columns["measurement"].tobytes() for batch in batches)
+    volts = tuple(WIRE.voltage.quantizer().level(code) for code in (3, -3))
+    assert [tuple(row) for batch in batches for row in batch.columns["voltages"]] == [OFF] + [volts] * 48
+    assert rows(batches, "outcome") == [Outcome.NONE] + [Outcome.ACTED] * 48
+    assert rows(batches, "received_as") == [Sent.NONE] + [Sent.FRAME] * 48
+    assert rows(batches, "answered") == [0xFFFF_FFFF, *range(48)]
+    for batch in batches:
+        sent, received = batch.times_ns("sent"), batch.times_ns("received")
+        assert (np.diff(sent) >= 0).all()
+        assert ((received < sent) | (received == -1)).all()
+
+
+@pytest.mark.parametrize(
+    ("meddle", "cause"),
+    [
+        (inject("attitude:off"), TripCause.SENSORS),
+        (inject("command:off"), TripCause.COMMAND_TIMEOUT),
+        (lambda stage: stage.wires.deliver(WIRE.command.pack(40, (-32, 0)), 1_000), None),
+        (
+            lambda stage: stage.wires.deliver(WIRE.command.pack(stage.endpoint.counter, (-32, 0)), 0),
+            TripCause.INVALID_COMMAND,
+        ),
+    ],
+    ids=["sensors", "commands lost", "none", "invalid"],
+)
+def test_a_trip_is_the_sessions_last_row_with_its_cause(
+    meddle: Callable[[Stage], None], cause: TripCause | None
+) -> None:
+    batches = Stage(LOOP, WIRE, PLANT, between=at({0: Stage.claim, 40: meddle}), answer=answer).run(200).batches
+    *before, last = rows(batches, "trip")
+    assert set(before) == {0}
+    assert last == (0 if cause is None else cause.number)
+    assert rows(batches, "sent_as")[-1] == (Sent.FRAME if cause is None else Sent.NONE)
+    assert batches[-1].header.final
+    if cause is not None:
+        assert len(before) < 190
+        assert tuple(batches[-1].columns["voltages"][-1]) == OFF
+        assert rows(batches, "answered")[-1] == 0xFFFF_FFFF
+
+
+@pytest.mark.parametrize(
+    ("frame", "received_as", "outcome"),
+    [
+        (WIRE.command.pack(38, (3, -3)) + b"\0", Sent.MALFORMED, Outcome.MALFORMED),  # the rest would be fresh
+        (b"\1", Sent.MALFORMED, Outcome.MALFORMED),
+        (SILENCE, Sent.SILENT, Outcome.MALFORMED),
+        (b"\xff" * WIRE.command.size, Sent.FRAME, Outcome.MALFORMED),
+        (WIRE.command.pack(3, (31, 31)), Sent.FRAME, Outcome.REPEATED),
+    ],
+)
+def test_what_is_not_acted_upon_is_in_its_row(frame: bytes, received_as: Sent, outcome: Outcome) -> None:
+    between = at({0: Stage.claim, 40: lambda stage: stage.wires.deliver(frame, 0)})
+    batches = Stage(LOOP, WIRE, PLANT, between=between, answer=answer).run(50).batches
+    row = rows(batches, "tick").index(41)
+    assert rows(batches, "received_as")[row] == received_as
+    assert rows(batches, "outcome")[row] == outcome
+    if received_as is Sent.FRAME:
+        assert b"".join(b.columns["command"].tobytes() for b in batches)[row * len(frame) :][: len(frame)] == frame
+
+
+def test_commands_that_a_fault_keeps_back_are_withheld_and_in_their_rows() -> None:
+    between = at({0: Stage.claim, 40: inject("command:off@0..0.02")})
+    batches = Stage(LOOP, WIRE, PLANT, between=between, answer=answer).run(60).batches
+    first = rows(batches, "tick").index(41)
+    assert rows(batches, "outcome")[first - 1 : first + 11] == [Outcome.ACTED, *[Outcome.WITHHELD] * 10, Outcome.ACTED]
+    assert set(rows(batches, "received_as")[first:]) == {Sent.FRAME}
+    assert operations(batches)[-1] == Operation(tick=40, kind="inject", name="command:off@0..0.02")
+
+
+def test_silence_is_a_row_with_the_measurement_not_sent() -> None:
+    wire = WireSpec(transmit=Transmit(measurement="on_change"))
+    still = PLANT.model_copy(update={"ideal": True})
+    batches = Stage(LOOP, wire, still, between=at({0: Stage.claim}), answer=answer).run(40).batches
+    sent_as = rows(batches, "sent_as")
+    assert sent_as[:3] == [Sent.FRAME, Sent.SILENT, Sent.SILENT]
+    assert len(sent_as) == 39
+
+
+def test_what_is_done_without_a_session_is_published_at_once_without_rows() -> None:
+    seen: dict[int, int] = {}
+
+    def between(stage: Stage) -> None:
+        if stage.endpoint.ticked == 5:
+            stage.endpoint.stop()
+        if stage.endpoint.ticked == 9:
+            stage.endpoint.arm()
+        seen[stage.endpoint.ticked] = len(stage.batches)
+
+    batches = Stage(LOOP, WIRE, PLANT, between=between).run(12).batches
+    assert (seen[5], seen[6], seen[9], seen[10]) == (0, 1, 1, 2)
+    assert [(batch.header.rows, batch.header.session, batch.header.final) for batch in batches] == [(0, "", False)] * 2
+    assert [operation.kind for operation in operations(batches)] == ["stop", "arm"]
+
+
+def test_what_changes_limits_and_watchdog_says_so_in_full() -> None:
+    other = PLANT.model_copy(update={"watchdog_s": 0.04})
+    stage = Stage(LOOP, WIRE, PLANT, between=at({3: lambda stage: stage.driver.reconfigure(other)})).run(5)
+    assert operations(stage.batches) == [
+        Operation(tick=3, kind="reconfigure", settings={"watchdog_s": 0.04, "limits": PLANT.limits.model_dump()})
+    ]
+
+
+def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:
+    loop = LoopSettings(lockstep=True, realtime="off", trace_s=10)
+    impatient = PLANT.model_copy(update={"answer_timeout_s": 1e-9})
+
+    def sometimes(stage: Stage, measurement: bytes) -> None:
+        if stage.endpoint.ticked != 20:
+            answer(stage, measurement)
+
+    def claim(stage: Stage) -> None:
+        if stage.endpoint.session is None:
+            stage.claim()
+
+    batches = Stage(loop, WIRE, impatient, between=claim, answer=sometimes).run(40).batches
+    assert rows(batches, "tick") == list(range(41))
+    expired = operations(batches)[1]
+    assert (expired.kind, expired.tick, expired.cause) == ("expire", 20, TripCause.NO_ANSWER)
+    assert rows(batches, "session_tick") == [*range(21), *range(20)]
+
+
+@pytest.mark.parametrize("loop", [LoopSettings(), LoopSettings(rate_hz=10_000), LoopSettings(lockstep=True)])
+def test_the_cache_holds_what_a_session_publishes_in_its_time(loop: LoopSettings) -> None:
+    rate_hz = 10_000 if loop.lockstep else loop.rate_hz
+    assert batches_per_s(loop) * KEPT_S >= max(KEPT_S / loop.trace_s, KEPT_S * rate_hz / MAX_ROWS)

@@ -1,0 +1,178 @@
+"""Trace batches: round trips, golden vectors of SPEC.md, and refusals."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aeroloop import protocol
+from aeroloop.protocol.messages.operator import Change, Gains
+from aeroloop.protocol.messages.trace import (
+    HEADER_BYTES,
+    MAX_ROWS,
+    NEVER,
+    End,
+    Operation,
+    TraceWriter,
+    read_batch,
+    row_dtype,
+)
+from aeroloop.protocol.wire.spec import WireSpec
+
+SPEC: Final = (Path(protocol.__file__).parent / "SPEC.md").read_text(encoding="utf-8")
+WIRE: Final = WireSpec()
+S: Final = 1_000_000_000
+
+
+def golden(end: str) -> tuple[list[list[Any]], bytes]:
+    """Rows and bytes of one golden vector, as the text has them."""
+    text = SPEC.partition("### Golden vectors of the trace")[2].partition(f"**{end}**")[2]
+    table, _, rest = text.partition("```\n")
+    lines = [line for line in table.splitlines() if line.startswith("| ") and "tick" not in line]
+    rows = [[_value(cell.strip()) for cell in line.strip("|").split("|")] for line in lines if set(line) - set("|- ")]
+    return rows, bytes.fromhex(rest.partition("```")[0])
+
+
+def _value(cell: str) -> Any:
+    if not cell.startswith("`"):
+        return int(cell)
+    text = cell.strip("`").replace("–", "")
+    return tuple(map(float, text.split())) if " " in text else bytes.fromhex(text)
+
+
+def add(writer: TraceWriter, row: Sequence[Any]) -> None:
+    (writer.controller_row if writer.end == "controller" else writer.plant_row)(*row)
+
+
+def test_the_golden_batch_of_the_controller_is_what_the_writer_writes() -> None:
+    rows, batch = golden("Controller")
+    writer = TraceWriter("controller", WIRE, 0x0123456789ABCDEF, S)
+    writer.session = "s1"
+    writer.changes.append(Change(session="s1", tick=0, gains=Gains(C2=(0.2, 0.2, 0.2))))
+    for row in rows:
+        add(writer, row)
+    assert len(rows) == 3
+    assert writer.take(2_650_000_000, 1_800_000_000_650_000_000).hex(" ") == batch.hex(" ")
+    assert writer.empty
+
+
+def test_the_golden_batch_of_the_plant_is_what_the_writer_writes() -> None:
+    rows, batch = golden("Plant")
+    writer = TraceWriter("plant", WIRE, 0xFEDCBA9876543210, S)
+    for row in rows[:1] * 7:
+        add(writer, row)
+    writer.take(0, 0)  # seven rows before
+    writer.session = "s1"
+    for row in rows:
+        add(writer, row)
+    writer.operations.append(Operation(tick=1001, kind="stop"))
+    assert writer.take(5_004_100_000, 1_800_000_000_004_100_000, final=True).hex(" ") == batch.hex(" ")
+
+
+@pytest.mark.parametrize("end", ["controller", "plant"])
+def test_numpy_reads_the_golden_batches_by_the_text_alone(end: End) -> None:
+    rows, batch = golden(end.capitalize())
+    fields = dict(re.findall(r"\| \d+ \| (\w+) \| (u8|u16|u32|u64|i64) \|", SPEC))
+    assert list(fields) == [
+        "version", "end", "flags", "actuators", "measurement_bytes", "command_bytes", "rows", "tail_bytes",
+        "run", "first_row", "monotonic_ns", "wall_ns",
+    ]  # fmt: skip
+    types = {"u8": "<u1", "u16": "<u2", "u32": "<u4", "u64": "<u8", "i64": "<i8"}
+    header = np.frombuffer(batch, [(name, types[kind]) for name, kind in fields.items()], 1)[0]
+    n, at = int(header["rows"]), HEADER_BYTES
+    assert header["version"] == 2
+    assert n == len(rows)
+    dtype = row_dtype(end, int(header["measurement_bytes"]), int(header["command_bytes"]), int(header["actuators"]))
+    assert dtype.names is not None
+    base = int(header["monotonic_ns"])
+    for i, name in enumerate(dtype.names):
+        column = np.frombuffer(batch, dtype[name].base, n * int(np.prod(dtype[name].shape)), at)
+        at += column.nbytes
+        said = [row[i] for row in rows]
+        if name in ("tick", "session_tick", "answered", "received", "sent"):
+            column = np.cumsum(column, dtype=column.dtype)
+        if name in ("received", "sent"):
+            ns = [base + int(us) * 1000 if us != NEVER else 0 for us in column]
+            assert [abs(a - b) < 1000 for a, b in zip(ns, said, strict=True)] == [True] * n
+        elif name == "voltages":
+            assert column.reshape(n, -1).tolist() == [list(volts) for volts in said]
+        elif dtype[name].kind == "V":
+            assert [bytes(frame) for frame in column] == [frame.ljust(column.itemsize, b"\0") for frame in said]
+        else:
+            assert column.tolist() == [value & NEVER if value < 0 else value for value in said]
+    assert len(batch) - at == header["tail_bytes"]
+    json.loads(batch[at:])
+
+
+frames = st.binary(min_size=7, max_size=7)
+times = st.integers(10 * S, 12 * S)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**32 - 2), st.integers(0, 3), st.integers(0, 2), times, times | st.just(0), frames,
+                  st.binary(min_size=3, max_size=3)),
+        min_size=1, max_size=MAX_ROWS,
+    ),
+    st.booleans(),
+)  # fmt: skip
+def test_a_batch_reads_back_as_the_rows_that_were_added(rows: list[Any], final: bool) -> None:
+    writer = TraceWriter("controller", WIRE, 5, S)
+    writer.session, writer.state = "abc", {"sign": 1}
+    rows = [(row[0], row[1], row[2], max(row[3], rows[0][3]), *row[4:]) for row in rows]
+    for row in rows:
+        add(writer, row)
+    batch = read_batch(writer.take(13 * S, 77 * S, final=final))
+    assert batch is not None
+    header = batch.header
+    assert (header.rows, header.final, header.session, header.run) == (len(rows), final, "abc", 5)
+    assert header.wall_ns - header.monotonic_ns == 64 * S
+    assert batch.tail.state == {"sign": 1}
+    assert batch.columns["tick"].tolist() == [row[0] for row in rows]
+    assert [bytes(frame) for frame in batch.columns["measurement"]] == [row[5] for row in rows]
+    received = batch.times_ns("received")
+    assert all(0 <= row[3] - at < 1000 for row, at in zip(rows, received.tolist(), strict=True))
+    sent = batch.times_ns("sent").tolist()
+    before = rows[0][3] - S  # what lies before the base wraps; no end sends a second before it receives
+    assert all(at == -1 if not row[4] else row[4] < before or 0 <= row[4] - at < 1000
+               for row, at in zip(rows, sent, strict=True))  # fmt: skip
+
+
+def test_a_batch_is_due_when_it_is_full_or_its_first_row_has_waited_long_enough() -> None:
+    writer = TraceWriter("controller", WIRE, 5, S // 10)
+    assert not writer.due(10 * S)
+    writer.controller_row(0, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3))
+    assert not writer.due(10 * S + S // 10 - 1)
+    assert writer.due(10 * S + S // 10)
+    for k in range(1, MAX_ROWS):
+        assert not writer.due(10 * S)
+        writer.controller_row(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3))
+    assert writer.due(10 * S)
+
+
+def test_what_is_no_batch_is_refused_whole() -> None:
+    for end in ("Controller", "Plant"):
+        _, batch = golden(end)
+        assert read_batch(batch) is not None
+        for size in range(len(batch)):
+            assert read_batch(batch[:size]) is None
+        assert read_batch(batch + b"\0") is None
+        for at, value in ((0, 1), (0, 3), (1, 2), (2, 2), (3, 4), (8, 99), (9, 2), (48, 200)):
+            assert read_batch(batch[:at] + bytes([value]) + batch[at + 1 :]) is None, at
+        assert read_batch(batch[:-1] + b"]") is None
+
+
+@given(st.binary(max_size=400))
+def test_random_bytes_are_refused(payload: bytes) -> None:
+    assert read_batch(payload) is None
+    _, batch = golden("Plant")
+    mixed = batch[: len(payload) % len(batch)] + payload
+    read_batch(mixed)  # refused or read, never an exception

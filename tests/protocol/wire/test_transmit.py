@@ -1,0 +1,156 @@
+"""Transmit policy: a frame at once for a new level, else at the heartbeat, and not before."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import Sender, Transmit
+
+PERIOD_NS = 2_000_000
+COUNTERS = 16
+HEARTBEATS = st.integers(1, COUNTERS // 2 - 1)
+CODES = st.tuples(st.integers(-1, 1), st.integers(0, 1))  # few, so that most ticks repeat the last
+RUN = st.lists(CODES, min_size=1, max_size=100)
+STEPS = st.lists(
+    st.tuples(st.sampled_from((1, 1, 1, 2, COUNTERS - 1, COUNTERS, COUNTERS + 1, 2 * COUNTERS)), CODES),
+    min_size=1,
+    max_size=60,
+)
+
+
+@given(RUN, HEARTBEATS)
+def test_whoever_hears_the_frames_knows_the_codes_of_every_tick(run: list[tuple[int, int]], heartbeat: int) -> None:
+    sender, held = Sender("on_change", heartbeat, COUNTERS), None
+    for k, codes in enumerate(run):
+        if sender.due(k, codes):
+            held = codes
+        assert held == codes
+
+
+@given(RUN, HEARTBEATS)
+def test_without_a_change_a_frame_is_sent_exactly_a_heartbeat_after_the_last(
+    run: list[tuple[int, int]], heartbeat: int
+) -> None:
+    sender = Sender("on_change", heartbeat, COUNTERS)
+    sent = [k for k, codes in enumerate(run) if sender.due(k, codes)]
+    assert sent[0] == 0
+    for last, k in zip(sent, [*sent[1:], len(run)], strict=True):
+        assert k - last <= heartbeat
+        if k < len(run) and k - last < heartbeat:
+            assert run[k] != run[last]
+
+
+@given(STEPS, HEARTBEATS)
+def test_where_ticks_are_missed_a_change_still_reaches_who_takes_a_repeated_counter_for_a_repetition(
+    steps: list[tuple[int, tuple[int, int]]], heartbeat: int
+) -> None:
+    sender, k = Sender("on_change", heartbeat, COUNTERS), -1
+    echo, held, ticks_wrong = -1, None, 0
+    for ahead, codes in steps:
+        k += ahead
+        if sender.due(k, codes) and k % COUNTERS != echo:  # as a plant takes a command
+            echo, held = k % COUNTERS, codes
+        ticks_wrong = 0 if held == codes else ticks_wrong + 1
+        # Only at a tick whose counter is the last one's, which no frame can mend before the next tick.
+        assert ticks_wrong == 0 or k % COUNTERS == echo
+
+
+@given(RUN)
+def test_a_periodic_sender_sends_at_every_tick(run: list[tuple[int, int]]) -> None:
+    sender = Sender("periodic", 3, COUNTERS)
+    assert all(sender.due(k, codes) for k, codes in enumerate(run))
+
+
+def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None:
+    sender = Sender("on_change", 7, COUNTERS)
+    assert [sender.due(k, (1, 2)) for k in range(3)] == [True, False, False]
+    sender.forget()
+    assert [sender.due(k, (1, 2)) for k in range(3, 6)] == [True, False, False]
+    sender.forget()
+    assert [sender.due(k, (1, 2)) for k in range(3 + COUNTERS, 6 + COUNTERS)] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "sent"),
+    [
+        ((0.0, 1.5), (-0.0, 1.5), True),  # two frames, and a law may tell them apart
+        ((-0.0, 1.5), (-0.0, 1.5), False),
+        ((1, 0), (1, 0), False),
+        ((1, 0), (0, 1), True),
+    ],
+)
+def test_a_frame_whose_bits_differ_is_sent(before: tuple[float, ...], now: tuple[float, ...], sent: bool) -> None:
+    sender = Sender("on_change", 7, COUNTERS)
+    assert sender.due(0, before)
+    assert sender.due(1, now) == sent
+
+
+def test_no_valid_value_is_said_once_and_repeated_by_heartbeat_only() -> None:
+    for invalid in ([-32, -32], [float("nan")] * 2):
+        sender = Sender("on_change", 7, COUNTERS)
+        assert [k for k in range(20) if sender.due(k, invalid)] == [0, 7, 14]
+
+
+@pytest.mark.parametrize(
+    ("heartbeat_s", "period_ns", "bits", "ticks"),
+    [
+        (0.03, PERIOD_NS, 8, 15),
+        (0.03, PERIOD_NS, 4, 7),  # four bits of counter allow no more
+        (0.03, 20_000_000, 8, 1),
+        (0.03, 200_000_000, 8, 1),  # a period alone is longer
+        (1.0, PERIOD_NS, 8, 127),
+        (1.0, PERIOD_NS, 10, 500),
+        (1.0, 100_000, 16, 10_000),
+        (0.0059, PERIOD_NS, 8, 2),
+    ],
+)
+def test_the_heartbeat_in_ticks_is_what_fits_into_its_time_and_the_counter(
+    heartbeat_s: float, period_ns: int, bits: int, ticks: int
+) -> None:
+    assert Transmit(heartbeat_s=heartbeat_s).heartbeat_ticks(period_ns, 2**bits) == ticks
+
+
+@given(st.integers(1, 127), st.integers(10, 7_800))
+def test_a_heartbeat_of_so_many_periods_is_as_many_ticks(ticks: int, period_us: int) -> None:
+    """However the binary fraction of it is rounded."""
+    assert Transmit(heartbeat_s=ticks * period_us / 1e6).heartbeat_ticks(period_us * 1000, 256) == ticks
+
+
+def test_one_word_stands_for_both_directions() -> None:
+    both = WireSpec.model_validate({"transmit": "on_change"}).transmit
+    assert both == Transmit(measurement="on_change", command="on_change")
+    assert WireSpec.model_validate({"transmit": "periodic"}) == WireSpec()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "sometimes",
+        {"measurement": "sometimes"},
+        {"heartbeat_s": 0},
+        {"heartbeat_s": -1},
+        {"heartbeat_s": 1.1},
+        {"heartbeat_s": float("nan")},
+        {"heartbeat": 0.03},
+    ],
+)
+def test_what_is_no_way_to_send_is_refused(wrong: object) -> None:
+    with pytest.raises(ValueError, match="transmit"):
+        WireSpec.model_validate({"transmit": wrong})
+
+
+def test_two_wires_that_send_otherwise_differ_and_say_how() -> None:
+    sparse = WireSpec(transmit=Transmit(command="on_change", heartbeat_s=0.02))
+    assert WireSpec().differences(sparse) == [
+        "transmit.command: periodic, not on_change",
+        "transmit.heartbeat_s: 0.03, not 0.02",
+    ]
+
+
+def test_a_wire_that_sends_as_ever_tells_nothing_of_it() -> None:
+    assert "transmit" not in WireSpec().agreed()
+    sparse = WireSpec(transmit=Transmit(measurement="on_change"))
+    assert WireSpec.model_validate(sparse.agreed()) == sparse

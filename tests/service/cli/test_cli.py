@@ -1,0 +1,139 @@
+"""Command line: wrong usage gives one line with a remedy, and an exit code."""
+
+from __future__ import annotations
+
+import json
+import socket
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import load
+
+
+def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    """Exit code and the one line on stderr."""
+    code = run(arguments)
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("aeroloop: ")
+    return code, lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (("lab", "experiment", "--set", "wire.rate.bitz=3"), "wire.rate.bitz"),
+        (("lab", "experiment", "--set", "wires=3"), "wires"),
+        (("lab", "experiment", "--set", "wire.rate.bits=17"), "wire.rate.bits"),
+        (("lab", "experiment", "--set", "law.C2=[0.1, 0.1, -1]"), "law.C2"),
+        (("lab", "experiment", "--set", "nonsense"), "nonsense"),
+        (("lab", "experiment", "--bits-out", "1"), "--bits-out"),
+        (("lab", "experiment", "--bits-in", "many"), "--bits-in"),
+        (("lab", "experiment", "--config", "no/such.toml"), "no/such.toml"),
+        (("lab", "experiment", "--duration", "0"), "--duration"),
+        (("lab", "experiment", "--speed", "9"), "--speed"),
+        (("lab", "fly"), "fly"),
+        (("demo", "--set", "vehicle=a/b"), "vehicle"),
+    ],
+)
+def test_wrong_usage_and_configuration_exit_with_2_and_name_the_culprit(
+    capfd: pytest.CaptureFixture[str], arguments: tuple[str, ...], names: str
+) -> None:
+    code, line = refusal(capfd, *arguments)
+    assert code == 2
+    assert names in line
+
+
+def test_a_broken_configuration_file_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("[wire\n")
+    code, line = refusal(capfd, "show", "config", "--config", str(path))
+    assert code == 2
+    assert str(path) in line
+
+
+def test_a_log_that_is_not_one_exits_with_1(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_text("hello")
+    code, line = refusal(capfd, "log", "review", str(path))
+    assert code == 1
+    assert str(path) in line
+    code, line = refusal(capfd, "log", "review", str(tmp_path / "none.mcap"))
+    assert code == 1
+    assert "none.mcap" in line
+
+
+def test_a_port_in_use_exits_with_1_and_says_which(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        for arguments in (
+            ("--set", f"network.rendezvous={endpoint}"),
+            ("--set", f'network.listen=["{endpoint}"]', "--set", "network.rendezvous="),
+        ):
+            code, line = refusal(capfd, "recorder", "--log", str(tmp_path / "a.mcap"), *arguments)
+            assert code == 1
+            assert endpoint in line
+
+
+def test_a_log_that_cannot_be_written_exits_with_1(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    code, line = refusal(capfd, "recorder", "--log", str(tmp_path / "file" / "a.mcap"), "--set", "network.rendezvous=")
+    assert code == 1
+    assert "a.mcap" in line
+
+
+def test_the_shown_configuration_read_back_is_the_same(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    overrides = ("--set", "wire.attitude.bits=cont", "--set", "loop.rate_hz=1000", "--set", "controller.stale_s=0.05")
+    assert run(["show", "config", *overrides]) == 0
+    path.write_text(capfd.readouterr().out)
+    shown = load(path)
+    assert shown.description() == load(overrides=[text for text in overrides if text != "--set"]).description()
+    assert shown.wire.attitude.bits is None
+    assert shown.description() != load().description()
+
+
+def test_the_environment_overrides_the_file_and_set_overrides_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("vehicle = 'file'\n[loop]\nrate_hz = 100.0\n")
+    assert load(path).vehicle == "file"
+    monkeypatch.setenv("AEROLOOP_VEHICLE", "environment")
+    monkeypatch.setenv("AEROLOOP_LOOP__LOCKSTEP", "true")
+    settings = load(path)
+    assert (settings.vehicle, settings.loop.rate_hz, settings.loop.lockstep) == ("environment", 100.0, True)
+    assert load(path, ["vehicle=option"]).vehicle == "option"
+
+
+def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(["lab", "experiment", "--duration", "0.1", "--json"]) == 0
+    figures = json.loads(capfd.readouterr().out)
+    assert set(figures) >= {
+        "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
+        "latency_us", "log",
+    }  # fmt: skip
+    assert figures["measurement"] == {"frames_per_s": 500.0, "bits_per_s": 28000.0}
+    for name in ("latency_us", "log"):  # null, with the reason beside it
+        assert figures[name] is None
+        assert figures["reasons"][name]
+
+
+def test_every_verb_says_what_it_does_in_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    verbs = ("demo", "controller", "emulator", "recorder", "lab experiment", "log review", "show config", "show spec")
+    for verb in verbs:
+        assert run([*verb.split(), "--help"]) == 0
+        assert "." in capfd.readouterr().out
+
+
+def test_show_config_is_toml_that_names_every_section(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(["show", "config"]) == 0
+    sections = tomllib.loads(capfd.readouterr().out)
+    assert {"loop", "wire", "reference", "law", "controller", "plant", "recorder", "network"} <= set(sections)

@@ -1,0 +1,342 @@
+"""Controller: a frame in, a frame out, and its state in between.
+
+Frames are packed here by protocol.frames, which has its own tests; the controller's results are compared with the NumPy
+twin.
+"""
+
+from __future__ import annotations
+
+from math import cos, isnan, nan, pi, radians, sin
+
+import numpy as np
+import pytest
+
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
+from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.wire.attitude import Quaternion, Vector, sent_vector
+from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.law import LawSettings
+from tests.support import numpy_twin as twin
+from tests.support.numpy_twin import Array
+from tests.support.twin_body import body_of
+
+COUNTERS = 1 << DEFAULT_COUNTER_BITS
+
+PERIOD = 0.002
+PERIOD_NS = 2_000_000
+LAW = LawSettings()
+PAPER = Sinusoid()
+LEVEL = Sinusoid(amplitude=(0.0, 0.0, 0.0))
+"""Hold q_d = [1, 0, 0, 0]."""
+
+QUANTIZED = WireSpec()
+CONTINUOUS = WireSpec().with_bits(None, None)
+AT_REST: Vector = (0.0, 0.0, 0.0)
+
+
+def _controller(wire: WireSpec = CONTINUOUS, reference: Sinusoid = PAPER, law: LawSettings = LAW) -> Controller:
+    return Controller(wire, law, reference, PERIOD)
+
+
+def _yawed(angle: float) -> Quaternion:
+    return cos(angle / 2), 0.0, 0.0, sin(angle / 2)
+
+
+def _frame(wire: WireSpec, counter: int, attitude: Quaternion, rate: Vector) -> bytes:
+    """A measurement as a plant end sends it."""
+    attitude_of, rate_of = wire.attitude.quantizer(), wire.rate.quantizer()
+    codes = [attitude_of.encode(x) for x in sent_vector(attitude)] + [rate_of.encode(x) for x in rate]
+    return wire.measurement.pack(counter % COUNTERS, codes)
+
+
+def _answer(wire: WireSpec, frame: bytes | None) -> tuple[int, list[float]]:
+    """Echo and voltages [V] of a command frame."""
+    assert frame is not None
+    read = wire.command.unpack(frame)
+    assert read is not None
+    return read[0], [wire.voltage.quantizer().level(code) for code in read[1]]
+
+
+class TwinLoop:
+    """The twin of the controller between its frames: law, reference, θ̂ and the sign."""
+
+    def __init__(self, reference: Sinusoid, law: LawSettings = LAW) -> None:
+        self.body = body_of(law)
+        self.reference = twin.Sinusoids(np.radians(reference.amplitude), np.array(reference.frequency))
+        self.theta: Array = np.array(law.damping_estimate)
+        self.s = 0.0
+        self.e: Array = np.zeros(4)
+
+    def tick(self, q: Array, omega: Array, k: int) -> Array:
+        """u₂ and u₃ before any limit [V]."""
+        desired = self.reference.desired(k * PERIOD)
+        if not self.s:
+            eta_e = q @ desired[0]  # the scalar of (C.16) is the quaternions' inner product
+            self.s = 1.0 if eta_e >= 0 else -1.0
+        state = twin.law(self.body, q, omega, *desired, self.theta, self.s)
+        self.theta = self.theta + PERIOD * state.theta_dot
+        self.e = state.e
+        return state.u[1:]
+
+
+# Frames in, frames out
+
+
+@pytest.mark.parametrize("wire", [QUANTIZED, CONTINUOUS], ids=["8/6 bits", "cont"])
+def test_every_answer_echoes_the_counter_of_its_measurement(wire: WireSpec) -> None:
+    controller = _controller(wire)
+    for k in range(2 * COUNTERS):
+        counter = (5 * k + 3) % COUNTERS  # in no order: the counter is the plant's business
+        echo, _ = _answer(wire, controller.tick(_frame(wire, counter, _yawed(0.1), AT_REST), k))
+        assert (echo, controller.counter, controller.tick_index) == (counter, counter, k)
+
+
+def test_nothing_in_gives_nothing_out() -> None:
+    controller = _controller()
+    assert controller.tick(None, 0) is None
+    assert (controller.tick_index, controller.sign, controller.refused) == (-1, 0, 0)
+
+
+@pytest.mark.parametrize("wire", [QUANTIZED, CONTINUOUS], ids=["8/6 bits", "cont"])
+def test_malformed_bytes_are_counted_and_give_nothing_out(wire: WireSpec) -> None:
+    quantized, wire = (
+        wire is QUANTIZED,
+        WireSpec.model_validate({**wire.model_dump(), "counter_bits": 4}),
+    )  # has padding
+    controller, untouched = _controller(wire), _controller(wire)
+    frame = _frame(wire, 7, _yawed(0.3), (0.1, 0.2, 0.3))
+    # 8 bits: the padding's last bit is set; cont: a bit of the gap after the counter is
+    padding = frame[:-1] + bytes([frame[-1] | 1]) if quantized else bytes([frame[0] | 1]) + frame[1:]
+    for k, junk in enumerate((b"", frame[:-1], frame + b"\0", padding)):
+        assert controller.tick(junk, k) is None
+        assert controller.refused == k + 1
+    assert controller.tick(frame, 9) == untouched.tick(frame, 9)  # it left no trace
+    assert controller.refused == 4
+
+
+@pytest.mark.parametrize("wire", [QUANTIZED, CONTINUOUS], ids=["8/6 bits", "cont"])
+@pytest.mark.parametrize("failed", range(6))
+def test_a_measurement_without_a_valid_value_is_answered_by_a_command_without_one(wire: WireSpec, failed: int) -> None:
+    controller, untouched = _controller(wire), _controller(wire)
+    good = _frame(wire, 1, _yawed(0.1), (0.1, 0.2, 0.3))
+    read = wire.measurement.unpack(good)
+    assert read is not None
+    codes = list(read[1])
+    codes[failed] = (wire.attitude if failed < 3 else wire.rate).quantizer().invalid
+    echo, voltages = _answer(wire, controller.tick(wire.measurement.pack(2, codes), 4))
+    assert echo == 2
+    assert all(isnan(u) for u in voltages)
+    assert controller.invalid == 1
+    assert (controller.tick_index, controller.sign) == (-1, 0)
+    assert controller.tick(good, 5) == untouched.tick(good, 5)  # θ̂ and the sign know nothing of it
+
+
+def test_three_actuators_get_three_voltages() -> None:
+    wire = WireSpec(actuators=3).with_bits(None, None)
+    controller, two = _controller(wire), _controller(CONTINUOUS)
+    attitude, rate = (0.98, 0.05, 0.02, (1 - 0.98**2 - 0.05**2 - 0.02**2) ** 0.5), (0.01, 0.02, 0.03)
+    _, voltages = _answer(wire, controller.tick(_frame(wire, 0, attitude, rate), 0))
+    _, last_two = _answer(CONTINUOUS, two.tick(_frame(CONTINUOUS, 0, attitude, rate), 0))
+    u1 = twin.law(
+        body_of(LAW), np.array(attitude), np.array(rate), *_desired_at_start(), np.array(LAW.damping_estimate), 1.0
+    ).u[0]
+    assert voltages[1:] == last_two
+    # rounding of some hundred operations; the row of u₁ is the fictitious identity
+    assert voltages[0] == pytest.approx(u1, rel=1e-12)
+
+
+def _desired_at_start() -> tuple[Array, Array, Array]:
+    return twin.Sinusoids(np.radians(PAPER.amplitude), np.array(PAPER.frequency)).desired(0.0)
+
+
+def test_voltages_beyond_the_range_are_sent_as_its_edge_and_counted() -> None:
+    turned = _yawed(radians(60))  # B needs u₂ = −u₃·0.79 or so for a torque of 0.5 N·m: hundreds of volts
+    controller = _controller(CONTINUOUS, LEVEL)
+    for n in (1, 2, 3):
+        _, voltages = _answer(CONTINUOUS, controller.tick(_frame(CONTINUOUS, n, turned, AT_REST), n))
+        assert [abs(u) for u in voltages] == [24.0, 24.0]
+        assert [np.sign(u) for u in voltages] == [np.sign(u) for u in controller.voltages]
+        assert min(abs(u) for u in controller.voltages) > 24.0  # what it keeps is u before quantization
+        assert controller.saturated == 2 * n
+    _answer(CONTINUOUS, controller.tick(_frame(CONTINUOUS, 4, _yawed(0.0), AT_REST), 4))
+    assert controller.saturated == 6
+
+
+def test_a_law_without_inverse_is_refused() -> None:
+    law = LawSettings(allocation=((1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 1.0)))
+    with pytest.raises(ValueError, match="no inverse"):
+        _controller(law=law)
+
+
+# What it tells of itself
+
+
+def test_what_it_tells_is_what_the_law_computed() -> None:
+    controller, loop = _controller(), TwinLoop(PAPER)
+    attitude, rate = _yawed(0.2), (0.02, -0.03, 0.05)
+    controller.tick(_frame(CONTINUOUS, 3, attitude, rate), 250)
+    u = loop.tick(np.array(attitude), np.array(rate), 250)
+    desired = loop.reference.desired(250 * PERIOD)
+    state = twin.law(loop.body, np.array(attitude), np.array(rate), *desired, np.array(LAW.damping_estimate), 1.0)
+    # all by some hundred operations of 2e-16; the voltages have B's condition of 900 on top
+    assert controller.attitude_error == pytest.approx(state.e[1:], abs=1e-14)
+    assert controller.rate_error == pytest.approx(state.omega_e, abs=1e-14)
+    assert controller.desired == pytest.approx(desired[0], abs=1e-14)
+    assert controller.damping_estimate == pytest.approx(loop.theta, abs=1e-14)
+    assert controller.voltages == pytest.approx(u, rel=1e-12)
+    assert (controller.sign, controller.tick_index, controller.counter) == (1, 250, 3)
+
+
+# The sign of z₁, Assumption 3
+
+AHEAD = Sinusoid(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi))
+"""Yaw is at its crest of 170° at t = 0.5 s, tick 250."""
+
+
+def test_the_sign_is_that_of_the_first_error_and_stays() -> None:
+    near = _controller(reference=LEVEL)
+    near.tick(_frame(CONTINUOUS, 0, _yawed(radians(100)), AT_REST), 0)
+    assert near.sign == 1
+
+    far = _controller(reference=AHEAD)
+    far.tick(_frame(CONTINUOUS, 0, _yawed(radians(-170)), AT_REST), 250)  # η̃ = cos 170° < 0: 20° the short way
+    assert far.sign == -1
+    for k, yaw in enumerate((-120, -60, 0, 60, 120, 170), start=251):  # all the way round: η̃ = +1 at the end
+        far.tick(_frame(CONTINUOUS, k, _yawed(radians(yaw)), AT_REST), k)
+    # the desired yaw is 6 ticks past its crest: 170° (1 − cos 2°) = 0.12°, so ε̃ = sin 0.06°
+    assert far.attitude_error == pytest.approx((0.0, 0.0, sin(radians(85 * (1 - cos(0.012 * pi))))), abs=1e-12)
+    assert far.sign == -1
+
+
+def test_a_measurement_without_a_valid_value_does_not_choose_the_sign() -> None:
+    controller = _controller(reference=AHEAD)
+    controller.tick(CONTINUOUS.measurement.pack(0, [nan] * 6), 250)
+    assert controller.sign == 0
+    controller.tick(_frame(CONTINUOUS, 1, _yawed(radians(-170)), AT_REST), 250)
+    assert controller.sign == -1
+
+
+def test_from_a_large_attitude_the_body_turns_the_short_way() -> None:
+    """Yaw −170° to a desired 170°: with z₁₋ it turns by −20°, through the back, and not by +340°."""
+    held = Sinusoid(amplitude=(0.0, 0.0, 170.0), frequency=(0.0, 0.0, pi / 60))  # crest at 30 s, and slow there
+    aero = IDEAL_AERO
+    plant = twin.LockedBody(
+        body_of(LAW),
+        np.vstack([np.zeros(2), aero.thrust]),
+        np.array(aero.damping),
+        np.array([0.0, radians(-170), 0, 0]),
+    )
+    controller = _controller(reference=held)
+    yaws = []
+    for k in range(14_000, 16_000):  # 28 s to 32 s
+        _, u = _answer(CONTINUOUS, controller.tick(_frame(CONTINUOUS, k, _q(plant), _w(plant)), k))
+        plant.advance(np.array(u), PERIOD, 1)
+        yaws.append(np.degrees(plant.x[1]))
+    assert controller.sign == -1
+    assert max(yaws) < -170  # never the long way, from the first tick on
+    assert yaws[-1] > -200  # −190° is 170°
+    # Around rest this is a mass of 0.0218 kg·m² on a spring of ½ N·m/rad, nearly critically damped by C₂: 4 s are 16
+    # time constants. What stays is damping that the law does not know, 0.0125 N·m·s/rad, at up to 0.02 rad/s and on a
+    # gain of 1; twice that for the acceleration of the reference.
+    assert max(abs(error) for error in controller.attitude_error) < 0.0125 * 0.02 * 2
+
+
+def _q(plant: twin.LockedBody) -> Quaternion:
+    w, x, y, z = (float(value) for value in plant.q)
+    return w, x, y, z
+
+
+def _w(plant: twin.LockedBody) -> Vector:
+    x, y, z = (float(value) for value in plant.omega)
+    return x, y, z
+
+
+# The sign of q through full turns, Remarks 1 and 2
+
+STEADY = LawSettings(Gamma=(1e-9, 1e-9, 1e-9))
+"""Does not adapt, so u depends on the attitude and the rate alone."""
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_through_full_turns_the_law_sees_the_attitude_that_never_jumped(direction: int) -> None:
+    """ε as sent jumps at each half turn; u must be that of the quaternion which turns on and on."""
+    wire = CONTINUOUS.model_copy(update={"rate": CONTINUOUS.rate.model_copy(update={"limit": 10.0})})
+    controller, loop = _controller(wire, LEVEL, STEADY), TwinLoop(LEVEL, STEADY)
+    rate = direction * 6.0
+    jumps = 0
+    last = sent_vector(_yawed(0.0))
+    for k in range(round(3 * 2 * pi / 6.0 / PERIOD)):  # three turns
+        q = _yawed(rate * k * PERIOD)
+        sent = sent_vector(q)
+        jumps += abs(sent[2] - last[2]) > 1
+        last = sent
+        controller.tick(_frame(wire, k, q, (0.0, 0.0, rate)), k)
+        expected = loop.tick(np.array(q), np.array([0.0, 0.0, rate]), k)
+        # Rounding as elsewhere, but η = √(1 − εᵀε): an error of 2e-16 in ε is one of 2e-16/η in η, and of all these
+        # ticks the one nearest to a half turn has η = 2e-5.
+        assert controller.voltages == pytest.approx(expected, rel=1e-11)
+    assert jumps == 3  # the sign sent did turn over, once a turn
+
+
+def test_through_full_turns_of_a_quantized_attitude_no_voltage_jumps() -> None:
+    wire = WireSpec(rate=QUANTIZED.rate.model_copy(update={"limit": 10.0}))
+    controller = _controller(wire, LEVEL, STEADY)
+    rate = 6.0
+    quantizer = wire.attitude.quantizer()
+    # At a constant rate u changes with ε̃ and η̃ alone. ε̃ moves by half the angle turned, and by quantization at both
+    # ends; so does η̃ = √(1 − ε̃²), but near η̃ = 0 an error δ of ε̃ is one of up to √(2δ). They enter (C.37) with gains
+    # 1 + C₁C₂ and J C₁ ω/2; weight does not enter, as yaw does not tilt the body.
+    delta = rate * PERIOD / 2 + 2 * quantizer.bound
+    moment = (1 + 0.3 * 0.15) * delta + 0.0218 * 0.3 / 2 * rate * (2 * (2 * delta) ** 0.5)
+    inverse = np.linalg.inv(np.array(LAW.allocation)[1:, 1:])
+    smooth = np.linalg.norm(inverse, ord=2) * moment
+    wrong_sign = np.linalg.norm(inverse @ [0.0, 2 * (1 + 0.3 * 0.15)])
+    assert 10 * smooth < wrong_sign  # so what is asserted below tells one from the other
+    before = None
+    for k in range(round(3 * 2 * pi / rate / PERIOD)):
+        controller.tick(_frame(wire, k, _yawed(rate * k * PERIOD), (0.0, 0.0, rate)), k)
+        now = np.array(controller.voltages)
+        if before is not None:
+            assert np.linalg.norm(now - before) <= smooth
+        before = now
+
+
+# The whole loop
+
+
+def test_the_closed_loop_agrees_with_the_twins() -> None:
+    """Controller, frames, endpoint and Aero against law twin and plant twin, tick by tick."""
+    aero = IDEAL_AERO
+    plant = PlantSettings(ideal=True).build(PERIOD)
+    endpoint = Endpoint(plant, CONTINUOUS, PERIOD_NS, lockstep=True)
+    claim = Claim(controller="test", session="loop", period_ns=PERIOD_NS, lockstep=True, auto_arm=True, wire=CONTINUOUS)
+    assert isinstance(endpoint.claim(claim), Grant)
+    controller, loop = _controller(), TwinLoop(PAPER)
+    body = twin.LockedBody(body_of(LAW), np.vstack([np.zeros(2), aero.thrust]), np.array(aero.damping), np.zeros(4))
+    q: Array = np.array([1.0, 0.0, 0.0, 0.0])
+    measurement = endpoint.tick(None, 0)
+    limited = 0
+    for k in range(1000):
+        command = controller.tick(measurement, k)
+        q = twin.reconstructed(body.q[1:] * (1 if body.q[0] >= 0 else -1), q)
+        u = loop.tick(q, body.omega, k)
+        held = np.clip(u, -24.0, 24.0)
+        limited += bool(np.any(held != u))
+        # A tick rounds by 1e-13 of u (B's condition). The loop is stable and forgets it within a second, 500 ticks,
+        # so what has gathered stays below 500 of these.
+        assert controller.voltages == pytest.approx(u, rel=5e-11, abs=5e-11)
+        assert controller.attitude_error == pytest.approx(loop.e[1:], abs=1e-12)
+        assert controller.damping_estimate == pytest.approx(loop.theta, abs=1e-12)
+        _, sent = _answer(CONTINUOUS, command)
+        assert sent == pytest.approx(held, rel=5e-11, abs=5e-11)
+        measurement = endpoint.tick(command, k + 1)
+        body.advance(held, PERIOD, PlantSettings().substeps)
+        assert plant.truth().attitude == pytest.approx(body.q, abs=1e-12)
+        assert plant.truth().rate == pytest.approx(body.omega, abs=1e-12)
+    assert limited > 0  # the start is hard enough to meet the limits, which are part of what is compared
+    assert abs(body.x[1]) > radians(10)  # and it went somewhere
+    assert endpoint.accepted == 1000

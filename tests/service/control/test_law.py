@@ -1,0 +1,365 @@
+"""Control law of the paper: agrees with an independent twin and has the properties that the paper proves.
+
+States, bodies and gains are random and states move, so that no term hides behind a zero, a symmetry or a product of
+equal numbers.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quaternion
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.control.law import Law, LawSettings, build_law, law_function, law_steps, projection
+from tests.support import numpy_twin as twin
+from tests.support.numpy_twin import Array
+from tests.support.twin_body import body_of
+
+both_signs = pytest.mark.parametrize("s", [1.0, -1.0])
+both_bodies = pytest.mark.parametrize("paper", [True, False], ids=["paper's body", "random bodies"])
+
+
+@dataclass(frozen=True)
+class Point:
+    """Everything that the law depends on, and the true θ that it does not know."""
+
+    q: Array
+    omega: Array
+    q_d: Array
+    omega_d: Array
+    omega_d_dot: Array
+    theta: Array
+    true_theta: Array
+
+
+def _sent(q: Array) -> Array:
+    """ε on the wire: of whichever of ±q has η ≥ 0."""
+    return q[1:] if q[0] >= 0 else -q[1:]
+
+
+def _unit(rng: np.random.Generator, size: int) -> Array:
+    v = rng.normal(size=size)
+    return np.asarray(v / np.linalg.norm(v), dtype=np.float64)
+
+
+def _point(rng: np.random.Generator, bound: float) -> Point:
+    """A moving state. Every other θ̂ lies where the projection acts, between 0.95 k_θ and k_θ."""
+    length = rng.uniform(0.95, 1.0) if rng.uniform() < 0.5 else rng.uniform(0.0, 0.95)
+    return Point(
+        q=_unit(rng, 4),
+        omega=rng.normal(size=3),
+        q_d=_unit(rng, 4),
+        omega_d=rng.normal(size=3),
+        omega_d_dot=rng.normal(size=3),
+        theta=_unit(rng, 3) * length * bound,
+        true_theta=rng.normal(size=3) * bound,
+    )
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _random_settings(rng: np.random.Generator) -> LawSettings:
+    """A body and gains that have nothing in common with Table C.1."""
+    allocation = rng.normal(size=(3, 3)) + 3 * np.identity(3)  # + 3 I: well away from singular
+    return LawSettings(
+        inertia=_triple(rng.uniform(0.5, 2.0, 3)),
+        mass=float(rng.uniform(0.5, 2.0)),
+        gravity=float(rng.uniform(5.0, 10.0)),
+        centre_of_mass=_triple(rng.normal(size=3)),
+        allocation=(_triple(allocation[0]), _triple(allocation[1]), _triple(allocation[2])),
+        C1=_triple(rng.uniform(0.1, 2.0, 3)),
+        C2=_triple(rng.uniform(0.1, 2.0, 3)),
+        Gamma=_triple(rng.uniform(0.1, 2.0, 3)),
+        damping_bound=float(rng.uniform(0.1, 2.0)),
+    )
+
+
+def _array(value: ca.DM) -> Array:
+    return np.array(value, dtype=np.float64).ravel()
+
+
+class ClosedLoop:
+    """The law on a body without quantization, and derivatives along it.
+
+    The body is written out here and not taken from the project: kinematics as products of quaternions, gravity through
+    the last row of the rotation matrix.
+    """
+
+    def __init__(self, p: LawSettings) -> None:
+        self._p = p
+        self.law = law = build_law(p)
+        self.true_theta = ca.SX.sym("true_theta", 3)
+        self._moves = [
+            (law.q, _product(law.q, ca.vertcat(0, law.omega)) / 2),  # (C.1): ω in the body frame
+            (law.omega, _omega_dot(p, law, self.true_theta)),  # (C.2)
+            (law.q_d, _product(ca.vertcat(0, law.omega_d), law.q_d) / 2),  # (C.12): ω_d in the inertial frame
+            (law.omega_d, law.omega_d_dot),
+            (law.theta, law.tau),  # (C.23), which does not project
+        ]
+
+    def rates(self, y: ca.SX) -> list[ca.SX]:
+        """ẏ as its addends, one for each thing that moves."""
+        return [ca.jacobian(y, x) @ x_dot for x, x_dot in self._moves]
+
+    def evaluator(self, *expressions: ca.SX) -> ca.Function:
+        """A function of a point's fields and the sign."""
+        law = self.law
+        symbols = [law.q, law.omega, law.q_d, law.omega_d, law.omega_d_dot, law.theta, self.true_theta, law.s]
+        gains = [law.C1, law.C2, law.Gamma]
+        values = [ca.SX(gain) for gain in (self._p.C1, self._p.C2, self._p.Gamma)]
+        return ca.Function("values", symbols, ca.substitute(list(expressions), gains, values))
+
+
+def _product(p: ca.SX, q: ca.SX) -> ca.SX:
+    """Hamilton's p ⊗ q, by its sixteen products."""
+    return ca.vertcat(
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+def _omega_dot(p: LawSettings, law: Law, true_theta: ca.SX) -> ca.SX:
+    """(C.2) solved for ω̇, with the law's u."""
+    w, x, y, z = (law.q[i] for i in range(4))
+    up = ca.vertcat(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))  # seen from the body
+    weight = -p.mass * p.gravity * up
+    J = ca.SX(p.inertia)
+    torque = (
+        ca.cross(ca.SX(p.centre_of_mass), weight)
+        - ca.cross(law.omega, J * law.omega)
+        - true_theta * law.omega
+        + ca.SX(np.array(p.allocation)) @ law.u
+    )
+    return torque / J
+
+
+def _values(function: ca.Function, x: Point, s: float) -> Sequence[Array]:
+    return [_array(v) for v in function(x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, x.true_theta, s)]
+
+
+def _close(a: Array, b: Array) -> bool:
+    """Equal but for rounding: 2e-16 through some hundred operations, times the condition of B, 900 for the paper's."""
+    return bool(np.linalg.norm(a - b) <= 1e-12 * np.linalg.norm(b))
+
+
+@both_signs
+@both_bodies
+def test_the_law_agrees_with_the_twin_at_moving_states(paper: bool, s: float) -> None:
+    rng = np.random.default_rng(1)
+    projected = 0
+    for _ in range(1 if paper else 20):
+        p = LawSettings() if paper else _random_settings(rng)
+        loop = ClosedLoop(p)
+        law = loop.law
+        e = ca.vertcat(law.eta_e, law.eps_e)
+        function = loop.evaluator(law.u, law.theta_dot, law.tau, e, law.omega_e, law.z1, law.z2)
+        for _ in range(100 if paper else 5):
+            x = _point(rng, p.damping_bound)
+            t = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+            expected = (t.u, t.theta_dot, t.tau, t.e, t.omega_e, t.z1, t.z2)
+            assert all(_close(a, b) for a, b in zip(_values(function, x, s), expected, strict=True))
+            projected += bool(np.any(t.theta_dot != t.tau))
+    assert 10 < projected < 90  # of a hundred: both branches of the projection were drawn often
+
+
+@both_signs
+def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -> None:
+    rng = np.random.default_rng(2)
+    period = 0.01
+    for _ in range(30):
+        p = _random_settings(rng)
+        x = _point(rng, 0.5 * p.damping_bound)  # so far inside k_θ that a period does not lead out
+        expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+        tick = law_function(p, period)(
+            eps=_sent(x.q),
+            last=x.q,
+            omega=x.omega,
+            q_d=x.q_d,
+            omega_d=x.omega_d,
+            omega_d_dot=x.omega_d_dot,
+            theta=x.theta,
+            s=s,
+            C1=p.C1,
+            C2=p.C2,
+            Gamma=p.Gamma,
+        )
+        assert _close(_array(tick["u"]), expected.u)
+        assert _close(_array(tick["theta_next"]), x.theta + period * expected.theta_dot)
+        assert _close(np.append(_array(tick["eta_e"]), _array(tick["eps_e"])), expected.e)
+        assert _close(_array(tick["omega_e"]), expected.omega_e)
+
+
+@both_signs
+@both_bodies
+def test_without_quantization_the_lyapunov_function_falls_exactly_as_c25_says(paper: bool, s: float) -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(1 if paper else 10):
+        p = LawSettings() if paper else _random_settings(rng)
+        loop = ClosedLoop(p)
+        z1, z2 = loop.law.z1, loop.law.z2
+        wrong = loop.true_theta - loop.law.theta
+        V = ca.dot(z1, z1) + ca.dot(z2, ca.SX(p.inertia) * z2) / 2 + ca.dot(wrong, wrong / ca.SX(p.Gamma)) / 2  # (C.24)
+        power = ca.fabs(z2).T @ ca.fabs(ca.SX(np.array(p.allocation))) @ ca.fabs(loop.law.u)
+        function = loop.evaluator(ca.vertcat(*loop.rates(V)), power, loop.law.eps_e, z2)
+        for _ in range(30):
+            addends, through_B, eps_e, z_2 = _values(function, _point(rng, p.damping_bound), s)
+            promised = -eps_e @ np.diag(p.C1) @ eps_e - z_2 @ np.diag(p.C2) @ z_2  # (C.25) with (C.49)
+            # V̇ is a sum of large addends that cancel, z₂ᵀB u among them: it can be no more exact than 2e-16 of these,
+            # times the few hundred operations behind each.
+            scale = np.abs(addends).sum() + through_B.sum()
+            assert abs(addends.sum() - promised) <= 1e-12 * scale
+            assert promised < -1e-6 * scale  # what is claimed stands well above that tolerance
+
+
+@both_signs
+def test_without_quantization_c46_is_the_derivative_of_the_virtual_control(s: float) -> None:
+    """α is the law's; ᾱ is the twin's, which the first test above holds to be the law's."""
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        p = _random_settings(rng)
+        loop = ClosedLoop(p)
+        alpha = loop.law.omega_e - loop.law.z2  # (C.19)
+        function = loop.evaluator(alpha, ca.vertcat(*loop.rates(alpha)))
+        for _ in range(10):
+            x = _point(rng, p.damping_bound)
+            value, rates = _values(function, x, s)
+            rates = rates.reshape(-1, 3)  # a row for each thing that moves
+            expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
+            # α = ω_e − z₂ rounds at the size of ω_e; α̇ at the size of its addends; 2e-16, some hundred operations
+            assert np.abs(value - expected.alpha).max() <= 1e-13 * (1 + np.linalg.norm(expected.omega_e))
+            assert np.abs(rates.sum(axis=0) - expected.alpha_bar).max() <= 1e-13 * np.abs(rates).sum()
+
+
+BOUND = 0.05
+GAMMA = np.array([0.02, 0.01, 0.05])
+
+
+def _projection() -> ca.Function:
+    tau, theta = ca.SX.sym("tau", 3), ca.SX.sym("theta", 3)
+    return ca.Function("projection", [tau, theta], [projection(tau, theta, ca.diag(ca.SX(GAMMA)), BOUND)])
+
+
+def _drive(rng: np.random.Generator) -> Array:
+    """A τ of any direction and, over eight decades, any size."""
+    return np.asarray(rng.normal(size=3) * 10.0 ** rng.uniform(-6, 2), dtype=np.float64)
+
+
+def test_the_projection_changes_nothing_inside_the_inner_ball() -> None:
+    rng = np.random.default_rng(5)
+    proj = _projection()
+    for _ in range(100):
+        tau = _drive(rng)
+        assert np.array_equal(_array(proj(tau, _unit(rng, 3) * 0.949 * BOUND * rng.uniform())), tau)
+        assert np.array_equal(_array(proj(tau, np.zeros(3))), tau)  # θ̂ = 0 has no direction to divide by
+
+
+def test_the_projection_changes_nothing_that_points_inwards() -> None:
+    rng = np.random.default_rng(6)
+    proj = _projection()
+    for _ in range(100):
+        tau, direction = _drive(rng), _unit(rng, 3)
+        if tau @ direction > 0:
+            tau = -tau
+        assert np.array_equal(_array(proj(tau, direction * BOUND)), tau)
+
+
+def test_the_projection_stops_what_points_outwards_at_the_bound() -> None:
+    rng = np.random.default_rng(7)
+    proj = _projection()
+    for _ in range(100):
+        tau, direction = _drive(rng), _unit(rng, 3)
+        if tau @ direction < 0:
+            tau = -tau
+        outwards = direction @ _array(proj(tau, direction * BOUND))
+        # all of it is taken away; what is left is rounding of ‖τ‖: ten operations of 2e-16, times Γ's condition of 5
+        assert abs(outwards) <= 1e-14 * np.linalg.norm(tau)
+
+
+def test_the_projection_takes_away_more_the_nearer_the_bound_is() -> None:
+    rng = np.random.default_rng(8)
+    proj = _projection()
+    for _ in range(20):
+        tau, direction = _drive(rng), _unit(rng, 3)
+        if tau @ direction < 0:
+            tau = -tau
+        speeds = [direction @ _array(proj(tau, direction * BOUND * r)) for r in (0.95, 0.9625, 0.975, 0.9875, 1.0)]
+        assert all(nearer < farther for farther, nearer in pairwise(speeds))
+
+
+def test_the_projection_never_hurts_the_lyapunov_function() -> None:
+    """Remark 5: −θ̃ᵀΓ⁻¹Proj(τ) ≤ −θ̃ᵀΓ⁻¹τ, for any true θ in the inner ball."""
+    rng = np.random.default_rng(9)
+    proj = _projection()
+    helped = 0
+    for _ in range(300):
+        tau = _drive(rng)
+        theta = _unit(rng, 3) * BOUND * rng.uniform(0.9, 1.0)
+        wrong = _unit(rng, 3) * 0.95 * BOUND * rng.uniform() - theta
+        with_projection, without = -(wrong / GAMMA) @ _array(proj(tau, theta)), -(wrong / GAMMA) @ tau
+        # rounding of the two sums: 2e-16 times the size of their addends, some tens of operations
+        assert with_projection <= without + 1e-14 * np.linalg.norm(wrong / GAMMA) * np.linalg.norm(tau)
+        helped += with_projection < 0.99 * without
+    assert helped > 30  # it did act, and by more than rounding
+
+
+@pytest.mark.parametrize("gain", [1.0, 100.0])
+def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> None:
+    """Remark 5: ‖θ̂‖ ≤ k_θ, at every tick and not only in continuous time."""
+    rng = np.random.default_rng(10)
+    p = LawSettings(Gamma=_triple(0.02 * gain * np.ones(3)))
+    tick = law_function(p, 0.002)
+    theta = np.array([0.0, 0.0, p.damping_bound])
+    x = _point(rng, p.damping_bound)
+    pressed = 0
+    for k in range(3000):
+        if k % 300 == 0:
+            x = _point(rng, p.damping_bound)  # another drive, kept long enough to press against the bound
+        desired = x.q_d, x.omega_d, x.omega_d_dot
+        theta = _array(tick(x.q, theta, _sent(x.q), x.omega, *desired, 1.0, p.C1, p.C2, p.Gamma)[2])
+        pressed += bool(np.linalg.norm(theta) > 0.95 * p.damping_bound)
+        # scaling to a length of k_θ rounds in the last place
+        assert np.linalg.norm(theta) <= p.damping_bound * (1 + 1e-15)
+    assert pressed > 300
+
+
+@pytest.mark.parametrize(
+    "allocation",
+    [
+        ((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, 0.0011, 0.0011)),  # two motors that do the same
+        ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -0.0014, 0.00176)),  # an axis that no motor acts on
+    ],
+)
+def test_an_allocation_without_inverse_is_refused(allocation: tuple[tuple[float, float, float], ...]) -> None:
+    settings = LawSettings.model_validate({"allocation": allocation})
+    with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
+        build_law(settings)
+    with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
+        law_function(settings, 0.002)
+
+
+def test_attitudes_are_received_to_the_bits_of_the_plain_function() -> None:
+    """Whether the last pointed away, along, or at a right angle, or ε was longer than 1, or −0."""
+    corners = [0.0, -0.0, 0.6, -0.6, 0.8, -0.8, 1.0, -1.0, 1.3, 1e200]
+    rng = np.random.default_rng(0)
+    step = Compiled(law_steps(LawSettings(), 0.002).attitude)
+    last, eps, q = step.inputs["last"], step.inputs["eps"], step.outputs["q"]
+    starts: list[Quaternion] = [IDENTITY, (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.6, -0.8)]
+    for before in starts:
+        now = before
+        for x, y, z in rng.choice(corners, size=(2000, 3), p=[0.25, 0.05, *[0.1] * 6, 0.05, 0.05]).tolist():
+            last[:], eps[:] = memoryview(array("d", now)), memoryview(array("d", (x, y, z)))
+            step()
+            now = received_quaternion(x, y, z, now)
+            assert q.tobytes() == array("d", now).tobytes()

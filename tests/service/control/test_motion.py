@@ -1,0 +1,659 @@
+"""Reference under any sequence of operator's changes: never jumps, stays within limits, and arrives.
+
+Angles are compared with polynomials and sines written here, and q_d, ω_d, ω̇_d with those of the NumPy twin: the three
+turns by hand. Joins are checked just before and just after.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import nextafter, pi, radians
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from aeroloop.protocol.messages.operator import (
+    MAX_POINTS,
+    Gains,
+    Hold,
+    Message,
+    Points,
+    Reference,
+    Setpoint,
+    Sinusoid,
+    Stream,
+    Track,
+)
+from aeroloop.protocol.wire.symbolic import buffer
+from aeroloop.service.control.reference import Angles, FollowError, Limits, Motion, Plan
+from tests.support.numpy_twin import Array, Sinusoids
+
+EPS: Final = 2.0**-52
+NO_LIMITS = Limits(rate=1e9, tilt=pi, rolls=True)
+BENCH = Limits(rate=1.0, tilt=radians(60), rolls=False)
+"""A 2-DOF bench as configured unless told otherwise."""
+BODY = BENCH._replace(rolls=True)
+
+# What can be asked
+
+
+def triples(limit: float) -> st.SearchStrategy[tuple[float, float, float]]:
+    """Roll, pitch, yaw [deg], in steps of a hundredth: what matters lies in between, not in the last bit."""
+    angle = st.integers(round(-100 * limit), round(100 * limit)).map(lambda n: n / 100)
+    return st.tuples(angle, angle, angle)
+
+
+def seconds(least: float, most: float) -> st.SearchStrategy[float]:
+    """Times to the millisecond [s]."""
+    return st.integers(round(1000 * least), round(1000 * most)).map(lambda n: n / 1000)
+
+
+@st.composite
+def some_points(draw: st.DrawFn) -> Points:
+    """Two to six points, 0.05 s to 3 s from each other."""
+    gaps = draw(st.lists(seconds(0.05, 3.0), min_size=1, max_size=5))
+    times = [0.0, *(float(t) for t in np.cumsum(gaps))]
+    return Points(times=times, attitudes=draw(st.lists(triples(60), min_size=len(times), max_size=len(times))))
+
+
+holds = triples(60).map(lambda attitude: Hold(attitude=attitude))
+frequencies = st.integers(0, 30).map(lambda n: n / 10)
+sinusoids = st.builds(Sinusoid, amplitude=triples(60), frequency=st.tuples(frequencies, frequencies, frequencies))
+references: st.SearchStrategy[Reference] = st.one_of(holds, sinusoids, some_points())
+withins = seconds(0.02, 5.0)
+
+# A second opinion of a plan
+
+
+def states(plan: Plan, t: float, *, before: bool = False) -> tuple[Array, Array, Array]:
+    """Angle, rate, acceleration, each of shape (3,), term by term; on a join, of the piece after it unless `before`."""
+    begun = [i for i, start in enumerate(plan.starts) if (start < t if before else start <= t)]
+    return piece_states(plan, begun[-1] if begun else 0, t)
+
+
+def piece_states(plan: Plan, i: int, t: float | Array) -> tuple[Array, Array, Array]:
+    """As above, of one piece, wherever t lies; of many times at once if they are of shape (m, 1)."""
+    tau, c = t - plan.starts[i], plan.quintic[i]
+    a, f = plan.amplitude[i], plan.frequency[i]
+    powers = range(6)
+    return (
+        sum((c[n] * tau**n for n in powers), a * np.sin(f * tau)),
+        sum((n * c[n] * tau ** (n - 1) for n in powers[1:]), a * f * np.cos(f * tau)),
+        sum((n * (n - 1) * c[n] * tau ** (n - 2) for n in powers[2:]), -a * f * f * np.sin(f * tau)),
+    )
+
+
+def quaternion(angles: Array) -> Array:
+    """The twin's q_d, multiplied out, of angles that stand still."""
+    return desired_of((angles, np.zeros(3), np.zeros(3)))[0]
+
+
+def desired_of(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """The twin's q_d, ω_d, ω̇_d of any angles, rates, accelerations."""
+
+    class Now(Sinusoids):
+        def angles(self, _t: float) -> tuple[Array, Array, Array]:
+            return state
+
+    return Now(np.zeros(3), np.zeros(3)).desired(0.0)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The sums over three axes of the largest rate, acceleration, jerk and jerk's derivative over some stretch."""
+
+    rate: float
+    acceleration: float
+    jerk: float
+
+    @property
+    def attitude_jerk(self) -> float:
+        """Of ‖q⃛‖: q is a product of three half turns, so ‖q̇‖ ≤ V/2, and so on by the product rule."""
+        return self.jerk / 2 + 3 / 4 * self.rate * self.acceleration + self.rate**3 / 8
+
+    @property
+    def velocity_curve(self) -> float:
+        """Of ‖ω̈‖, by ω = Σ rate · axis, the axes turning no faster than V."""
+        return self.jerk + 3 * self.rate * self.acceleration + 2 * self.rate**3
+
+
+def bounds(plan: Plan, i: int, start: float, end: float) -> Bounds:
+    """Of piece i from start to end: Σ |c| τⁿ bounds a polynomial, whatever its signs."""
+    tau, c = max(abs(start - plan.starts[i]), abs(end - plan.starts[i])), np.abs(plan.quintic[i])
+    a, f = np.abs(plan.amplitude[i]), plan.frequency[i]
+
+    def derivative(order: int) -> float:
+        polynomial = sum(math.perm(n, order) * c[n] * tau ** (n - order) for n in range(order, 6))
+        return float((polynomial + a * f**order).sum())
+
+    return Bounds(derivative(1), derivative(2), derivative(3))
+
+
+# A motion that is watched
+
+
+class Followed:
+    """A motion, the memory that it writes, and what its plan should be by Plan's own word."""
+
+    def __init__(self, reference: Reference) -> None:
+        self.memory = {name: buffer(n) for name, n in (("q_d", 4), ("omega_d", 3), ("omega_d_dot", 3))}
+        self.motion = Motion(reference, self.memory)
+        self.plan = Plan.of(reference)
+
+    def at(self, t: float) -> tuple[Array, Array, Array]:
+        """q_d, ω_d, ω̇_d as the loop reads them."""
+        self.motion.at(t)
+        q_d, omega_d, omega_d_dot = (np.array(memory) for memory in self.memory.values())
+        return q_d, omega_d, omega_d_dot
+
+    def follow(self, reference: Reference, t: float, within_s: float, ease_s: float = 0.0) -> None:
+        """Follow something else, and know the plan of that."""
+        angle, rate, acceleration = states(self.plan, t)
+        here = Angles(angle[None], rate[None], acceleration[None])
+        self.plan = Plan.of(reference).joined(here, t, within_s, ease_s)
+        self.motion.follow(Plan.of(reference), t, within_s, ease_s=ease_s)
+
+
+def rounding(around: Sequence[tuple[Array, Array, Array]], t: float, within_s: float) -> Array:
+    """How far angle, rate and acceleration may be off where a quintic ends, by rounding alone. Shape (3,).
+
+    Its terms are at most 15 (|Δ| + |v| T + |a| T²) of the states around, and n orders of derivatives grow that by
+    (5/T)ⁿ. They round by EPS some thirty times. What rounds τ, by EPS of t, counts as one derivative more.
+    """
+    T = within_s
+    sizes = [[np.abs(part).max() * T**order for order, part in enumerate(state)] for state in around]
+    size = float(max(map(sum, sizes)))
+    orders = np.arange(3)
+    return 30 * EPS * 15 * size * (5 / T) ** orders + 2 * EPS * (t + T) * 15 * size * (5 / T) ** (orders + 1)
+
+
+@settings(max_examples=75)
+@given(first=references, then=references, t=seconds(0, 20), within_s=withins, ease_s=st.just(0.0) | seconds(0.02, 1.0))
+def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
+    first: Reference, then: Reference, t: float, within_s: float, ease_s: float
+) -> None:
+    """Of the plan before and the approach, of its two parts where it eases first, and of it and the target."""
+    old, target = Plan.of(first), Plan.of(then)
+    here = states(old, t)
+    new = target.joined(Angles(*(part[None] for part in here)), t, within_s, ease_s)
+    parts = 2 if ease_s else 1
+    assert len(new.starts) == parts + len(target.starts)
+    assert new.starts[0] == t
+    assert new.starts[parts] == t + ease_s + within_s
+    sides = [(here, piece_states(new, 0, t))]
+    sides += [
+        (piece_states(new, i, new.starts[i + 1]), piece_states(new, i + 1, new.starts[i + 1])) for i in range(parts)
+    ]
+    sides += [(sides[-1][1], piece_states(target, 0, 0.0))]
+    lengths = np.diff(new.starts[: parts + 1])
+    around = [state for side in sides for state in side]
+    tolerance = np.max([rounding(around, t + ease_s, float(length)) for length in lengths], axis=0) + 1e-300
+    for before, after in sides:
+        for order in range(3):
+            assert np.abs(before[order] - after[order]).max() <= tolerance[order]
+
+
+@settings(max_examples=75)
+@given(
+    first=references,
+    changes=st.lists(st.tuples(references, seconds(0, 3), withins), min_size=1, max_size=4),
+)
+def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
+    first: Reference, changes: list[tuple[Reference, float, float]]
+) -> None:
+    """Also in the middle of an approach. q_d, ω_d and ω̇_d at the very time of the change, before it and after it."""
+    followed = Followed(first)
+    t = 0.0
+    for reference, passed, within_s in changes:
+        t += passed
+        before = followed.at(t)
+        here = states(followed.plan, t)
+        followed.follow(reference, t, within_s)
+        # At τ = 0 only c₀, c₁ and 2·c₂ count, which are the state itself; the products of three turns round on.
+        tolerance = 100 * EPS * (1 + np.abs(here).max()) ** 2
+        for was, now in zip(before, followed.at(t), strict=True):
+            assert np.abs(was - now).max() <= tolerance
+
+
+@settings(max_examples=75)
+@given(first=references, then=references, t=seconds(0.1, 10), within_s=withins)
+def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_acceleration(
+    first: Reference, then: Reference, t: float, within_s: float
+) -> None:
+    followed = Followed(first)
+    h = 1e-6
+    old = followed.plan
+    before, _ = followed.at(t - h), followed.at(t)
+    begun = int(np.searchsorted(old.starts, t - h, side="right")) - 1
+    within_old = [bounds(old, i, t - h, t) for i in range(begun, int(np.searchsorted(old.starts, t, side="right")))]
+    followed.follow(then, t, within_s)
+    plan, end = followed.plan, t + within_s
+    triples_around = [
+        (before, followed.at(t), followed.at(t + h), [*within_old, bounds(plan, 0, t, t + h)]),
+        (
+            followed.at(end - h),
+            followed.at(end),
+            followed.at(end + h),
+            [bounds(plan, i, end - h, end + h) for i in range(2)],
+        ),
+    ]
+    for (q0, w0, _), (q1, w1, dw1), (q2, w2, _), around in triples_around:
+        # A central difference errs by h²/6 of the third derivative; of ω, whose second jumps, by h/2 of that jump.
+        # Values near 1, or as large as the rate is, round by a few EPS, and τ by that of t; both over 2 h.
+        third = max(b.attitude_jerk for b in around)
+        curve = max(b.velocity_curve for b in around)
+        fast = max(b.rate for b in around)
+        quick = max(b.acceleration + b.rate**2 for b in around)
+        attitude_rounding = 50 * EPS * (1 + fast * (end + h)) / h
+        velocity_rounding = 50 * EPS * (1 + fast + quick * (end + h)) / h
+        w, x, y, z = q1
+        a, b, c = w1
+        moves = 0.5 * np.array(  # (C.12) row by row: ½ [−ε_dᵀ; η_d I − S(ε_d)] ω_d
+            [-x * a - y * b - z * c, w * a + z * b - y * c, -z * a + w * b + x * c, y * a - x * b + w * c]
+        )
+        assert np.abs((q2 - q0) / (2 * h) - moves).max() <= h * h / 6 * third + attitude_rounding
+        assert np.abs((w2 - w0) / (2 * h) - dw1).max() <= h * curve + velocity_rounding
+
+
+# Arriving
+
+
+@settings(max_examples=75)
+@given(first=references, target=holds, t=seconds(0, 10), within_s=withins)
+def test_going_somewhere_ends_there_exactly_and_at_rest(
+    first: Reference, target: Hold, t: float, within_s: float
+) -> None:
+    followed, still = Followed(first), Followed(target)
+    followed.follow(target, t, within_s)
+    for later in (t + within_s, t + within_s + 100):
+        for got, expected in zip(followed.at(later), still.at(0.0), strict=True):
+            assert np.array_equal(got, expected)
+    assert not np.any(followed.memory["omega_d"])
+    assert not np.any(followed.memory["omega_d_dot"])
+    assert target.attitude is not None
+    assert followed.at(1e4)[0] == pytest.approx(quaternion(np.radians(target.attitude)), abs=8 * EPS)
+
+
+@settings(max_examples=75)
+@given(first=references, points=some_points(), t=seconds(0, 10), within_s=withins)
+def test_points_are_passed_each_at_its_time_from_rest_to_rest(
+    first: Reference, points: Points, t: float, within_s: float
+) -> None:
+    followed = Followed(first)
+    followed.follow(points, t, within_s)
+    start = t + within_s
+    shortest = min(np.diff(points.times))
+    # Of the piece before the point: its terms, at most 15 times the differences, in a time that rounds by EPS of t.
+    reach = 15 * radians(120) * 3 * max(np.diff(points.times)) / shortest
+    tolerance = EPS * reach * (50 + 10 * (start + points.times[-1]) / shortest)
+    for time_s, attitude in zip(points.times, points.attitudes, strict=True):
+        expected = quaternion(np.radians(attitude))
+        assert followed.at(nextafter(start + time_s, 0.0))[0] == pytest.approx(expected, abs=tolerance)
+        q_d, omega_d, omega_d_dot = followed.at(start + time_s)
+        assert q_d == pytest.approx(expected, abs=tolerance)
+        if time_s in (points.times[0], points.times[-1]):
+            # The rounding of the start, over the shortest gap, once for the rate and twice for the acceleration.
+            assert np.abs(omega_d).max() <= tolerance / shortest * 5
+            assert np.abs(omega_d_dot).max() <= tolerance / shortest**2 * 25
+    assert not np.any(followed.at(start + points.times[-1] + 1.0)[1])
+
+
+@settings(max_examples=40)
+@given(points=some_points())
+def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> None:
+    plan = Plan.of(points)
+    gaps = np.diff(points.times)
+    for i, (start, gap) in enumerate(zip(plan.starts[1:], gaps, strict=True)):
+        here, there = piece_states(plan, i, plan.starts[i]), piece_states(plan, i + 1, start)
+        tolerance = rounding([here, there], float(start), float(gap)) + 1e-300
+        for order, (before, after) in enumerate(zip(piece_states(plan, i, start), there, strict=True)):
+            assert np.abs(before - after).max() <= tolerance[order]
+
+
+@settings(max_examples=75)
+@given(first=references, t=seconds(0, 10), within_s=withins)
+def test_resting_comes_to_rest_where_even_braking_ends(first: Reference, t: float, within_s: float) -> None:
+    followed = Followed(first)
+    angle, rate, _ = states(followed.plan, t)
+    rest = followed.motion.rest(t, within_s)
+    assert rest.attitude is not None
+    # From rate v to 0 at an even rate is ½ v T of way; degrees and back round thrice.
+    assert np.radians(rest.attitude) == pytest.approx(angle + rate * within_s / 2, abs=1e-12)
+    followed.follow(rest, t, within_s)
+    assert not np.any(followed.at(t + within_s)[1])
+    assert not np.any(followed.at(t + within_s + 9.0)[2])
+
+
+def test_resting_from_an_even_turn_only_ever_slows_down() -> None:
+    turning = Sinusoid(amplitude=(0.0, 30.0, 50.0), frequency=(0.0, 0.5, 0.4))
+    followed = Followed(turning)
+    rates = [states(followed.plan, 0.0)[1]]  # at t = 0 every axis is at its crest of rate
+    followed.follow(followed.motion.rest(0.0, 1.5), 0.0, 1.5)
+    rates += [states(followed.plan, t)[1] for t in np.linspace(0, 1.5, 301)]
+    for before, after in pairwise(rates):
+        assert np.all(after <= before + 1e-13)  # rounding of rates below 0.5 rad/s
+        assert np.all(after >= -1e-13)
+
+
+# The loop's function
+
+
+@settings(max_examples=75)
+@given(
+    first=references,
+    changes=st.lists(st.tuples(references, seconds(0.05, 3), withins), max_size=3),
+    steps=st.lists(seconds(0, 0.4), min_size=1, max_size=20),
+)
+def test_the_loops_function_gives_the_plans_own_angles(
+    first: Reference, changes: list[tuple[Reference, float, float]], steps: list[float]
+) -> None:
+    followed = Followed(first)
+    t, pending = 0.0, list(changes)
+    for step in steps:
+        t += step
+        if pending and t >= pending[0][1]:
+            reference, _, within_s = pending.pop(0)
+            followed.follow(reference, t, within_s)
+        plan, i = followed.plan, followed.plan.piece(t)
+        taken = plan.at(np.full((len(plan.starts), 1), t - plan.starts[i]))
+        state = tuple(part[i, 0] for part in taken)
+        around = bounds(plan, i, plan.starts[i], t)
+        for order, (got, expected) in enumerate(
+            zip(followed.at(t), desired_of((state[0], state[1], state[2])), strict=True)
+        ):
+            # Either way the terms round by EPS some fifty times: of angles below 10, rates and accelerations.
+            size = (10.0, 10 * (1 + around.rate), 10 * (1 + around.rate) ** 2 + around.acceleration)[order]
+            assert np.abs(got - expected).max() <= 200 * EPS * size
+        for got, expected in zip(state, piece_states(plan, i, t), strict=True):
+            assert np.abs(got - expected).max() <= 200 * EPS * (10 + around.rate + around.acceleration)
+
+
+# Limits
+
+TOO_FAST = Sinusoid(amplitude=(0.0, 30.0, 100.0), frequency=(0.0, 0.5, 0.7))
+TOO_TILTED = Sinusoid(amplitude=(0.0, 61.0, 10.0), frequency=(0.0, 0.3, 0.3))
+TILTED_BY_BOTH = Sinusoid(amplitude=(50.0, 50.0, 0.0), frequency=(0.3, 0.3, 0.0))
+ROLLS = Sinusoid(amplitude=(1.0, 0.0, 0.0), frequency=(0.3, 0.0, 0.0))
+FAST_POINTS = Points(times=[0.0, 1.0, 1.5], attitudes=[(0.0, 0.0, 0.0), (0.0, 5.0, 0.0), (0.0, 5.0, 25.0)])
+TILTED_POINTS = Points(times=[0.0, 4.0, 8.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 60.5, 0.0), (0.0, 0.0, 0.0)])
+
+
+@pytest.mark.parametrize(
+    ("reference", "limits", "why"),
+    [
+        (TOO_FAST, BENCH, "max_reference_rate"),
+        (FAST_POINTS, BENCH, "max_reference_rate"),
+        (TOO_TILTED, BENCH, "max_reference_tilt_deg"),
+        (TILTED_BY_BOTH, BODY, "max_reference_tilt_deg"),  # neither alone is too much: acos(cos² 50°) = 65.6°
+        (TILTED_POINTS, BENCH, "max_reference_tilt_deg"),
+        (Hold(attitude=(0.0, -60.1, 0.0)), BENCH, "max_reference_tilt_deg"),
+        (Hold(attitude=(0.0, 180.0, 0.0)), BENCH, "max_reference_tilt_deg"),
+        (ROLLS, BENCH, "roll"),
+        (Hold(attitude=(-0.1, 0.0, 0.0)), BENCH, "roll"),
+    ],
+)
+def test_what_goes_too_far_is_refused_by_the_name_of_the_limit_in_one_line(
+    reference: Reference, limits: Limits, why: str
+) -> None:
+    with pytest.raises(FollowError, match=why) as refused:
+        Plan.of(reference).check(limits)
+    assert len(str(refused.value).splitlines()) == 1
+    Plan.of(reference).check(NO_LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("reference", "limits"),
+    [
+        (Sinusoid(), BENCH),
+        (Sinusoid(amplitude=(0.0, 59.9, 0.0), frequency=(0.0, 0.5, 0.0)), BENCH),
+        (Sinusoid(amplitude=(0.0, 0.0, 100.0), frequency=(0.0, 0.0, 0.5)), BENCH),
+        (Hold(attitude=(0.0, 59.9, 7200.0)), BENCH),
+        (Hold(attitude=None), BENCH),
+        (Stream(), BENCH),
+        (ROLLS, BODY),
+        (Points(times=[0.0, 4.0], attitudes=[(0.0, 0.0, 0.0), (0.0, 59.0, 100.0)]), BENCH),
+    ],
+)
+def test_what_stays_within_the_limits_is_not_refused(reference: Reference, limits: Limits) -> None:
+    Plan.of(reference).check(limits)
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        Sinusoid(amplitude=(0.0, 80.0, 1.0), frequency=(0.0, 0.7, 0.7 / 32)),  # sampled where pitch is 0, each time
+        Sinusoid(amplitude=(0.0, 80.0, 0.0), frequency=(0.0, 0.001, 0.0)),  # beyond 60° only after 848 s
+        Sinusoid(amplitude=(0.0, 360.0, 1.0), frequency=(0.0, 0.15, 0.0005)),
+    ],
+)
+def test_a_sinusoid_that_tilts_too_far_at_any_time_is_refused(reference: Sinusoid) -> None:
+    with pytest.raises(FollowError):
+        Plan.of(reference).check(BENCH)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_an_approach_that_overflows_is_refused() -> None:
+    with pytest.raises(FollowError):
+        Motion(Hold()).follow(Plan.of(Hold(attitude=(0.0, 0.0, 1e308))), 0.0, 0.02, BENCH)
+
+
+@pytest.mark.parametrize(
+    ("target", "within_s", "limits", "why"),
+    [
+        (Hold(attitude=(0.0, 0.0, 90.0)), 2.0, BENCH, "max_reference_rate"),
+        (TOO_FAST, 2.0, BENCH, "max_reference_rate"),
+        (Hold(attitude=(0.0, 60.5, 0.0)), 2.0, BENCH._replace(rate=50.0), "max_reference_tilt_deg"),
+        (Hold(attitude=(3.0, 0.0, 0.0)), 2.0, BENCH, "roll"),
+    ],
+)
+def test_a_way_that_goes_too_far_is_refused_and_nothing_changes(
+    target: Reference, within_s: float, limits: Limits, why: str
+) -> None:
+    """It is asked for in the middle of another approach, whose end and what follows must come as before."""
+    followed, left_alone = Followed(Hold()), Followed(Hold())
+    points = Points(times=[0.0, 1.0, 2.5], attitudes=[(0.0, 5.0, 5.0), (0.0, 10.0, -5.0), (0.0, 0.0, 0.0)])
+    for one in (followed, left_alone):
+        one.follow(points, 0.0, 0.5)
+    for t in np.arange(0.0, 4.0, 0.05):
+        with pytest.raises(FollowError, match=why):
+            followed.motion.follow(Plan.of(target), float(t), within_s, limits)
+        for got, expected in zip(followed.at(float(t)), left_alone.at(float(t)), strict=True):
+            assert np.array_equal(got, expected)
+
+
+def test_a_way_within_the_limits_is_the_one_without_any() -> None:
+    limited, unlimited = Followed(Hold()), Followed(Hold())
+    target = Plan.of(Hold(attitude=(0.0, 0.0, 90.0)))
+    limited.motion.follow(target, 1.0, 3.0, BENCH)  # 15/8 · 90° within 3 s: 0.98 rad/s
+    unlimited.motion.follow(target, 1.0, 3.0)
+    with pytest.raises(FollowError, match="max_reference_rate"):
+        Motion(Hold()).follow(target, 1.0, 2.9, BENCH)  # 1.02 rad/s
+    for t in np.linspace(1.0, 5.0, 81):
+        for got, expected in zip(limited.at(float(t)), unlimited.at(float(t)), strict=True):
+            assert np.array_equal(got, expected)
+
+
+DENSE: Final = 30 * 64 + 1
+"""Times, among which are the 65 that are sampled."""
+
+QUARTIC_BETWEEN_SAMPLES: Final = 1.004
+"""How far a quartic can rise above the largest of its 65 even samples: 0.38 %, near the crests of the fourth Chebyshev
+polynomial (the least Σ|w| of weights w that give every quartic's value there from its samples). The rate along the
+direction that is fastest at any time is such a quartic."""
+
+
+@settings(max_examples=75)
+@given(first=references, target=holds, t=seconds(0, 5), within_s=seconds(0.2, 5.0))
+def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hold, t: float, within_s: float) -> None:
+    """Without roll, where Σ rate² is all; from any state, so from any acceleration."""
+    here = [part * [0.0, 1.0, 1.0] for part in states(Plan.of(first), t)]
+    assert target.attitude is not None
+    level = Plan.of(Hold(attitude=(0.0, *target.attitude[1:])))
+    plan = level.joined(Angles(*(part[None] for part in here)), t, within_s)
+    _, rates, _ = piece_states(plan, 0, t + within_s * np.linspace(0, 1, DENSE)[:, None])
+    fastest = np.linalg.norm(rates, axis=1).max()
+    # 1e-9: rounding of terms 15 (5/T) times the angles, at most 400, that cancel; in what is hardly moving, too.
+    assert plan.fastest() <= fastest * (1 + 1e-9) + 1e-9
+    assert fastest <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES + 1e-9
+
+
+def test_the_fastest_is_found_where_it_falls_between_samples() -> None:
+    """A turn that brakes hard and comes back; every other sample alone would miss its crest by 0.9 %."""
+    here = Angles(*(np.array([[0.0, 0.0, x]]) for x in (0.0, 0.38, -4.92)))
+    plan = Plan.of(Hold(attitude=(0.0, 0.0, float(np.degrees(0.24))))).joined(here, 0.0, 2.95)
+    _, rates, _ = piece_states(plan, 0, 2.95 * np.linspace(0, 1, DENSE)[:, None])
+    assert np.abs(rates).max() <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES
+
+
+@settings(max_examples=40)
+@given(start=holds, target=holds, within_s=seconds(0.2, 5.0))
+def test_from_rest_to_rest_the_fastest_is_that_of_the_angular_velocity_itself(
+    start: Hold, target: Hold, within_s: float
+) -> None:
+    """All three axes, whose rates are not at right angles: ‖ω_d‖ as the law gets it, within 0.2 %."""
+    followed = Followed(start)
+    followed.follow(target, 0.0, within_s)
+    fastest = max(np.linalg.norm(followed.at(t)[1]) for t in np.linspace(0, within_s, DENSE))
+    assert followed.plan.fastest() == pytest.approx(fastest, rel=2e-3, abs=1e-9)
+
+
+@settings(max_examples=40)
+@given(amplitude=triples(60), frequency=frequencies)
+def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
+    amplitude: tuple[float, float, float], frequency: float
+) -> None:
+    followed = Followed(Sinusoid(amplitude=amplitude, frequency=(frequency,) * 3))
+    period = 2 * pi / frequency if frequency else 1.0
+    fastest = max(np.linalg.norm(followed.at(t)[1]) for t in np.linspace(0, period, DENSE))
+    # 64 samples a period are at most 0.05 rad from a crest, and ω² there has harmonics up to the third or so with roll.
+    assert followed.plan.fastest() == pytest.approx(fastest, rel=5e-3, abs=1e-9)
+
+
+@settings(max_examples=75)
+@given(start=holds, target=holds, asked_s=withins, rate=st.integers(1, 40).map(lambda n: n / 10))
+def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
+    start: Hold, target: Hold, asked_s: float, rate: float
+) -> None:
+    followed, plan = Followed(start), Plan.of(target)
+    limits = Limits(rate=rate, tilt=pi, rolls=True)
+    within_s, ease_s = followed.motion.time_to_reach(plan, 0.0, asked_s, limits)
+    assert ease_s == 0.0  # there is no acceleration to let go
+    here = Angles(*(part[None] for part in states(followed.plan, 0.0)))
+    asked = plan.joined(here, 0.0, asked_s).fastest()
+    assert plan.joined(here, 0.0, within_s).fastest() <= rate
+    assert within_s >= asked_s
+    if asked <= rate:
+        assert within_s == asked_s
+    else:
+        # Rates fall as the time grows: the least is asked_s · asked / rate, and 5 % more is what is taken at once.
+        assert within_s == pytest.approx(asked_s * asked / rate * 1.05, rel=1e-9)
+
+
+def test_time_to_reach_changes_nothing() -> None:
+    followed, left_alone = Followed(Sinusoid()), Followed(Sinusoid())
+    followed.motion.time_to_reach(Plan.of(Hold(attitude=(0.0, 0.0, 170.0))), 1.0, 0.2, BENCH)
+    for got, expected in zip(followed.at(1.5), left_alone.at(1.5), strict=True):
+        assert np.array_equal(got, expected)
+
+
+def test_a_far_set_point_in_the_middle_of_a_quick_one_is_reached_within_the_limit() -> None:
+    followed = Followed(Stream())
+    near, far = (Hold(attitude=(0.0, 0.0, yaw)) for yaw in (1.0, 170.0))
+    followed.follow(near, 0.0, *followed.motion.time_to_reach(Plan.of(near), 0.0, 0.2, BENCH))
+    within_s, ease_s = followed.motion.time_to_reach(Plan.of(far), 0.04, 0.2, BENCH)
+    followed.follow(far, 0.04, within_s, ease_s)
+    assert followed.plan.fastest() <= BENCH.rate
+    assert within_s < 60.0
+
+
+# What the verbs refuse
+
+
+def complaint(model: type[Message], **fields: Any) -> str:
+    """The one message that a person gets."""
+    with pytest.raises(ValidationError) as refused:
+        model.model_validate(fields)
+    (error,) = refused.value.errors()
+    return f"{error['loc'][0] if error['loc'] else model.__name__}: {error['msg'].removeprefix('Value error, ')}"
+
+
+TWO = [(0.0, 0.0, 0.0)] * 2
+GAIN_RANGE = "every element must be positive and at most 20"
+NUMBER = "every element must be a number"
+MILLISECOND = "Points: times must rise by at least a millisecond"
+
+
+@pytest.mark.parametrize(
+    ("model", "fields", "told"),
+    [
+        (Gains, {"C1": (0.3, 0.0, 0.3)}, f"C1: {GAIN_RANGE}"),
+        (Gains, {"C2": (0.3, 0.3, -1e-9)}, f"C2: {GAIN_RANGE}"),
+        (Gains, {"Gamma": (20.001, 1.0, 1.0)}, f"Gamma: {GAIN_RANGE}"),
+        (Gains, {"C1": (math.nan, 0.3, 0.3)}, f"C1: {NUMBER}"),
+        (Gains, {"C1": (math.inf, 0.3, 0.3)}, f"C1: {NUMBER}"),
+        (Gains, {"C1": (0.3, 0.3)}, "C1: Field required"),
+        (Gains, {"C3": (0.3, 0.3, 0.3)}, "C3: Extra inputs are not permitted"),
+        (Points, {"times": [0, 1, 2], "attitudes": TWO}, "Points: 3 times for 2 attitudes"),
+        (Points, {"times": [1, 2], "attitudes": TWO}, "Points: the first time must be 0, and every time a number"),
+        (
+            Points,
+            {"times": [0, math.nan], "attitudes": TWO},
+            "Points: the first time must be 0, and every time a number",
+        ),
+        (
+            Points,
+            {"times": [0, math.inf], "attitudes": TWO},
+            "Points: the first time must be 0, and every time a number",
+        ),
+        (Points, {"times": [0, 0], "attitudes": TWO}, MILLISECOND),
+        (Points, {"times": [0, 2, 1], "attitudes": [*TWO, TWO[0]]}, MILLISECOND),
+        (Points, {"times": [0, 0.0009], "attitudes": TWO}, MILLISECOND),
+        (Points, {"times": [0, 1], "attitudes": [TWO[0], (0, math.nan, 0)]}, f"attitudes: {NUMBER}"),
+        (Points, {"times": [0], "attitudes": TWO}, "times: List should have at least 2 items after validation, not 1"),
+        (
+            Points,
+            {"times": range(MAX_POINTS + 1), "attitudes": TWO},
+            f"times: List should have at most {MAX_POINTS} items after validation, not more",
+        ),
+        (Hold, {"attitude": (0.0, math.inf, 0.0)}, f"attitude: {NUMBER}"),
+        (Setpoint, {"attitude": (0.0, math.nan, 0.0)}, f"attitude: {NUMBER}"),
+        (Sinusoid, {"amplitude": (0.0, math.nan, 0.0)}, f"amplitude: {NUMBER}"),
+        (Sinusoid, {"frequency": (0.0, -0.1, 0.0)}, "frequency: Input should be greater than or equal to 0"),
+        (Sinusoid, {"frequency": (0.0, math.inf, 0.0)}, "frequency: Input should be less than or equal to 100"),
+        (Stream, {"timeout_s": 0.0}, "timeout_s: Input should be greater than 0"),
+        (Stream, {"within_s": 0.01}, "within_s: Input should be greater than or equal to 0.02"),
+        (Track, {"reference": Hold(), "within_s": 0.0}, "within_s: Input should be greater than or equal to 0.02"),
+        (Track, {"reference": Hold(), "within_s": math.nan}, "within_s: Input should be less than or equal to 600"),
+    ],
+)
+def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
+    model: type[Message], fields: dict[str, Any], told: str
+) -> None:
+    said = complaint(model, **fields)
+    assert said == told or said.startswith(told)
+
+
+@pytest.mark.parametrize(
+    ("model", "fields"),
+    [
+        (Gains, {}),
+        (Gains, {"C1": (20.0, 1e-9, 0.3)}),
+        (Points, {"times": [0, 0.001], "attitudes": TWO}),
+        (Points, {"times": range(MAX_POINTS), "attitudes": TWO[:1] * MAX_POINTS}),
+        (Stream, {"timeout_s": 60.0, "within_s": 0.02}),
+        (Track, {"reference": Hold(), "within_s": 600.0}),
+    ],
+)
+def test_what_is_just_within_the_bounds_is_taken(model: type[Message], fields: dict[str, Any]) -> None:
+    model.model_validate(fields)
+
+
+def test_points_a_millisecond_apart_are_taken() -> None:
+    Points(times=[n / 1000 for n in range(20)], attitudes=TWO[:1] * 20)

@@ -1,0 +1,162 @@
+"""Certificate gate: publishes each change of the verdict, and refuses to drive without a required one."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from aeroloop.protocol.messages.operator import Gains, Hold, Reference, Sinusoid, Stream, Track
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.daemon.certificate_gate import UncertifiedError, gains_of
+from aeroloop.service.settings import ControllerSettings
+from tests.service.daemon.test_operator_changes import LAW, Loop
+
+WIRE = WireSpec()
+FAILING = Gains(C1=(3.0, 3.0, 3.0))
+BETTER = Gains(C2=(0.2, 0.2, 0.2))
+
+
+def of(gains: Gains) -> LawSettings:
+    return LAW.model_copy(update={name: value for name, value in gains if value is not None})
+
+
+class Certified(Loop):
+    """A loop whose OperatorChanges asks for certificates."""
+
+    def __init__(self, *, required: bool, reference: Reference | None = None) -> None:
+        settings = ControllerSettings(require_certificate=required)
+        super().__init__(reference or Sinusoid(), settings, wire=WIRE)
+
+    @property
+    def verdicts(self) -> list[tuple[str, str]]:
+        """What was told of the theorem: kind, text."""
+        words = ("Theorem 1", "nothing is certified")
+        kinds = ("started", "changed", "fault")
+        return [(kind, text) for kind in kinds for text in self.events(kind) if any(word in text for word in words)]
+
+
+@pytest.fixture
+def certified() -> Certified:
+    """A session of a controller that must be certified, and is."""
+    loop = Certified(required=True)
+    loop.assurance.publish()
+    loop.begin()
+    loop.tick()
+    return loop
+
+
+def wait_for_threads() -> None:
+    """Until what is computed beside the loop is done."""
+    for thread in threading.enumerate():
+        if thread.daemon and thread is not threading.current_thread() and "weigh" in thread.name:
+            thread.join(30)
+
+
+def test_the_verdict_is_told_once_and_again_when_it_changes(certified: Certified) -> None:
+    certified.assurance.publish()
+    ((kind, text),) = certified.verdicts
+    assert kind == "started"
+    assert text.startswith("Theorem 1 holds: c₀/2 = 0.075")
+    asked = certified.ask("set_gains", Gains(C1=LAW.C1))  # which they are already
+    certified.tick()
+    assert asked.answers[0].done
+    assert len(certified.verdicts) == 1
+    asked = certified.ask("set_gains", BETTER)
+    certified.tick()
+    assert asked.answers[0].done
+    kind, text = certified.verdicts[-1]
+    assert (kind, "c₀/2 = 0.1 " in text) == ("changed", True)
+
+
+def test_gains_of_which_it_would_not_hold_are_refused_with_the_reason_and_a_remedy(certified: Certified) -> None:
+    asked = certified.ask("set_gains", FAILING)
+    certified.tick()
+    (answer,) = asked.answers
+    assert not answer.done
+    assert len(answer.text.splitlines()) == 1
+    assert "Theorem 1 does not hold: c₀/2 = 0.075 does not exceed" in answer.text
+    assert "what would do: law.C1 = [1.355, 1.355, 1.355], or law.C2" in answer.text
+    assert certified.controller.gains.C1 == LAW.C1
+    assert certified.assurance.blocks is None
+    assert len(certified.verdicts) == 1
+
+
+def test_a_stream_is_refused_and_what_can_be_certified_is_followed(certified: Certified) -> None:
+    asked = certified.ask("track", Track(reference=Stream()))
+    certified.tick()
+    assert not asked.answers[0].done
+    assert "set-points are not known beforehand" in asked.answers[0].text
+    asked = certified.ask("track", Track(reference=Hold(attitude=(0.0, 5.0, 5.0)), within_s=2.0))
+    certified.tick()
+    assert asked.answers[0].done
+    assert certified.verdicts[-1][0] == "changed"
+
+
+def test_two_changes_that_hold_by_themselves_are_not_both_taken_if_together_they_do_not(certified: Certified) -> None:
+    less, more = Gains(C1=(1.2, 1.2, 1.2)), Gains(C2=(0.06, 0.06, 0.06))
+    for alone in (less, more):
+        assert certified.assurance.weigh(gains_of(of(alone)), Sinusoid()).holds
+    asked = [certified.ask("set_gains", gains) for gains in (less, more)]
+    certified.tick()
+    assert [one.answers[0].done for one in asked] == [True, False]
+    assert certified.controller.gains == gains_of(of(less))
+
+
+def test_where_nothing_is_required_all_is_taken_and_told() -> None:
+    loop = Certified(required=False)
+    loop.begin()
+    asked = [loop.ask("set_gains", FAILING), loop.ask("track", Track(reference=Stream()))]
+    loop.tick()
+    wait_for_threads()
+    loop.tick()
+    assert all(one.answers[0].done for one in asked)
+    assert "nothing is certified" in loop.verdicts[-1][1]
+    assert loop.assurance.blocks is None
+    assert not loop.events("fault")
+
+
+def test_where_it_comes_to_rest_is_certified_beside_the_loop(certified: Certified) -> None:
+    asked = certified.ask("track", Track(reference=Hold(), within_s=2.0))
+    certified.tick()
+    assert asked.answers[0].done
+    wait_for_threads()
+    certified.tick()
+    assert certified.verdicts[-1][0] == "changed"
+    assert certified.assurance.blocks is None
+
+
+def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
+    loop = Certified(required=True)
+    loop.assurance.publish()
+    for gains in (FAILING, BETTER):
+        loop.assurance.weigh(*loop.live.prospect(of(gains), Sinusoid()))
+        loop.live.adopt(of(gains), Sinusoid())
+        blocks = loop.assurance.blocks
+        if gains is FAILING:
+            assert blocks is not None
+            assert blocks.startswith("claims no vehicle, as controller.require_certificate is set: Theorem 1 does not")
+            (fault,) = loop.events("fault")
+            assert fault.startswith(blocks)
+            assert "law.C1 = [1.355, 1.355, 1.355]" in fault
+        else:
+            assert blocks is None
+    assert [kind for kind, _ in loop.verdicts] == ["started", "changed", "fault"]
+
+
+def test_what_was_not_weighed_beforehand_counts_as_failing_until_it_is() -> None:
+    loop = Certified(required=True)
+    loop.live.adopt(of(BETTER), Sinusoid())
+    assert "not known yet" in (loop.assurance.blocks or "")
+    wait_for_threads()
+    loop.role.take_inbox()
+    assert loop.assurance.blocks is None
+
+
+def test_what_must_hold_and_does_not_is_not_admitted(certified: Certified) -> None:
+    with pytest.raises(UncertifiedError, match="does not hold"):
+        certified.assurance.admit(gains_of(of(FAILING)), Sinusoid())
+    certified.assurance.admit(gains_of(of(FAILING)), Sinusoid(), required=False)
+    certified.assurance.required = False
+    certified.assurance.admit(gains_of(of(FAILING)), Sinusoid())

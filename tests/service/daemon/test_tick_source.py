@@ -1,0 +1,290 @@
+"""Tick source: a plant that sends on change and one with late frames, on a simulated link, which is the clock.
+
+A tick's frame arrives `DELAY_NS` after the tick unless a test sets otherwise; every tick is returned once, in order,
+with a frame or without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import pytest
+
+from aeroloop.protocol.messages.trace import Received
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE, Sender
+from aeroloop.service.daemon import tick_source
+from aeroloop.service.daemon.tick_source import PlantTick, TickSource
+from tests.support.simulated_link import LOOP, PERIOD_NS, SimulatedLink, wire_of
+
+WIRE = wire_of("on_change", "on_change")
+DELAY_NS = 200_000
+COUNTERS = WIRE.measurement.counters
+HALF_NS = PERIOD_NS // 2
+
+
+def frame(k: int, code: int = 0, wire: WireSpec = WIRE) -> bytes:
+    return wire.measurement.pack(k % COUNTERS, (0, 0, 0, 0, 0, code))
+
+
+def arrival(k: int, code: int = 0, *, late_ns: int = 0, content: bytes | None = None) -> Arrival:
+    """The frame of tick k."""
+    arrives_ns = k * PERIOD_NS + DELAY_NS + late_ns
+    return Arrival(frame(k, code) if content is None else content, arrives_ns)
+
+
+def in_passing(tick: PlantTick) -> bool:
+    """Whether it is a frame that is no tick of its own."""
+    return tick.received_as in (Received.LATE, Received.MALFORMED)
+
+
+class Source:
+    """A tick source at one end of a simulated link, and its ticks so far."""
+
+    def __init__(
+        self,
+        arrivals: Iterable[Arrival],
+        monkeypatch: pytest.MonkeyPatch,
+        *,
+        wire: WireSpec = WIRE,
+        loop: LoopSettings = LOOP,
+        own_grid: bool = False,
+        stale_s: float = 0.1,
+    ) -> None:
+        self.link = SimulatedLink(sorted(arrivals, key=lambda each: each.at_ns), tick_source.MAILBOX)
+        monkeypatch.setattr(tick_source, "time", self.link)
+        if own_grid:
+            monkeypatch.setattr("aeroloop.protocol.runtime.tick_grid.time", self.link)
+        self.source = TickSource(self.link, loop, wire, own_grid=own_grid, stale_s=stale_s)
+        self.taken: list[tuple[PlantTick, int]] = []  # and when
+
+    def run(self, until_ns: int) -> list[PlantTick]:
+        """Ticks until a time; an answer takes none."""
+        while self.link.now_ns < until_ns:
+            tick = self.source.next(0.02)
+            if tick is not None:
+                self.taken.append((tick, self.link.now_ns))
+        return [tick for tick, _ in self.taken]
+
+    @property
+    def ticks(self) -> list[int]:
+        """Ticks that were computed."""
+        return [tick.tick for tick, _ in self.taken if not in_passing(tick)]
+
+    def when(self, tick: int) -> int:
+        """When a tick came."""
+        return next(at_ns for each, at_ns in self.taken if each.tick == tick and not in_passing(each))
+
+
+def until(k: int) -> int:
+    """When tick k is over, frame or not."""
+    return k * PERIOD_NS + DELAY_NS + HALF_NS
+
+
+def heartbeats(last: int, codes: Mapping[int, int] | None = None) -> list[Arrival]:
+    """Arrivals of a plant whose code becomes what `codes` say at their ticks."""
+    sender, code, sent = Sender("on_change", 15, COUNTERS), 0, []
+    for k in range(last + 1):
+        code = (codes or {}).get(k, code)
+        if sender.due(k, (code,)):
+            sent.append(arrival(k, code))
+    return sent
+
+
+def test_a_frame_is_a_tick_as_it_arrives_and_silence_half_a_period_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source(heartbeats(40, {7: 1}), monkeypatch)
+    ticks = source.run(until(40))
+    assert source.ticks == list(range(41))
+    sent = {k: at_ns for at_ns, k in ((k * PERIOD_NS + DELAY_NS, k) for k in (0, 7, 22, 37))}
+    for k in range(41):
+        assert source.when(k) == sent.get(k, until(k))
+    assert {each.tick: each.frame for each in ticks if each.frame} == {
+        0: frame(0), 7: frame(7, 1), 22: frame(22, 1), 37: frame(37, 1)
+    }  # fmt: skip
+    assert all(each.missed == 0 for each in ticks)
+    assert all((each.received_as is Received.SILENT) == (each.frame == SILENCE) == (not each.fresh) for each in ticks)
+    assert all(each.due_ns == source.when(each.tick) for each in ticks)
+
+
+def test_there_is_no_tick_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source([arrival(30)], monkeypatch)
+    source.run(until(32))
+    assert source.taken[0][0].frame == frame(30)
+    assert source.ticks == [30 + i for i in range(3)]  # a session's first frame has its tick for a counter
+
+
+def test_a_late_frame_is_no_second_tick_and_brings_its_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    late = arrival(5, 9, late_ns=HALF_NS + 1)
+    source = Source([arrival(0), late], monkeypatch)
+    ticks = source.run(until(8))
+    assert source.ticks == list(range(9))
+    assert [(each.tick, each.frame) for each in ticks if in_passing(each)] == [(5, frame(5, 9))]
+    assert source.when(5) == until(5)
+
+
+def test_of_frames_that_wait_together_the_newest_is_computed_and_the_others_are_missed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source = Source([arrival(0), *(arrival(k, k) for k in range(5, 9))], monkeypatch)
+    source.run(until(4))
+    source.link.pass_time(until(8) - HALF_NS)  # the controller was kept waiting for three ticks
+    ticks = source.run(until(10))[5:]
+    assert [(each.tick, in_passing(each)) for each in ticks[:4]] == [(5, True), (6, True), (7, True), (8, False)]
+    assert ticks[3].missed == 3
+    assert source.ticks == [0, 1, 2, 3, 4, 8, 9, 10]
+
+
+def test_a_frame_whose_tick_is_long_over_is_not_answered_but_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A controller that wakes from a stall goes on with the present."""
+    source = Source([arrival(0), arrival(5, 9)], monkeypatch)
+    source.run(until(4))
+    source.link.pass_time(until(9) + 1)
+    ticks = source.run(until(10))[5:]
+    assert [(each.tick, each.frame, in_passing(each), each.missed) for each in ticks] == [
+        (5, frame(5, 9), True, 0),
+        (9, SILENCE, False, 4),
+        (10, SILENCE, False, 0),
+    ]
+
+
+def test_the_levels_of_a_frame_are_used_for_no_tick_before_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its counter, which is all that tells, one may be of a tick that is still to come."""
+    early = arrival(8, 9)._replace(at_ns=arrival(5).at_ns)
+    nonsense = arrival(5, content=b"\0")  # waits behind it, so that it is taken in passing
+    source = Source([arrival(0), early, nonsense], monkeypatch)
+    source.run(until(9))
+    assert [tick for tick in source.ticks if tick > 4][:2] == [8, 9]
+
+
+def test_a_stall_of_the_controller_in_silence_counts_as_ticks_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source([arrival(0)], monkeypatch)
+    source.run(until(4))
+    source.link.pass_time(until(9) + 1)
+    ticks = source.run(until(11))
+    assert source.ticks == [0, 1, 2, 3, 4, 9, 10, 11]
+    assert [each.missed for each in ticks] == [0, 0, 0, 0, 0, 4, 0, 0]
+
+
+@pytest.mark.parametrize("drift", [-1e-2, -1e-4, 1e-4, 1e-2])
+@pytest.mark.parametrize("jitter_ns", [0, 150_000])
+def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(
+    drift: float, jitter_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plant's period is longer or shorter by the controller's clock, up to one that runs 1 % fast or slow."""
+    last = 12_000
+    sent = []
+    for each in heartbeats(last, {k: k % 7 for k in range(0, last, 11)}):
+        k = (each.at_ns - DELAY_NS) // PERIOD_NS
+        at_ns = round(k * PERIOD_NS * (1 + drift)) + DELAY_NS + (k * 7919 % 97) * jitter_ns // 97
+        sent.append(each._replace(at_ns=at_ns))
+    source = Source(sent, monkeypatch)
+    ticks = source.run(round(last * PERIOD_NS * (1 + drift)))
+    assert source.ticks == list(range(len(source.ticks)))
+    assert len(source.ticks) >= last - 1
+    assert not any(in_passing(each) or each.missed for each in ticks)
+
+
+@pytest.mark.parametrize("nonsense", [SILENCE, b"\0", frame(5) + b"\0"], ids=["empty", "short", "long"])
+def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source([arrival(0), *(arrival(k, content=nonsense) for k in range(1, 9))], monkeypatch)
+    ticks = source.run(until(8))
+    assert source.ticks == list(range(9))
+    assert [source.when(k) for k in range(1, 9)] == [until(k) for k in range(1, 9)]
+    assert not any(each.fresh for each in ticks[1:])
+    assert [each.frame for each in ticks if in_passing(each)] == [nonsense] * 8
+
+
+def test_a_frame_that_nonsense_follows_at_once_keeps_its_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = [arrival(5, 9, late_ns=HALF_NS - 10), arrival(5, late_ns=HALF_NS - 10, content=b"\0")]
+    source = Source([arrival(0), *both], monkeypatch)
+    ticks = source.run(until(6))
+    assert [each.frame for each in ticks if each.tick >= 4] == [SILENCE, frame(5, 9), b"\0", SILENCE, SILENCE]
+    assert source.ticks == list(range(7))
+
+
+def test_a_frame_that_comes_twice_is_one_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    twice = [arrival(3, 1), arrival(3, 1, late_ns=1000), arrival(3, 1, late_ns=PERIOD_NS)]
+    source = Source([arrival(0), *twice], monkeypatch)
+    source.run(until(6))
+    assert source.ticks == list(range(7))
+    assert not any(in_passing(each) for each, _ in source.taken)
+
+
+def test_in_lockstep_an_empty_frame_is_the_next_tick_and_time_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    contents = [frame(0), *[SILENCE] * 14, frame(15), *[SILENCE] * 3]
+    arrivals = [Arrival(content, 7 * PERIOD_NS * i) for i, content in enumerate(contents)]
+    source = Source(arrivals, monkeypatch, loop=LOOP.model_copy(update={"lockstep": True}))
+    ticks = source.run(7 * PERIOD_NS * 18)
+    assert [(each.tick, each.frame, each.missed) for each in ticks] == [(k, each, 0) for k, each in enumerate(contents)]
+
+
+def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    contents = [frame(0), *[SILENCE] * 14, *[SILENCE] * 14, frame(30)]  # the frame of tick 15 is not there
+    arrivals = [Arrival(content, PERIOD_NS * i) for i, content in enumerate(contents)]
+    source = Source(arrivals, monkeypatch, loop=LOOP.model_copy(update={"lockstep": True}))
+    source.run(PERIOD_NS * 30)
+    assert source.ticks == [*range(29), 30]
+
+
+# On a grid of one's own
+
+
+@pytest.mark.parametrize("phase_ns", [250_000, 700_000, 1_300_000, 1_900_000])
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(
+    phase_ns: int, every: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever in the plant's period it stands, but for its first tenth, and however often there is a frame."""
+    last = 300
+    source = Source(heartbeats(last, {k: k % 5 for k in range(0, last, every)}), monkeypatch, own_grid=True)
+    source.source._grid.start_ns = phase_ns + DELAY_NS  # type: ignore[union-attr]  # it has one
+    ticks = source.run(last * PERIOD_NS)
+    assert len(source.ticks) > last - 5
+    assert sorted(set(source.ticks)) == source.ticks
+    assert sum(each.missed for each in ticks) <= 1
+
+
+def test_on_a_grid_of_ones_own_what_has_piled_up_is_caught_up_with_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source([arrival(k, k % 5) for k in range(100)], monkeypatch, own_grid=True)
+    source.run(until(9))
+    source.link.pass_time(until(14))
+    source.run(until(60))
+    behind = [at_ns - each.tick * PERIOD_NS - DELAY_NS for each, at_ns in source.taken if each.tick > 15]
+    assert max(behind) < PERIOD_NS
+    assert source.ticks[-40:] == list(range(source.ticks[-1] - 39, source.ticks[-1] + 1))
+
+
+# Where every tick has a frame
+
+PERIODIC = WireSpec()
+
+
+def test_a_frame_that_is_later_than_the_stale_time_is_not_answered_and_shows_no_life(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A link that holds everything up for a while and then delivers it: what is old is refused, what is new is not."""
+    held = range(100, 200)  # all of them arrive 250 ms after tick 100
+    arrivals = [arrival(k, late_ns=max(0, 125 - (k - 100)) * PERIOD_NS if k in held else 0) for k in range(300)]
+    source = Source(arrivals, monkeypatch, wire=PERIODIC)
+    source.link = source.source._link = SimulatedLink(arrivals, 300)  # each is taken
+    monkeypatch.setattr(tick_source, "time", source.link)
+    taken = source.run(until(299))
+    stale = [each.tick for each in taken if each.received_as is Received.LATE]
+    assert stale
+    assert all(each.late_ns > 100_000_000 and not each.fresh for each in taken if each.tick in stale)
+    assert all(each.late_ns <= 100_000_000 for each in taken if each.received_as is Received.FRAME)
+    assert source.ticks == [k for k in range(300) if k not in stale]
+    assert set(stale) <= set(held)
+
+
+@pytest.mark.parametrize("offset_ns", [0, 10**10, -(10**9), 3_600 * 10**9])
+def test_what_a_clock_reads_makes_no_difference(offset_ns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = 10**10 + offset_ns
+    arrivals = [arrival(k, late_ns=(k * 7919 % 97) * 1000)._replace() for k in range(600) if k % 50]
+    arrivals = [each._replace(at_ns=each.at_ns + start) for each in arrivals]
+    source = Source(arrivals, monkeypatch, wire=PERIODIC)
+    taken = source.run(start + until(599))
+    assert source.ticks == [k for k in range(600) if k % 50]
+    assert all(each.late_ns < PERIOD_NS for each in taken)

@@ -1,0 +1,449 @@
+"""Page of a review, as text and in Chromium; without Chromium the browser tests are skipped outside CI."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from html import escape
+from html.parser import HTMLParser
+from itertools import count
+from json import loads
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+
+from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.report.page.data import page_data
+from aeroloop.service.report.page.markup import tag
+from aeroloop.service.report.page.page import page, write_page
+from aeroloop.service.report.rows import figure_rows, micros, percent
+from aeroloop.service.review.report import Check, Mark, Panel, Report
+from tests.support.made_report import MARKS, made_report, made_theorem
+
+HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""
+PATIENCE_MS = 120_000
+"""Nothing here is about speed; a browser on a busy machine may take its time."""
+
+HELD = Check(text="z_track ≤ 0.005 s", holds=True, found="0.00458 s")
+BROKEN = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
+
+
+# without a browser
+
+
+class Texts(HTMLParser):
+    """The texts of a page, outside of scripts and styles, and its elements."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.elements = [""]
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, _attrs: object) -> None:
+        self.elements.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        if self.elements[-1] not in {"script", "style"}:
+            self.texts.append(data)
+
+
+def test_text_and_attributes_are_escaped_and_markup_is_not() -> None:
+    inner = tag("b", "a<b & c")
+    assert tag("p", inner, "<i>", None, title='"x"', hidden=True) == (
+        '<p title="&quot;x&quot;" hidden><b>a&lt;b &amp; c</b>&lt;i&gt;</p>'
+    )
+
+
+def test_the_page_says_what_was_asked_and_what_was_found() -> None:
+    held = Texts(page([made_report(checks=[HELD])])).texts
+    assert " Held" in held
+    assert HELD.text in held
+    broken = Texts(page([made_report(checks=[HELD, BROKEN])])).texts
+    assert " Not held" in broken
+    assert "does not hold: 50" in broken
+    assert " Tripped" in Texts(page([made_report()])).texts
+    assert " Tracked" in Texts(page([made_report(marks=())])).texts
+
+
+def test_the_page_says_what_the_theorem_promises_and_which_inequality_was_broken() -> None:
+    held = page([made_report(theorem=made_theorem())])
+    texts = Texts(held).texts
+    assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in texts
+    assert {"0.0638", "0.2004", "(C.57)", "97.0"} <= set(texts)
+    (judged,) = (text for text in texts if "belong to a tick" in text)
+    assert "Judged until 8.5 s" in judged
+    assert "Judged from" not in judged
+    went = made_theorem().model_copy(update={"since_s": 2.1})
+    assert any("Judged from 2.1 s" in text for text in Texts(page([made_report(theorem=went)])).texts)
+    assert "At 120 the sensors of the rate err by more than the quantizer, against (C.29)." in judged
+    assert judged.endswith("Lemma 1 is judged by the other 380.")
+    broken = page([made_report(theorem=made_theorem(broken=7))])
+    assert "Show 3.125 s: (C.57) ‖Φ − Φ^Q‖ first broken" in broken
+    assert {"7", "125.0"} <= set(Texts(broken).texts)
+    assert "first broken" not in held
+
+
+def test_where_no_run_was_held_against_the_theorem_the_page_says_nothing_of_it() -> None:
+    assert 'id="theorem"' not in page([made_report()])
+    several = page([made_report("a"), made_report("b", theorem=made_theorem())])
+    assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in Texts(several).texts
+
+
+def test_the_theorems_panels_stand_in_its_own_section_and_nowhere_else() -> None:
+    text = page([made_report(theorem=made_theorem())])
+    _, _, section = text.partition('<section id="theorem"')
+    assert 'data-name="z_norm"' in section.partition("</section>")[0]
+    assert text.count('data-name="z_norm"') == 1
+
+
+def test_the_wire_is_told_with_each_signals_quantizer() -> None:
+    signals = {
+        "attitude": {"bits": 8, "limit": 1.0},  # of before there were kinds
+        "rate": {"bits": 10, "limit": 2.0, "kind": "hysteresis-uniform"},
+        "voltage": {"bits": None, "limit": 24.0, "kind": "logarithmic-uniform"},
+    }
+    texts = Texts(page([made_report(settings={"wire": signals})])).texts
+
+    def row(head: str) -> list[str]:
+        return texts[texts.index(head) :][1:4]
+
+    assert row("attitude ε") == ["uniform", "8", "±1"]
+    assert row("rate ω") == ["hysteresis-uniform", "10", "±2"]
+    assert row("voltage u") == ["–", "cont", "±24"]
+
+
+def test_what_could_not_be_read_is_told() -> None:
+    damage = "a.mcap: cut at byte 1234"
+    assert damage in Texts(page([made_report(damages=[damage])])).texts
+    assert "What is missing from the log" not in Texts(page([made_report()])).texts
+
+
+def test_the_page_says_whether_lines_are_thinned_out() -> None:
+    assert "up to 64 ticks" in page([made_report(thinned=64)])
+    assert "thinned out" not in page([made_report(thinned=2)])
+
+
+def test_a_missing_figure_says_why() -> None:
+    run = made_report()
+    why = "the plant told no latency"
+    findings = run.findings.model_copy(update={"latency_us": None, "reasons": {"latency_us": why}})
+    assert Texts(page([replace(run, findings=findings)])).texts.count(why) >= 2  # p50 and p99
+
+
+def test_data_cannot_end_its_script_and_comes_back_as_it_was() -> None:
+    report = made_report(HOSTILE)
+    data = page_data([report])
+    assert not set("<>&") & set(data)
+    assert loads(data)["runs"][0]["name"] == HOSTILE
+
+
+def shortened(panel: Panel, n: int) -> Panel:
+    return replace(panel, lines=[replace(line, values=line.values[:n]) for line in panel.lines])
+
+
+def test_a_desired_line_that_runs_share_is_drawn_once() -> None:
+    def desired(*reports: Report) -> list[dict[str, Any]]:
+        (group,) = [group for group in loads(page_data(reports))["groups"] if group["id"] == "attitude"]
+        return [line for line in group["panels"][0]["lines"] if line["desired"]]
+
+    one, later = made_report("a"), made_report("b", phase=0.3)
+    assert [line["shared"] for line in desired(one, later)] == [True]
+    other = made_report("c", turned=True)
+    assert [line["shared"] for line in desired(one, other)] == [False, False]
+    short = replace(later, time=later.time[:300], panels=[shortened(panel, 300) for panel in later.panels])
+    assert [line["shared"] for line in desired(one, short)] == [True]
+
+
+def test_a_run_without_values_has_a_page() -> None:
+    bare = replace(made_report(marks=()), time=np.empty(0), panels=[], settings={}, facts={})
+    findings = bare.findings.model_copy(update={"timing": {}, "gaps": [], "gap_count": 0, "z_track": None})
+    assert " Nothing to judge" in Texts(page([replace(bare, findings=findings)])).texts
+
+
+def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ReviewError, match=r"cannot write .*: No such file or directory"):
+        write_page([made_report()], tmp_path / "none" / "page.html")
+
+
+def test_numbers_have_sensible_digits() -> None:
+    assert [micros(us) for us in (0.25, 42.4, 640.2, 2400, 1.25e6)] == [
+        "0.25 µs",
+        "42.4 µs",
+        "640 µs",
+        "2.4 ms",
+        "1.25 s",
+    ]
+    assert [percent(share) for share in (0, 0.00012, 0.0345, 1)] == ["0", "0.012", "3.5", "100.0"]
+    (z_track,) = [row for row in figure_rows([made_report().findings]) if row.key == "z_track"]
+    assert (z_track.values[0].text, z_track.unit) == ("45.80", "10⁻⁴ s")
+
+
+# in a browser
+
+Open = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        assert "CI" not in os.environ, "CI has a Chromium"
+        pytest.skip("no Chromium on PATH")
+    arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
+                 "--disable-component-update", "--disable-sync"]  # fmt: skip
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=arguments, timeout=PATIENCE_MS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def open_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
+    """Opens the page of reports; in the end, none has asked for anything or complained of anything."""
+    folder, numbers = tmp_path_factory.mktemp("pages"), count()
+    contexts: list[BrowserContext] = []
+    asked: list[str] = []
+    complaints: list[str] = []
+
+    def open_page(*reports: Report) -> Page:
+        out = folder / f"{next(numbers)}.html"
+        write_page(reports, out)
+        context = browser.new_context(
+            viewport={"width": 1280, "height": 900}, color_scheme="light", reduced_motion="reduce"
+        )
+        context.set_default_timeout(PATIENCE_MS)
+        contexts.append(context)
+        opened = context.new_page()
+        opened.on("request", lambda request: None if request.url == out.as_uri() else asked.append(request.url))
+        opened.on("console", lambda message: complaints.append(message.text))
+        opened.on("pageerror", lambda error: complaints.append(str(error)))
+        opened.goto(out.as_uri())
+        return opened
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert asked == []
+    assert complaints == []
+
+
+@pytest.fixture(scope="module")
+def one(open_page: Open) -> Page:
+    """The page of one run; whoever moves its time or theme puts it back."""
+    return open_page(made_report(checks=[HELD]))
+
+
+@pytest.fixture(scope="module")
+def two(open_page: Open) -> Page:
+    """The page of two runs, whose second has a log that means harm."""
+    marks = [*MARKS, Mark(time_s=1.0, kind=HOSTILE, role=HOSTILE, text=HOSTILE)]
+    settings = {"law": {"C2": [0.3, 0.3, 0.3]}, HOSTILE: {HOSTILE: HOSTILE}}
+    checks = [Check(text=HOSTILE, holds=False, found=HOSTILE)]
+    harmful = made_report(HOSTILE, phase=0.3, marks=marks, damages=[HOSTILE], settings=settings, checks=checks)
+    return open_page(made_report("a"), replace(harmful, facts={HOSTILE: {HOSTILE: HOSTILE}}))
+
+
+def draw_all(opened: Page) -> None:
+    """Bring every drawing into sight, one after the other, until it is drawn."""
+    for drawing in opened.locator(".drawing").all():
+        drawing.scroll_into_view_if_needed()
+        drawing.locator(".main-svg").first.wait_for(state="attached")
+
+
+def ranges(opened: Page) -> dict[str, list[float]]:
+    """What each time axis shows, of those that are drawn."""
+    script = """() => Object.fromEntries([...document.querySelectorAll(".drawing.group")]
+        .filter((figure) => figure.querySelector(".js-plotly-plot"))
+        .map((figure) => [figure.dataset.name, figure.querySelector(".plot").layout.xaxis.range]))"""
+    return cast(dict[str, list[float]], opened.evaluate(script))
+
+
+def shows(opened: Page, name: str, within: tuple[float, float]) -> None:
+    """Wait until a group of panels shows a time within this span, and no more."""
+    opened.locator(f".group[data-name={name}]").scroll_into_view_if_needed()
+    opened.wait_for_function(
+        """([name, [from, to]]) => {
+            const range = document.querySelector(`.group[data-name=${name}] .plot`).layout?.xaxis.range;
+            return range && range[0] >= from && range[1] <= to;
+        }""",
+        arg=[name, list(within)],
+    )
+
+
+def test_every_panel_is_drawn_with_its_lines(one: Page) -> None:
+    draw_all(one)
+    lines = """() => [...document.querySelectorAll(".drawing")].map((figure) => [
+        figure.classList[1], figure.dataset.name,
+        [...figure.querySelectorAll(".scatterlayer .js-line")].filter((path) => path.getTotalLength() > 100).length,
+    ])"""
+    assert one.evaluate(lines) == [
+        ["group", "attitude", 4],
+        ["group", "attitude_error", 1],
+        ["group", "input", 1],
+        ["group", "damping_estimate", 1],
+        ["spread", "latency", 1],
+        ["spread", "period", 1],
+        ["group", "latency", 1],
+    ]
+
+
+def test_events_and_gaps_stand_across_every_panel(one: Page) -> None:
+    draw_all(one)
+    shapes = """(name) => document.querySelector(`.group[data-name=${name}] .plot`).layout.shapes
+        .map((shape) => [shape.path, shape.yref])"""
+    for name in ("attitude", "latency"):
+        assert one.evaluate(shapes, name) == [
+            ["M7.2,0 L7.3,0 L7.3,1 L7.2,1 Z", "paper"],
+            ["M3,0 L3,1", "paper"],
+            ["M7.25,0 L7.25,1", "paper"],
+        ]
+
+
+def test_zooming_one_panel_moves_every_other_and_a_double_click_shows_all_again(one: Page) -> None:
+    draw_all(one)
+    whole = ranges(one)["attitude"]
+    panel = one.locator(".group[data-name=attitude] .nsewdrag").first
+    panel.scroll_into_view_if_needed()
+    box = panel.bounding_box()
+    assert box is not None
+    middle = box["y"] + box["height"] / 2
+    one.mouse.move(box["x"] + 0.25 * box["width"], middle)
+    one.mouse.down()
+    one.mouse.move(box["x"] + 0.5 * box["width"], middle, steps=4)
+    one.mouse.up()
+    for name in ("attitude", "input", "latency"):
+        shows(one, name, (2.3, 5.1))
+    assert len({tuple(ranges(one)[name]) for name in ("attitude", "input", "latency")}) == 1
+    panel.dblclick()
+    shows(one, "latency", (whole[0], whole[1]))
+    one.wait_for_function(
+        "(end) => document.querySelector('.group[data-name=latency] .plot').layout.xaxis.range[1] === end", arg=whole[1]
+    )
+
+
+def test_a_click_on_an_event_or_a_gap_shows_what_was_around_it(one: Page) -> None:
+    one.get_by_role("button", name="tripped").click()
+    shows(one, "attitude_error", (6.7, 7.8))
+    one.get_by_role("button", name="gap of 50 ticks").click()
+    shows(one, "attitude_error", (6.6, 7.75))
+    one.get_by_role("button", name="Whole run").click()
+
+
+def test_keys_move_the_time_that_is_shown(one: Page) -> None:
+    drawing = one.locator(".group[data-name=input]")
+    drawing.scroll_into_view_if_needed()
+    drawing.locator(".main-svg").first.wait_for(state="attached")
+    drawing.locator(".plot").focus()
+    for key in ("+", "+", "ArrowRight"):
+        one.keyboard.press(key)
+    shows(one, "input", (4.3, 7.0))
+    one.keyboard.press("0")
+    assert one.locator("#shown").inner_text() == "−0.1 – 10.1 s"
+
+
+def test_the_search_opens_what_it_finds(one: Page) -> None:
+    one.locator("#search").fill("rate_hz")
+    assert one.locator("#configuration tr[data-key]:visible").all_inner_texts() == ["rate_hz\t500.0"]
+    one.locator("#search").fill("")
+    assert one.locator("#configuration tr[data-key]:visible").count() == 0
+
+
+CONTRASTS = """() => {
+    const probe = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+    const rgb = (colour) => {
+        probe.fillStyle = colour;
+        probe.fillRect(0, 0, 1, 1);
+        return [...probe.getImageData(0, 0, 1, 1).data].slice(0, 3);
+    };
+    const light = (colour) => rgb(colour)
+        .map((c) => (c /= 255) <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)
+        .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+    const behind = (element) => {
+        const colour = getComputedStyle(element).backgroundColor;
+        return colour === "rgba(0, 0, 0, 0)" && element.parentElement ? behind(element.parentElement) : colour;
+    };
+    const texts = [...document.querySelectorAll("body *")].filter((element) =>
+        element.offsetParent && [...element.childNodes].some((node) => node.nodeType === 3 && node.data.trim()));
+    return texts.map((element) => {
+        const [one, other] = [light(getComputedStyle(element).color), light(behind(element))].sort((a, b) => b - a);
+        return [(one + 0.05) / (other + 0.05), element.outerHTML.slice(0, 80)];
+    });
+}"""
+
+
+def background(opened: Page) -> str:
+    return str(opened.evaluate("getComputedStyle(document.body).backgroundColor"))
+
+
+def test_light_and_dark_differ_and_both_can_be_read(one: Page) -> None:
+    light = background(one)
+    for scheme in ("light", "dark"):
+        one.emulate_media(color_scheme=cast(Any, scheme))
+        contrasts = one.evaluate(CONTRASTS)
+        assert len(contrasts) > 50
+        assert [text for contrast, text in contrasts if contrast < 4.5] == []  # WCAG 2, AA
+    dark = background(one)
+    assert dark != light
+    one.locator("#theme").click()
+    assert background(one) == light
+    one.locator("#theme").click()
+    assert background(one) == dark
+    one.emulate_media(color_scheme="light")
+
+
+def test_drawings_have_the_colours_of_the_theme(one: Page) -> None:
+    drawing = one.locator(".group[data-name=attitude]")
+    drawing.scroll_into_view_if_needed()
+    label = drawing.locator(".annotation-text").first
+    label.wait_for()
+    light = label.evaluate("(text) => getComputedStyle(text).fill")
+
+    def wait(same: bool) -> None:
+        one.wait_for_function(
+            """([light, same]) => {
+                const label = document.querySelector(".group .annotation-text");
+                return label && (getComputedStyle(label).fill === light) === same;
+            }""",
+            arg=[light, same],
+        )
+
+    one.emulate_media(color_scheme="dark")
+    wait(same=False)
+    one.locator("#theme").click()
+    wait(same=True)
+    one.locator("#theme").click()
+    wait(same=False)
+    one.emulate_media(color_scheme="light")
+
+
+def test_hostile_text_of_a_log_is_text(two: Page) -> None:
+    draw_all(two)
+    assert two.evaluate("window.hit") is None
+    assert two.locator("img").count() == 0
+    assert HOSTILE in two.locator("#events td.text").all_inner_texts()
+    name = two.locator(".group[data-name=input] .plot").evaluate("(plot) => plot.data[1].name")
+    assert name == escape(HOSTILE, quote=False)
+
+
+def test_a_comparison_shows_what_differs_and_draws_every_run(two: Page) -> None:
+    rows = two.locator("#differences tbody tr").all_inner_texts()
+    assert "law.C2\t[0.15, 0.15, 0.15]\t[0.3, 0.3, 0.3]" in rows
+    draw_all(two)
+    colours = """(name) => [...document.querySelectorAll(`.group[data-name=${name}] .js-line`)]
+        .map((path) => path.style.stroke)"""
+    first, second = two.evaluate(colours, "input")
+    assert first != second
+    assert {first, second} < set(two.evaluate(colours, "attitude"))  # the same everywhere, and what is desired
+
+
+def test_nothing_scrolls_sideways_on_a_phone(two: Page) -> None:
+    two.set_viewport_size({"width": 390, "height": 844})
+    draw_all(two)
+    assert two.evaluate("document.documentElement.scrollWidth") == 390
+    assert two.evaluate("document.querySelector('.group .plot').clientWidth") > 300

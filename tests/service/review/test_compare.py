@@ -1,0 +1,72 @@
+"""`aeroloop log compare`: separate runs, named differences, limits per run, the page of `--html`."""
+
+from __future__ import annotations
+
+from json import loads
+from pathlib import Path
+
+import pytest
+
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import load
+from aeroloop.service.review.compare import Comparison, broken_limits, named_apart
+from aeroloop.service.review.report import Check
+from tests.support.made_log import make_log
+from tests.support.made_report import made_report
+
+
+def test_runs_are_named_apart_and_what_differs_is_named() -> None:
+    broken = Check(text="skipped_ticks ≤ 0", holds=False, found="50")
+    runs = named_apart([made_report(), made_report(checks=[broken], settings={"law": {"C2": [0.3, 0.3, 0.3]}})])
+    compared = Comparison.of(runs)
+    assert list(compared.runs) == ["a.mcap", "a.mcap (2)"]
+    (differs,) = compared.differences
+    assert (differs.key, list(differs.values.values())) == ("law.C2", [[0.15, 0.15, 0.15], [0.3, 0.3, 0.3]])
+    assert broken_limits(runs) == ["a.mcap (2): skipped_ticks ≤ 0 does not hold: 50"]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Two runs that differ in a gain."""
+    folder = tmp_path_factory.mktemp("logs")
+    for name, gain in (("calm", "0.15"), ("keen", "0.3")):
+        overrides = ["loop.lockstep=true", f"law.C2=[{gain}, {gain}, {gain}]"]
+        make_log(folder / f"{name}.mcap", 100, settings=load(overrides=overrides))
+    return str(folder / "calm.mcap"), str(folder / "keen.mcap")
+
+
+def test_logs_are_compared_in_the_terminal_as_json_and_on_a_page(
+    logs: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.html"
+    assert run(("log", "compare", *logs, "--html", str(out))) == 0
+    printed = capfd.readouterr().out
+    assert "law.C2" in printed
+    assert "[0.3, 0.3, 0.3]" in printed
+    assert run(("log", "compare", *logs, "--json")) == 0
+    compared = loads(capfd.readouterr().out)
+    assert [difference["key"] for difference in compared["differences"]] == ["law.C2"]
+    assert compared["runs"]["calm"]["z_track"] != compared["runs"]["keen"]["z_track"]
+    assert "2 runs compared" in out.read_text()
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_limit_holds_only_if_it_holds_for_every_run(logs: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(("log", "compare", *logs, "--require", "duration_s=0.2")) == 0
+    assert run(("log", "compare", *logs, "--require", "duration_s=0.1")) == 1
+    last = capfd.readouterr().err.splitlines()[-1]
+    assert last.count("duration_s ≤ 0.1") == 2
+
+
+def test_one_log_is_not_compared(logs: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(("log", "compare", logs[0])) == 2
+    assert capfd.readouterr().err == "aeroloop: log compare takes two logs or more\n"
+
+
+def test_a_review_writes_its_page_with_its_verdict(
+    logs: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.html"
+    assert run(("log", "review", logs[0], "--html", str(out), "--require", "z_track=1e-9")) == 1
+    assert "Not held" in out.read_text()
+    assert f"aeroloop: wrote {out}" in capfd.readouterr().err

@@ -1,0 +1,254 @@
+"""Findings of a log: events in order on the session's clock, limits, JSON and terminal table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aeroloop.protocol.messages.models import Event, Loss
+from aeroloop.protocol.messages.trace import Outcome, Received
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import load
+from aeroloop.service.review.report import Check, Findings, Mark, Spread
+from aeroloop.service.review.requirements import Limit
+from aeroloop.service.review.review import read, report, review
+from aeroloop.service.terminal.log_tables import sparkline
+from tests.support.edited_log import Said, edited, retell, told
+from tests.support.made_log import AN_OPERATORS_WORDS, START_NS, make_log
+
+TICKS = 500
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of 500 ticks in real time, each answered after 300 µs."""
+    path = tmp_path_factory.mktemp("whole") / "whole.mcap"
+    make_log(path, TICKS, settings=load())
+    return path
+
+
+def found(path: Path) -> Findings:
+    return read(path).findings
+
+
+# What happened
+
+
+def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
+    """The controller tells of it in words, too, but only the change itself has the tick."""
+    make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
+    more = [
+        told("event", Event(role="controller", kind="changed", text=text, session=session), START_NS + 240_000_000)
+        for text, session in (("gains set", "s1"), ("configuration read again", None))
+    ]
+    happened = found(retell(tmp_path / "a.mcap", tmp_path / "b.mcap", more=more)).marks
+    assert [mark.text for mark in happened if mark.kind == "changed"] == ["configuration read again"]
+    marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
+    assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
+    assert "C2 = diag(0.2, 0.2, 0.2)" in marks[1][1]
+    assert "0°, 5°, -10°" in marks[2][1]
+    assert "Gamma = diag(0.01, 0.01, 0.01)" in marks[3][1]
+    assert "sinusoid" in marks[3][1]
+
+
+def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_recorded(
+    whole: Path, tmp_path: Path
+) -> None:
+    """A batch is some 50 ticks here, recorded with its last row; the clocks of both ends differ by 10 s."""
+
+    def event(
+        at_s: float, role: str, kind: str, text: str, session: str | None = "s1", tick: int | None = None
+    ) -> Said:
+        message = Event.model_validate({"role": role, "kind": kind, "text": text, "session": session, "tick": tick})
+        return told("event", message, START_NS + round(at_s * 1e9))
+
+    more = [
+        event(1.1, "plant", "tripped", "tilted", tick=499),
+        event(-0.3, "controller", "claimed", "has it"),
+        event(-7.0, "plant", "started", "waits", session=None),
+        event(60.0, "plant", "stopped", "at 0 V", session=None),
+        event(0.52, "controller", "fault", "16 ticks missed", session=None),
+        event(0.53, "controller", "fault", "5 ticks missed", tick=260),
+        event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event"),
+    ]
+    findings = found(retell(whole, tmp_path / "a.mcap", more=more))
+    marks = [mark for mark in findings.marks if mark.kind != "change"]
+    assert [(mark.time_s, mark.role, mark.kind, mark.text) for mark in marks] == [
+        (None, "plant", "started", "waits"),
+        (0.0, "controller", "claimed", "has it"),
+        (0.508, "controller", "fault", "16 ticks missed"),
+        (0.52, "controller", "fault", "5 ticks missed"),
+        (0.998, "plant", "tripped", "tilted"),
+        (None, "plant", "stopped", "at 0 V"),
+    ]
+    assert findings.trips == ["tilted"]
+
+
+def test_what_a_restarted_recorder_received_again_counts_once(whole: Path, tmp_path: Path) -> None:
+    event = told("event", Event(role="plant", kind="tripped", text="tilted"), START_NS + 500_000_000)
+    findings = found(retell(whole, tmp_path / "a.mcap", more=[event, event]))
+    assert findings.trips == ["tilted"]
+    assert len([mark for mark in findings.marks if mark.kind == "tripped"]) == 1
+
+
+def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:
+    def late(columns: Any) -> None:
+        columns["received_as"][np.isin(columns["tick"], (100, 200))] = Received.LATE
+
+    def stale(columns: Any) -> None:
+        columns["outcome"][columns["session_tick"] == 300] = Outcome.STALE
+
+    path = retell(whole, tmp_path / "a.mcap", edited("controller", late))
+    findings = found(retell(path, tmp_path / "b.mcap", edited("plant", stale)))
+    assert findings.lapses == {"late": 2, "missed": 2, "stale": 1}
+    assert Limit.parse("lapses=2").broken(findings) == "lapses is 5, more than 2"
+
+
+def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
+    def loss(key: str, count: int, at_s: float) -> Said:
+        at = START_NS + round(at_s * 1e9)
+        return told("loss", Loss(key=key, count=count, reason="queue"), at)
+
+    more = [
+        loss("aeroloop/aero/s1/measurement", 3, 0.21),
+        loss("aeroloop/aero/s1/measurement", 4, 0.41),
+        loss("aeroloop/aero/event", 1, 0.51),
+    ]
+    findings = found(retell(whole, tmp_path / "a.mcap", more=more))
+    assert findings.losses == {"measurement": 7, "event": 1}
+    marks = [(mark.time_s, mark.role, mark.text[:17]) for mark in findings.marks if mark.kind == "lost"]
+    assert marks == [
+        (0.202, "recorder", "3 of measurement "),
+        (0.406, "recorder", "4 of measurement "),
+        (0.508, "recorder", "1 of event lost: "),
+    ]
+
+
+def test_a_storm_of_events_is_told_in_a_bounded_number_of_marks(whole: Path, tmp_path: Path) -> None:
+    storm = [
+        told("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + i * 1_000_000) for i in range(900)
+    ]
+    marks = [mark for mark in found(retell(whole, tmp_path / "a.mcap", more=storm)).marks if mark.kind == "refused"]
+    assert len(marks) == 301
+    assert marks[-1].text == "600 more, the last: no 899"
+
+
+# The whole
+
+
+def test_findings_are_the_figures_and_more(whole: Path) -> None:
+    figures, findings = review(whole), found(whole)
+    assert {name: getattr(findings, name) for name in type(figures).model_fields if name != "reasons"} == {
+        name: getattr(figures, name) for name in type(figures).model_fields if name != "reasons"
+    }
+    assert figures.reasons.items() <= findings.reasons.items()
+    assert (findings.vehicle, findings.session, findings.sessions) == ("aero", "s1", 1)
+    assert findings.started == "2027-01-15T08:00:00.000+00:00"
+
+
+def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(whole: Path, tmp_path: Path) -> None:
+    facts = {"git": "abc", "cpu": "two cores"}
+    path = retell(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
+    made = report([path], [Limit.parse("skipped=0"), Limit.parse("latency.p99=100")])
+    assert made.name == "night"
+    assert made.settings["wire"]["voltage"]["bits"] == 6
+    host = {"host": "h", "versions": {}}
+    assert made.facts == {"controller": host, "plant": host, "recorder": facts}
+    assert made.findings.checks == [
+        Check(text="skipped ≤ 0", holds=True, found="0"),
+        Check(text="latency.p99 ≤ 100 µs", holds=False, found="297.9 µs"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("limit", "value"),
+    [
+        ("skipped=0", 3),
+        ("gaps=0", 2),
+        ("losses=0", 7),
+        ("latency.p99=0", 4.0),
+        ("period.p999=0", 5.0),
+        ("age.max=0", 3.0),
+        ("saturated.voltage=0", 0.25),
+        ("invalid=0", 9),
+        ("trips=0", 1),
+    ],
+)
+def test_short_names_of_limits_mean_what_they_say(whole: Path, limit: str, value: float) -> None:
+    clean = found(whole)
+    timing = {
+        "latency": clean.timing["latency"].model_copy(update={"p99": 4.0}),
+        "period": clean.timing["period"].model_copy(update={"p999": 5.0}),
+    }
+    findings = clean.model_copy(
+        update={
+            "skipped_ticks": 3, "gap_count": 2, "losses": {"event": 5, "truth": 2}, "timing": timing, "trips": ["x"],
+            "age_us": {"p50": 1.0, "p99": 2.0, "max": 3.0}, "saturated": {"voltage": 0.25},
+            "invalid": {"measurement": 4, "command": 5},
+        }
+    )  # fmt: skip
+    assert Limit.parse(limit).value(findings) == value
+
+
+def test_what_could_not_be_had_breaks_its_limit_and_says_why(whole: Path) -> None:
+    check = Limit.parse("age.p99=5000").check(found(whole))
+    assert not check.holds
+    assert "controller" in check.found
+
+
+KEYS = {
+    "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
+    "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
+    "gaps", "gap_count", "saturated", "invalid", "losses", "lapses", "marks", "theorem", "checks", "missing_ticks",
+    "missing", "frames", "clock_offset_us",
+}  # fmt: skip
+THEOREM_KEYS = {
+    "verdict", "holds", "radius", "radius_deg", "transient_s", "since_s", "until_s", "z_norm", "z_norm_share",
+    "error_deg", "true_z_norm", "true_error_deg", "damping_known", "samples", "outside", "judged", "lemma", "broken",
+}  # fmt: skip
+
+
+def test_the_keys_of_the_json_are_stable_and_the_exit_code_says_whether_limits_hold(
+    whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert execute(["log", "review", str(whole), "--json", "--require", "z_track=50e-4", "--require", "skipped=0"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed.keys() == KEYS
+    assert printed["timing"]["latency"].keys() == {"count", "p50", "p90", "p99", "p999", "max", "bins"}
+    assert printed["marks"][0].keys() == set(Mark.model_fields)
+    assert printed["theorem"].keys() == THEOREM_KEYS
+    assert [check["holds"] for check in printed["checks"]] == [True, True]
+    assert execute(["log", "review", str(whole), "--json", "--require", "latency.p50=1"]) == 1
+    output = capsys.readouterr()
+    assert json.loads(output.out)["checks"][0]["holds"] is False
+    assert output.err == "aeroloop: latency.p50 is 297.9, more than 1\n"
+
+
+def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was() -> None:
+    bins = [(1000.0, 500_000), (1044.0, 500_000), (64_000.0, 1)]
+    bars = sparkline(Spread(count=1_000_001, p50=1000, p90=1000, p99=1000, p999=1000, max=64_000, bins=bins), width=12)
+    assert bars == "█          ▁"
+    assert sparkline(Spread(count=1, p50=9, p90=9, p99=9, p999=9, max=9, bins=[(9.0, 1)])) == "█"
+
+
+def test_the_account_tells_timing_gaps_what_happened_and_what_does_not_hold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_log(tmp_path / "whole.mcap", TICKS, settings=load(), lost=range(50, 53))
+    more = [
+        told("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + 500_000_000 + i)
+        for i in range(15)
+    ]
+    more.append(told("event", Event(role="plant", kind="tripped", text="the [red] limit"), START_NS + 410_000_000))
+    path = retell(tmp_path / "whole.mcap", tmp_path / "a.mcap", more=more)
+    assert execute(["log", "review", str(path), "--require", "gaps=0"]) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "gaps 1, the longest 3 ticks at 0.100 s" in out
+    assert "latency 298 298 298 300 µs" in out
+    assert "0.406 s plant tripped the [red] limit" in out
+    assert "… and 5 more" in out
+    assert "✗ gaps ≤ 0 1" in out

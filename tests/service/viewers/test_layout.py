@@ -1,0 +1,123 @@
+"""Viewer layout: its topics are decoded channels, and Lichtblick imports it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from aeroloop.service.cli.main import execute
+from aeroloop.service.viewers.channels import SHAPES
+from aeroloop.service.viewers.layout import layout
+
+PANELS = {
+    "3D": {"followTf", "followMode", "cameraState", "scene", "topics", "transforms", "layers"},
+    "Plot": {
+        "paths",
+        "yAxisLabel",
+        "xAxisVal",
+        "isSynced",
+        "showXAxisLabels",
+        "showYAxisLabels",
+        "showLegend",
+        "legendDisplay",
+        "showPlotValuesInLegend",
+        "followingViewWidth",
+        "sidebarDimension",
+    },
+    "StateTransitions": {"paths", "isSynced"},
+    "RosOut": {"searchTerms", "minLogLevel", "topicToRender"},
+}
+"""Panels of Lichtblick and the keys of their settings that are used here, from its sources."""
+
+TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
+
+
+def made(vehicle: str = "aero", actuators: int = 2) -> dict[str, Any]:
+    tree: dict[str, Any] = json.loads(layout(vehicle, actuators))
+    return tree
+
+
+def paths(tree: dict[str, Any]) -> list[str]:
+    return [path["value"] for panel in tree["configById"].values() for path in panel.get("paths", [])]
+
+
+def topics_named(tree: dict[str, Any]) -> set[str]:
+    panels = tree["configById"].values()
+    return {name for panel in panels for name in [*panel.get("topics", {}), panel.get("topicToRender")] if name}
+
+
+def leaves(node: Any) -> Iterator[str]:
+    if isinstance(node, str):
+        yield node
+    else:
+        assert set(node) == {"direction", "splitPercentage", "first", "second"}
+        assert node["direction"] in ("row", "column")
+        yield from leaves(node["first"])
+        yield from leaves(node["second"])
+
+
+@pytest.mark.parametrize("vehicle", ["aero", "bench.2"])
+def test_every_path_is_a_field_of_a_topic_that_is_decoded(vehicle: str) -> None:
+    found = paths(made(vehicle, 3))
+    for path in found:
+        parts = re.fullmatch(r'(?P<q>"?)/(?P<vehicle>[^/]+)/(?P<name>[a-z_/]+)(?P=q)\.(?P<field>\w+)', path)
+        assert parts is not None, path
+        assert parts["vehicle"] == vehicle
+        assert parts["field"] in json.loads(SHAPES[parts["name"]].schema)["properties"], path
+    shown = {path.rpartition(".")[2] for path in found}
+    assert {"pitch_deg", "desired_pitch_deg", "error_deg", "voltage_2_v", "latency_p99_us", "state"} <= shown
+
+
+def test_a_topic_with_a_dot_in_it_stands_in_quotes() -> None:
+    assert '"/bench.2/tracking".error_deg' in paths(made("bench.2"))
+    assert "/aero/tracking.error_deg" in paths(made("aero"))
+
+
+def test_topics_that_panels_name_are_decoded_in_the_schema_that_the_panel_draws() -> None:
+    tree = made()
+    assert topics_named(tree) <= {f"/aero/{name}" for name in SHAPES}
+    (body,) = (panel for name, panel in tree["configById"].items() if name.startswith("3D!"))
+    assert [name for name, settings in body["topics"].items() if settings["visible"]] == ["/aero/scene"]
+    assert SHAPES["scene"].name == "foxglove.SceneUpdate"
+    (log,) = (panel for name, panel in tree["configById"].items() if name.startswith("RosOut!"))
+    assert SHAPES[log["topicToRender"].removeprefix("/aero/")].name == "foxglove.Log"
+
+
+def test_the_camera_follows_the_frame_that_the_body_hangs_in() -> None:
+    (body,) = (panel for name, panel in made("x")["configById"].items() if name.startswith("3D!"))
+    assert (body["followTf"], body["followMode"]) == ("x", "follow-position")
+
+
+def test_only_settings_that_a_panel_has_are_made_and_every_panel_has_its_place() -> None:
+    tree = made()
+    assert set(tree) == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
+    for name, settings in tree["configById"].items():
+        assert set(settings) - TITLES <= PANELS[name.partition("!")[0]], name
+    assert sorted(leaves(tree["layout"])) == sorted(tree["configById"])
+
+
+def test_voltages_are_those_of_the_motors_there_are() -> None:
+    def volts(actuators: int) -> set[str]:
+        return {path.rpartition(".")[2] for path in paths(made("aero", actuators)) if "voltage" in path}
+
+    assert volts(2) == {"voltage_2_v", "voltage_3_v"}
+    assert volts(3) == {"voltage_1_v", "voltage_2_v", "voltage_3_v"}
+
+
+def test_the_command_prints_the_layout_of_the_vehicle_that_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    assert execute(["show", "layout", "--vehicle", "bench", "--set", "wire.actuators=3"]) == 0
+    assert json.loads(capfd.readouterr().out) == made("bench", 3)
+    assert execute(["show", "layout", "--set", "vehicle=aero2"]) == 0
+    assert json.loads(capfd.readouterr().out) == made("aero2")
+
+
+def test_a_name_that_no_vehicle_can_have_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
+    assert execute(["show", "layout", "--vehicle", "a/b"]) == 2
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("aeroloop: vehicle: ")
+    assert len(captured.err.splitlines()) == 1

@@ -1,0 +1,140 @@
+"""Edited logs: a copy of a log with messages moved, replaced, dropped or added, or rows of batches edited.
+
+Also builds synthetic ticks for an observer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from math import nan
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.operator import Message as Model
+from aeroloop.protocol.messages.trace import HEADER_BYTES, STEPS, End, read_batch
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
+from aeroloop.service.config import load
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.certificate_cache import CertificateCache
+from aeroloop.service.review.observe import Observer
+from aeroloop.service.review.theorem_check import TheoremCheck
+from tests.support.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
+
+PERIOD_NS = 2_000_000
+LATENCY_NS = 2 * ONE_WAY_NS  # in the bin from 291.7 to 304.4 µs, whose middle is 297.9
+
+
+class Said(NamedTuple):
+    """A message: its key, when it was recorded [ns], what it says."""
+
+    key: str
+    published_ns: int
+    data: bytes
+
+    @property
+    def topic(self) -> str:
+        """The name of its topic."""
+        address = topics.read_key(self.key)
+        return address.topic.name if address else ""
+
+
+def told(
+    name: str, message: Model | bytes, published_ns: int, role: str = "controller", session: str = SESSION
+) -> Said:
+    """A message of the made log's vehicle."""
+    key = topics.key(name, VEHICLE, session=session, role=role)
+    return Said(key, published_ns, message if isinstance(message, bytes) else message.encode())
+
+
+def retell(
+    log: Path,
+    out: Path,
+    change: Callable[[Said], Said | None] = lambda one: one,
+    more: Sequence[Said] = (),
+    metadata: Iterable[tuple[str, dict[str, str]]] = (),
+) -> Path:
+    """Write a log again.
+
+    Args:
+        log: The log.
+        out: The new one.
+        change: What becomes of each message; None leaves it out.
+        more: Messages to add, by their times.
+        metadata: Metadata to add, by name.
+    """
+    with log.open("rb") as file:
+        reader = make_reader(file)
+        messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+        known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+    kept = [one for message in messages if (one := change(message)) is not None]
+    return tell(out, sorted([*kept, *more], key=lambda one: one.published_ns), [*known, *metadata])
+
+
+def tell(out: Path, messages: Iterable[Said], metadata: Iterable[tuple[str, dict[str, str]]] = ()) -> Path:
+    """Write messages in this order."""
+    with out.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="aeroloop", library="test")
+        for name, entries in metadata:
+            writer.add_metadata(name, entries)
+        channels: dict[str, int] = {}
+        for one in messages:
+            if one.key not in channels:
+                channels[one.key] = writer.register_channel(one.key, "", 0)
+            writer.add_message(channels[one.key], one.published_ns, one.data, one.published_ns)
+        writer.finish()
+    return out
+
+
+def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
+    """What edits the columns of an end's batches in place."""
+
+    def change(one: Said) -> Said:
+        if one.topic != "trace" or not one.key.endswith(end):
+            return one
+        batch = read_batch(one.data)
+        assert batch is not None
+        columns = batch.columns.copy()
+        edit(columns)
+        for name in set(STEPS) & set(columns.dtype.names or ()):
+            columns[name] = np.diff(columns[name], prepend=columns[name].dtype.type(0))
+        at = HEADER_BYTES + columns.nbytes
+        return one._replace(data=one.data[:HEADER_BYTES] + columns.tobytes() + one.data[at:])
+
+    return change
+
+
+def observer_of(*overrides: str) -> Observer:
+    """An observer of the default configuration."""
+    settings = load(overrides=overrides)
+    return Observer(settings, TheoremCheck(CertificateCache(settings).of(()), settings.loop.period, None))
+
+
+def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:
+    """One tick at rest."""
+    at, zero, one = START_NS + k * PERIOD_NS, (0.0,) * 3, float(LATENCY_NS)
+    columns = (
+        k,
+        at,
+        at,
+        one,
+        nan,
+        nan,
+        attitude,
+        desired,
+        zero,
+        zero,
+        zero,
+        zero,
+        (0.0, 0.0),
+        (0.0, 0.0),
+        1.0,
+        zero,
+        zero,
+    )
+    return Ticks(*(np.array([column]) for column in columns))

@@ -1,0 +1,265 @@
+"""Synthetic logs without a network: controller and emulated plant, traces written as the recorder writes them.
+
+Both ends are the project's own: the emulator with its trace, the controller with its tick source and its trace. Only
+network and clocks are simulated, so the expected content of the log is exact.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Container
+from pathlib import Path
+from typing import Final, NamedTuple
+from unittest.mock import patch
+
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Grant
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
+from aeroloop.protocol.messages.trace import End, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.transport.publication import Delivery as Message
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.daemon.telemetry import telemetry_of
+from aeroloop.service.daemon.tick_source import PlantTick
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
+from aeroloop.service.recording.log_file import LogFile
+
+START_NS: Final = 1_800_000_000_000_000_000
+"""When tick 0 is measured, on the plant's wall clock."""
+VEHICLE, SESSION = "aero", "s1"
+MONOTONIC_NS: Final[dict[End, int]] = {"plant": 3_600_000_000_000, "controller": 86_400_000_000_000}
+"""The same instant on either end's monotonic clock: they were booted at different times."""
+AHEAD_NS: Final = 10_000_000_000
+"""The controller's wall clock is so far ahead of the plant's."""
+ONE_WAY_NS: Final = 150_000
+"""What a frame takes either way, where nothing goes wrong."""
+RUNS: Final[dict[End, int]] = {"plant": 0x1111, "controller": 0x2222}
+
+Changes = dict[int, tuple[Gains | None, Reference | None]]
+
+
+def lockstep() -> Settings:
+    return load(overrides=["loop.lockstep=true"])
+
+
+class Clock:
+    """One end's clocks, as `time` for its modules."""
+
+    def __init__(self, end: End, drift: float = 0.0) -> None:
+        self.now_ns = 0  # since tick 0, for everybody
+        self._monotonic_ns = MONOTONIC_NS[end]
+        self._wall_ns = START_NS + (AHEAD_NS if end == "controller" else 0)
+        self._rate = 1.0 + drift
+
+    def at(self, now_ns: int) -> int:
+        """Its monotonic clock at an instant [ns]."""
+        return self._monotonic_ns + round(now_ns * self._rate)
+
+    def monotonic_ns(self) -> int:
+        return self.at(self.now_ns)
+
+    def time_ns(self) -> int:
+        return self._wall_ns + self.now_ns
+
+
+class Logged(NamedTuple):
+    """A message, when it was recorded, and when it was published on its publisher's wall clock [ns]."""
+
+    at_ns: int
+    key: str
+    payload: bytes
+    published_ns: int
+
+
+class Messages:
+    """What is to be recorded, in order."""
+
+    def __init__(self) -> None:
+        self.all: list[Logged] = []
+
+    def add(self, name: str, payload: bytes, clock: Clock, role: str = "controller") -> None:
+        key = topics.key(name, VEHICLE, session=SESSION, role=role)
+        self.all.append(Logged(START_NS + clock.now_ns, key, payload, clock.time_ns()))
+
+
+def description(settings: Settings, role: str) -> Description:
+    return Description(
+        protocol=PROTOCOL_VERSION, role=role, vehicle=VEHICLE, host="h", versions={}, config=settings.description()
+    )
+
+
+def write(
+    path: Path,
+    settings: Settings,
+    messages: list[Logged],
+    chunk_every: int = 50,
+    roles: tuple[str, ...] = ("controller", "plant"),
+) -> Path:
+    """Write a log with both roles' descriptions and these messages."""
+    path.unlink(missing_ok=True)
+    log = LogFile(path)
+    for role in roles:
+        key = topics.key("description", VEHICLE, role=role)
+        log.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": description(settings, role).model_dump_json()})
+    numbers: Counter[str] = Counter()
+    for i, (at_ns, key, payload, published_ns) in enumerate(messages):
+        log.add(Message(key, payload, numbers[key], published_ns, None), at_ns)
+        numbers[key] += 1
+        if i % chunk_every == chunk_every - 1:
+            log.commit()
+    log.end()
+    return path
+
+
+class ControllerEnd:
+    """The controller and its trace, as the daemon runs them."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        messages: Messages,
+        clock: Clock,
+        session: str = SESSION,
+        run: int = RUNS["controller"],
+    ) -> None:
+        self.controller = Controller(settings.wire, settings.law, settings.reference, settings.loop.period)
+        self.trace = TraceWriter("controller", settings.wire, run, round(settings.loop.trace_s * 1e9))
+        self.trace.session = session
+        self._messages, self._clock, self._period = messages, clock, settings.loop.period
+        self.trace.state = self.controller.state.model_dump(mode="json")
+        first = Change(session=session, tick=0, gains=self.controller.gains, reference=settings.reference)
+        self.trace.changes.append(first)
+
+    def follow(self, k: int, gains: Gains | None, reference: Reference | None) -> None:
+        change = Change(session=self.trace.session, tick=k, gains=gains, reference=reference, within_s=1.0)
+        self.controller.apply(change)
+        self.trace.changes.append(change)
+
+    def record(self, tick: PlantTick, command: bytes | None, sent_ns: int) -> None:
+        sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
+        self.trace.controller_row(
+            max(tick.tick, 0), tick.received_as, sent_as, tick.at_ns, sent_ns if command is not None else 0,
+            tick.frame, command or b"",
+        )  # fmt: skip
+        if self.trace.due(self._clock.monotonic_ns()):
+            self.publish()
+            self.trace.state = self.controller.state.model_dump(mode="json")
+
+    def publish(self, *, final: bool = False) -> None:
+        payload = self.trace.take(self._clock.monotonic_ns(), self._clock.time_ns(), final=final)
+        self._messages.add("trace", payload, self._clock, "controller")
+
+
+def make_log(
+    path: Path,
+    ticks: int,
+    *,
+    settings: Settings | None = None,
+    begin: int = 0,
+    changes: Changes | None = None,
+    spoil: int | None = None,
+    chunk_every: int = 20,
+    truth_every: int = 0,
+    lost: Container[int] = (),
+    skipped: Container[int] = (),
+) -> None:
+    """Write a log of a loop in which nothing else goes wrong.
+
+    Args:
+        path: Where.
+        ticks: How many ticks the loop runs.
+        settings: Its configuration.
+        begin: Batches before this tick are not recorded.
+        changes: Gains and reference that an operator sets, by tick.
+        spoil: The tick whose command is not logged as it was sent.
+        chunk_every: Close a chunk after so many messages.
+        truth_every: Publish the true state every so many ticks; 0 is never.
+        lost: Ticks whose measurement never reaches the controller.
+        skipped: Ticks that the plant has no time for.
+    """
+    settings = settings or lockstep()
+    messages = made(settings, ticks, changes or {}, spoil, truth_every, lost, skipped)
+    write(path, settings, [message for message in messages if not begin or not _before(message, begin)], chunk_every)
+
+
+def made(
+    settings: Settings,
+    ticks: int,
+    changes: Changes = {},  # noqa: B006  # nobody changes it
+    spoil: int | None = None,
+    truth_every: int = 0,
+    lost: Container[int] = (),
+    skipped: Container[int] = (),
+    session: str = SESSION,
+    at_ns: int = 0,
+) -> list[Logged]:
+    """The messages of such a loop; arguments as of `make_log`.
+
+    The session may have another name, and begin so long after the first instant of both clocks [ns]; each session is
+    of processes of its own.
+    """
+    wire, loop = settings.wire, settings.loop
+    messages = Messages()
+    plant_clock, clock = Clock("plant"), Clock("controller")
+    emulator = Emulator(loop, wire, settings.plant, threading.Event())
+    endpoint, n = emulator.endpoint, at_ns // 1_000_000
+    with patch("aeroloop.plant_emulator.endpoint.trace_rows.time", plant_clock):
+        plant_clock.now_ns = at_ns
+        trace = PlantTrace(
+            loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n
+        )
+        claim = Claim(
+            controller="c", session=session, period_ns=loop.period_ns, lockstep=loop.lockstep, auto_arm=True, wire=wire
+        )
+        assert isinstance(endpoint.claim(claim), Grant)
+        trace.follow(endpoint)
+        end = ControllerEnd(settings, messages, clock, session, RUNS["controller"] + n)
+        arrival: Arrival | None = None
+        for k in range(ticks):
+            if k in skipped:
+                continue
+            now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
+            measurement = emulator.tick(arrival.frame if arrival else None, k)
+            assert measurement is not None, endpoint.notices
+            trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
+            if truth_every and k % truth_every == 0:
+                messages.add("truth", truth_of(emulator._emulated, endpoint).encode(), plant_clock, "plant")
+            arrival = None
+            if k in lost:
+                continue
+            clock.now_ns = now_ns + ONE_WAY_NS
+            if k in changes:
+                end.follow(k, *changes[k])
+            command = end.controller.tick(measurement, k)
+            received_as = Received.FRAME if measurement else Received.SILENT
+            logged = command if k != spoil or not command else command[:-1] + bytes([command[-1] ^ 0x10])
+            received_ns = clock.monotonic_ns()
+            end.record(PlantTick(k, measurement, received_as, received_ns, received_ns), logged, received_ns)
+            if k % 10 == 0 and end.controller.tick_index == k:
+                messages.add("telemetry", telemetry_of(end.controller, session).encode(), clock)
+            if command or (command is not None and loop.lockstep):
+                arrival = Arrival(command, plant_clock.at(now_ns + 2 * ONE_WAY_NS))
+        end.publish(final=True)
+        endpoint.release(session)
+        trace.follow(endpoint)
+    return messages.all
+
+
+def _before(message: Logged, begin: int) -> bool:
+    """Whether a message is a batch with rows of ticks before this one."""
+    batch = read_batch(message.payload) if "/trace/" in message.key else None
+    if batch is None:
+        return (message.at_ns - START_NS) // 2_000_000 < begin
+    ticks = batch.columns["tick" if batch.header.end == "controller" else "session_tick"]
+    return not len(ticks) or int(ticks[0]) < begin
+
+
+AN_OPERATORS_WORDS: Changes = {
+    120: (Gains(C2=(0.2, 0.2, 0.2)), None),
+    250: (None, Hold(attitude=(0.0, 5.0, -10.0))),
+    400: (Gains(Gamma=(0.01, 0.01, 0.01)), load().reference),
+}

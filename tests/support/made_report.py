@@ -1,0 +1,157 @@
+"""Synthetic report: a small, constant example of every part of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from aeroloop.protocol.messages.models import Percentiles
+from aeroloop.service.figures import StreamFigures
+from aeroloop.service.review.report import (
+    Check,
+    Findings,
+    Gap,
+    LemmaCheck,
+    Line,
+    Mark,
+    Panel,
+    Report,
+    Spread,
+    TheoremFindings,
+)
+
+BINS = [(2 ** (i / 16), count) for i, count in ((148, 90), (149, 400), (150, 300), (151, 60), (180, 3), (200, 1))]
+MARKS = (
+    Mark(time_s=None, kind="started", role="controller", text="controller aero-1 on host h"),
+    Mark(time_s=3.0, kind="changed", role="controller", text="gains: C2 = 0.2 0.2 0.2"),
+    Mark(time_s=7.25, kind="tripped", role="emulator", text="no fresh command for 100 ms: 0 V"),
+)
+
+
+def made_report(
+    name: str = "a.mcap",
+    *,
+    marks: Sequence[Mark] = MARKS,
+    checks: Sequence[Check] = (),
+    damages: Sequence[str] = (),
+    settings: dict[str, Any] | None = None,
+    thinned: int = 1,
+    phase: float = 0.0,
+    turned: bool = False,
+    theorem: TheoremFindings | None = None,
+) -> Report:
+    """Ten seconds of sines, with one trip and one gap.
+
+    Args:
+        name: What to call it.
+        marks: What happened.
+        checks: Limits that were asked for.
+        damages: What could not be read.
+        settings: Sections of the configuration over the usual ones.
+        thinned: Ticks behind two points.
+        phase: Of the measured lines [rad]; the desired ones do not change with it.
+        turned: Whether they are turned around.
+        theorem: What became of the theorem.
+    """
+    time = np.linspace(0.0, 10.0, 501)
+    desired, measured = np.sin(time) * (-1.0 if turned else 1.0), np.sin(time - phase) + 0.02 * np.cos(31 * time)
+    tenth = np.where(np.arange(501) % 10 == 0, measured, np.nan)
+    panels = [
+        *(
+            Panel("attitude", "Figure C.7: Attitude with quantization", label, "1",
+                  [Line("measured", measured), Line("desired", desired, desired=True)])
+            for label in ("ε₁", "ε₂")
+        ),
+        Panel("attitude_error", "Figure C.9: Attitude error with quantization", "ε̃₁", "1",
+              [Line("measured", measured)]),
+        Panel("input", "Figure C.11: Input with quantization", "u₂", "V", [Line("commanded", 20 * measured)]),
+        Panel("damping_estimate", "Damping estimate", "θ̂₁", "N·m·s/rad", [Line("estimated", tenth)]),
+        Panel("latency", "Loop latency", "latency", "µs",
+              [Line("latency", np.where(measured > 1.01, 90_000.0, 600.0))]),
+    ]  # fmt: skip
+    if theorem is not None:
+        panels.append(Panel("z_norm", "Error of Theorem 1", "‖z‖", "1", [Line("measured", np.abs(measured))]))
+    spread = Spread(count=854, p50=640.0, p90=690.0, p99=2400.0, p999=5900.0, max=6011.0, bins=BINS)
+    findings = Findings(
+        duration_s=10.0,
+        z_track=0.00458,
+        u_total=8185.2,
+        max_error_deg=4.84,
+        final_error_deg=0.46,
+        measurement=StreamFigures(frames_per_s=499.1, bits_per_s=27952.0),
+        command=StreamFigures(frames_per_s=498.3, bits_per_s=7972.0),
+        skipped_ticks=50,
+        latency_us=Percentiles(count=854, p50=640.0, p99=2400.0, p999=5900.0, max=6011.0),
+        log=name,
+        trips=[mark.text for mark in marks if mark.kind == "tripped"],
+        damages=list(damages),
+        vehicle="aero",
+        session="s1",
+        sessions=1,
+        started="2026-11-21T12:11:49.588+00:00",
+        timing={"latency": spread, "period": spread},
+        age_us={"p50": 120.0, "p99": 800.0, "max": 4000.0},
+        gaps=[Gap(time_s=7.2, tick=3600, ticks=50)],
+        gap_count=1,
+        saturated={"attitude": 0.0, "rate": 0.013, "voltage": 0.0},
+        invalid={"measurement": 0, "command": 2},
+        losses={},
+        lapses={},
+        missing_ticks={"controller": 0, "plant": 0},
+        missing=[],
+        marks=list(marks),
+        checks=list(checks),
+        theorem=theorem,
+    )
+    usual = {
+        "vehicle": "aero",
+        "loop": {"rate_hz": 500.0, "lockstep": False},
+        "wire": {
+            "attitude": {"bits": 8, "limit": 1.0},
+            "rate": {"bits": 8, "limit": 1.0},
+            "voltage": {"bits": 6, "limit": 24.0},
+        },
+        "law": {"C2": [0.15, 0.15, 0.15]},
+    }
+    facts: dict[str, dict[str, Any]] = {
+        "controller": {"host": "h", "versions": {"aeroloop": "0.1.0"}},
+        "plant": {"host": "h"},
+    }
+    return Report(name, findings, time, panels, thinned, usual | (settings or {}), facts)
+
+
+def made_theorem(*, broken: int = 0) -> TheoremFindings:
+    """A theorem that holds of a run, two of whose inequalities were judged; the second was broken so often."""
+    return TheoremFindings(
+        verdict="Theorem 1 holds: in the end ‖z‖ ≤ 0.2004.",
+        holds=True,
+        radius=0.2004,
+        radius_deg=23.01,
+        transient_s=2.0,
+        since_s=0.0,
+        until_s=8.5,
+        z_norm=0.0638,
+        z_norm_share=0.0638 / 0.2004,
+        error_deg=1.89,
+        true_z_norm=None,
+        true_error_deg=None,
+        damping_known=False,
+        samples=500,
+        outside={"C.28": 0, "C.29": 120, "Assumption 3": 0},
+        judged=380,
+        lemma=[
+            LemmaCheck(equation="C.52", what="‖d₁‖", samples=380, broken=0, closest=0.58, closest_s=7.5, broken_s=None),
+            LemmaCheck(
+                equation="C.57",
+                what="‖Φ − Φ^Q‖",
+                samples=380,
+                broken=broken,
+                closest=1.25 if broken else 0.97,
+                closest_s=4.25,
+                broken_s=3.125 if broken else None,
+            ),
+        ],
+        broken=broken,
+    )

@@ -1,0 +1,199 @@
+"""Driver harness: a driver's loop on a scripted grid, link and front, without network or clock.
+
+A test scripts actions between ticks, answers to measurements, and skipped ticks; the trace is the one that a ZenohFront
+would publish.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from unittest.mock import patch
+
+from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal
+from aeroloop.protocol.messages.trace import Batch, read_batch
+from aeroloop.protocol.transport.link import Arrival, Link
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+RUN = 0x0123_4567_89AB_CDEF
+
+
+class Wires(Link):
+    """Frames on their way to the plant, each due at a tick; the newest that is due is taken."""
+
+    def __init__(self) -> None:
+        self.tick = -1
+        self._due: list[tuple[int, bytes]] = []
+
+    def deliver(self, frame: bytes, tick: int) -> None:
+        """Let a frame be there from a tick on."""
+        self._due.append((tick, frame))
+
+    def send(self, frame: bytes) -> None:
+        """Measurements go to the stage."""
+
+    @property
+    def pending(self) -> bool:
+        """Whether a frame is due."""
+        return any(tick <= self.tick for tick, _ in self._due)
+
+    def take(self) -> Arrival | None:
+        """The last frame that is due, in the order in which they were sent."""
+        due = [frame for tick, frame in self._due if tick <= self.tick]
+        self._due = [(tick, frame) for tick, frame in self._due if tick > self.tick]
+        return Arrival(due[-1], time.monotonic_ns()) if due else None
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """As take: nothing comes by waiting."""
+        del timeout_s
+        return self.take()
+
+    def close(self) -> None:
+        """Forget what is on its way."""
+        self._due.clear()
+
+
+class Grid:
+    """Ticks without time."""
+
+    due_ns = 0
+
+    def __init__(self, skip: Callable[[], int]) -> None:
+        self.tick = -1
+        self.skipped = 0
+        self._skip = skip
+
+    def wait(self) -> int:
+        """The next tick, after those that are skipped."""
+        skipped = self._skip()
+        self.skipped += skipped
+        self.tick += 1 + skipped
+        return self.tick
+
+
+class Stage(Front):
+    """Runs an emulator's driver to a tick.
+
+    Args:
+        loop: The grid.
+        wire: What the frames are.
+        plant: The emulator.
+        between: Called between ticks.
+        answer: Called with every measurement that is sent; SILENCE in lockstep only.
+        skip: Ticks to skip before the next.
+        driver: Instead of an emulator.
+
+    Attributes:
+        batches: What was published.
+        driver: The driver; an Emulator unless one was given.
+        link: The wires, while a session runs.
+    """
+
+    def __init__(
+        self,
+        loop: LoopSettings,
+        wire: WireSpec,
+        plant: PlantSettings,
+        *,
+        between: Callable[[Stage], None] = lambda _: None,
+        answer: Callable[[Stage, bytes], None] = lambda *_: None,
+        skip: Callable[[], int] = lambda: 0,
+        driver: Driver | None = None,
+    ) -> None:
+        super().__init__()
+        self.stop = threading.Event()
+        self.loop, self.wire = loop, wire
+        self.driver = driver or Emulator(loop, wire, plant, self.stop)
+        self.endpoint = self.driver.endpoint
+        self.wires = Wires()
+        self.sent: list[bytes] = []
+        self._published: deque[bytes] = deque()
+        self.trace = PlantTrace(loop, wire, self._published.append, run=RUN)
+        self._between, self._answer, self._skip = between, answer, skip
+        self._claims = 0
+        self._ends = 0
+
+    def run(self, ticks: int) -> Stage:
+        """Run so many ticks of the plant, and leave."""
+        self._ends = ticks
+        with (
+            patch("aeroloop.plant_emulator.hosts.driver.TickGrid", lambda _: Grid(self._skip)),
+            patch("aeroloop.plant_emulator.hosts.driver.prepare_process", lambda _: []),
+            patch("aeroloop.plant_emulator.hosts.driver.IDLE_WAIT_S", 0.0),
+        ):
+            self.driver.run(self)
+        return self
+
+    @property
+    def batches(self) -> list[Batch]:
+        """What was published."""
+        batches = [read_batch(payload) for payload in self._published]
+        assert None not in batches
+        return [batch for batch in batches if batch is not None]
+
+    def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:
+        """Claim the plant for a controller `c`."""
+        self._claims += 1
+        return self.endpoint.claim(
+            Claim(
+                controller="c",
+                session=f"s{self._claims}",
+                period_ns=self.loop.period_ns,
+                lockstep=self.loop.lockstep,
+                auto_arm=auto_arm,
+                wire=self.wire,
+            )
+        )
+
+    @property
+    def link(self) -> Link | None:
+        """The session's frames; None while there is no session."""
+        return self.wires if self.endpoint.session is not None else None
+
+    def serve(self) -> None:
+        """Nothing to declare."""
+
+    def take_inbox(self) -> None:
+        """What the test says."""
+        self._between(self)
+        self.follow_session()
+
+    def send(self, frame: bytes) -> None:
+        """Have it answered, at once or later."""
+        if frame != SILENCE or self.loop.lockstep:
+            self.sent.append(frame)
+            self._answer(self, frame)
+
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """As a ZenohFront does."""
+        self.trace.row(self.endpoint, measurement, arrival, sent_ns)
+        self.wires.tick = self.endpoint.ticked
+        self.follow_session()
+        if self.endpoint.ticked >= self._ends:
+            self.stop.set()
+
+    def follow_session(self) -> None:
+        """As a ZenohFront does."""
+        self.trace.follow(self.endpoint)
+        if self.endpoint.session is None:
+            self.wires.close()
+
+    def publish_when_due(self) -> None:
+        """Nothing to tell."""
+
+    def publish_status(self) -> None:
+        """Nothing to tell."""
+
+    def leave(self) -> None:
+        """As a ZenohFront does."""
+        self.follow_session()
+        self.trace.finish()

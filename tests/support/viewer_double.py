@@ -1,0 +1,155 @@
+"""Viewer double without Foxglove's code: a protobuf decoder and a client of the live server.
+
+Protobuf: https://protobuf.dev/programming-guides/encoding. The client's binary message: opcode 1, the subscription's
+id (uint32), the log time in ns (uint64), all little-endian, and the message.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from aeroloop.protocol.wire.attitude import Quaternion
+
+SUBPROTOCOL = Subprotocol("foxglove.sdk.v1")
+PATIENCE_S = 20.0
+"""For what comes within milliseconds on an idle machine."""
+
+Fields = dict[int, list[Any]]
+
+
+def fields(data: bytes) -> Fields:
+    """A protobuf message: number of a field to its values, messages and strings as bytes."""
+    found: Fields = {}
+    for number, value in _fields(data):
+        found.setdefault(number, []).append(value)
+    return found
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, Any]]:
+    at = 0
+    while at < len(data):
+        tag, at = _varint(data, at)
+        number, kind = tag >> 3, tag & 7
+        value: Any
+        if kind == 0:
+            value, at = _varint(data, at)
+        elif kind == 1:
+            (value,), at = struct.unpack_from("<d", data, at), at + 8
+        else:
+            assert kind == 2, kind
+            size, at = _varint(data, at)
+            assert at + size <= len(data)
+            value, at = data[at : at + size], at + size
+        yield number, value
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        value |= (data[at] & 0x7F) << shift
+        shift += 7
+        at += 1
+        if not data[at - 1] & 0x80:
+            return value, at
+
+
+def quaternion(data: bytes) -> Quaternion:
+    """[w, x, y, z] of a foxglove.Quaternion."""
+    x, y, z, w = (fields(data).get(number, [0.0])[0] for number in (1, 2, 3, 4))
+    return w, x, y, z
+
+
+def orientation(pose_in_frame: bytes) -> Quaternion:
+    """Of a foxglove.PoseInFrame."""
+    pose = fields(fields(pose_in_frame)[3][0])
+    return quaternion(pose[2][0])
+
+
+class Shown(NamedTuple):
+    """A message that came: when it was published [ns], and its bytes."""
+
+    at_ns: int
+    data: bytes
+
+
+class Viewer:
+    """A client of a server in Foxglove's protocol. A context.
+
+    Args:
+        url: The server's.
+        max_queue: Messages that may wait here before it stops to read from the network.
+
+    Attributes:
+        info: What the server said of itself.
+        channels: What it has advertised so far, by topic.
+    """
+
+    def __init__(self, url: str, max_queue: int | None = None) -> None:
+        self._connecting = connect(url, subprotocols=[SUBPROTOCOL], max_queue=max_queue, close_timeout=0.5)
+        self.info: dict[str, Any] = {}
+        self.channels: dict[str, dict[str, Any]] = {}
+        self._topics: dict[int, str] = {}
+
+    def __enter__(self) -> Self:
+        self._socket = self._connecting.__enter__()
+        assert self._socket.subprotocol == SUBPROTOCOL
+        self.info = json.loads(self._socket.recv(PATIENCE_S))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._connecting.__exit__(kind, error, trace)
+
+    def await_topics(self, *topics: str) -> None:
+        """Listen until all of these have been advertised."""
+        while not set(topics) <= set(self.channels):
+            self._hear()
+
+    def await_closed(self) -> None:
+        """Listen until the server has closed the connection."""
+        with suppress(ConnectionClosed):
+            while True:
+                self._hear()
+
+    def subscribe(self, *topics: str) -> None:
+        """Ask for what has been advertised; ids of subscriptions are those of channels and 1000."""
+        wanted = [
+            {"id": self.channels[topic]["id"] + 1000, "channelId": self.channels[topic]["id"]} for topic in topics
+        ]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def receive(self) -> tuple[str, Shown]:
+        """The next message, and its topic."""
+        while (heard := self._hear()) is None:
+            pass
+        return heard
+
+    def first(self, topic: str) -> Shown:
+        """The next message of a topic."""
+        while True:
+            found, shown = self.receive()
+            if found == topic:
+                return shown
+
+    def _hear(self) -> tuple[str, Shown] | None:
+        heard = self._socket.recv(PATIENCE_S)
+        if isinstance(heard, bytes):
+            opcode, subscription, at_ns = struct.unpack_from("<BIQ", heard)
+            assert opcode == 1
+            return self._topics[subscription - 1000], Shown(at_ns, heard[13:])
+        said = json.loads(heard)
+        if said["op"] == "advertise":
+            for channel in said["channels"]:
+                self.channels[channel["topic"]] = channel
+                self._topics[channel["id"]] = channel["topic"]
+        return None

@@ -1,0 +1,64 @@
+"""Zenoh sessions on loopback that are always closed."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from aeroloop.protocol.transport.network import NetworkSettings, join
+
+PATIENCE_S = 20.0
+"""How long to wait for what takes milliseconds: a shared machine can keep a process waiting."""
+
+
+def free_port() -> int:
+    """A port of this machine that nobody has now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def accepts(port: int) -> bool:
+    """Whether somebody listens on a port of this machine."""
+    with socket.socket() as probe:
+        probe.settimeout(PATIENCE_S)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def eventually(what: str, condition: Callable[[], bool]) -> None:
+    """Poll for what another thread brings about and announces by no event."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"{what} did not happen within {PATIENCE_S:g} s"
+        time.sleep(0.005)
+
+
+class Gathering:
+    """Sessions at one rendezvous. A context: leaving it closes those that are still open."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self.settings = NetworkSettings(rendezvous=f"tcp/127.0.0.1:{self.port}")
+        self._members: list[zenoh.Session] = []
+
+    def join(self, settings: NetworkSettings | None = None) -> zenoh.Session:
+        """One more member, with the gathering's settings unless others are given."""
+        member = join(settings or self.settings)
+        self._members.append(member)
+        return member
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for member in self._members:
+            if not member.is_closed():
+                member.close()
