@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 Sign: TypeAlias = Literal[-1, 1]
 
@@ -14,10 +14,8 @@ CardType: TypeAlias = Literal["quanser_aero2_usb", "quanser_aero_usb"]
 PITCH_COUNTS: Final[Mapping[str, int]] = {"quanser_aero2_usb": 2880, "quanser_aero_usb": 2048}
 
 
-class QuanserSettings(BaseModel):
+class QuanserSettings(BaseModel, extra="forbid"):
     """The board, and how its channels map to the body. Verify the signs and the gyro's axes on the bench."""
-
-    model_config = ConfigDict(extra="forbid")
 
     card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name")
     card_identifier: str = Field(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
@@ -25,10 +25,8 @@ from aeroloop.plant_emulator.quanser_settings import QuanserSettings
 from aeroloop.protocol.wire.loop import WATCHDOG_S
 
 
-class PlantSettings(BaseModel):
+class PlantSettings(BaseModel, extra="forbid"):
     """The plant end: the plant, its disturbances, sensors and faults, the watchdog and the limits."""
-
-    model_config = ConfigDict(extra="forbid")
 
     via: Literal["emulator", "can", "quanser", "quanser-fake"] = Field(
         default="emulator",
@@ -56,8 +54,7 @@ class PlantSettings(BaseModel):
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
     faults: list[str] = Field(
-        default=[],
-        description="faults: signal:kind[=value][@start[..end]], in s since the first claim was granted",
+        default=[], description="faults: signal:kind[=value][@start[..end]], in s since the first claim was granted"
     )
     fault_seed: int = Field(default=0, ge=0, description="of the faults' random numbers")
     steps_on_request: bool = Field(

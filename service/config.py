@@ -146,7 +146,7 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
     except SettingsError as error:  # a section in the environment is JSON
         raise ConfigError(f"{error}: write its keys one by one, as {ENV_PREFIX}SECTION__KEY") from None
     except ValidationError as error:
-        raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
+        raise _config_error(error) from None
 
 
 def from_description(config: dict[str, Any]) -> Settings:
@@ -158,7 +158,7 @@ def from_description(config: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(config)
     except ValidationError as error:
-        raise ConfigError("; ".join(_explain(dict(e)) for e in error.errors(include_url=False))) from None
+        raise _config_error(error) from None
 
 
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
@@ -198,6 +198,10 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
+
+
+def _config_error(error: ValidationError, section: str = "") -> ConfigError:
+    return ConfigError("; ".join(section + _explain(dict(e)) for e in error.errors(include_url=False)))
 
 
 def _explain(error: dict[str, Any]) -> str:
@@ -240,4 +244,4 @@ def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> 
     try:
         return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
     except ValidationError as error:  # some kinds of quantizer allow other numbers of bits
-        raise ConfigError("; ".join(f"wire.{_explain(dict(e))}" for e in error.errors(include_url=False))) from None
+        raise _config_error(error, "wire.") from None

@@ -29,6 +29,7 @@ def test_the_python_example_prints_what_the_experiment_gives(capfd: pytest.Captu
     assert capfd.readouterr().out == f"{run_experiment(settings, 10).z_track}\n"
 
 
+@pytest.mark.processes
 def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None:
     (_, example) = python_blocks()
     (tmp_path / "test_example.py").write_text(example)

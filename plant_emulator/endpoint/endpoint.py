@@ -27,14 +27,8 @@ from aeroloop.protocol.wire.transmit import SILENCE, Sender
 class Endpoint(Tenancy):
     """One plant, one controller at a time.
 
-    Args:
-        plant: The plant to measure and to actuate.
-        wire: Format of the frames.
-        period_ns: Period of a tick [ns].
-        lockstep: Whether the loop waits for each command; a claim must have the same value.
-        watchdog_s: 0 V after this long without a fresh command [s].
-        guard: Limits that trip the plant; None for no limits.
-        armed: Whether the first claim is granted without `arm`.
+    After `watchdog_s` without a fresh command [s] the plant gets 0 V; `guard` trips it at its limits, if there are any.
+    The other arguments are Tenancy's.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.

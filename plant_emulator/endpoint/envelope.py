@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import acos, cos, degrees, hypot, isfinite, radians
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.endpoint.tenancy import Trip
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.states import TripCause
 
 
-class LimitSettings(BaseModel):
+class LimitSettings(BaseModel, extra="forbid"):
     """Limits; beyond any of them the plant trips."""
-
-    model_config = ConfigDict(extra="forbid")
 
     max_tilt_deg: float = Field(
         default=75.0, gt=0, le=180, description="largest angle between the body's z axis and the vertical [deg]"
@@ -34,13 +32,7 @@ class LimitSettings(BaseModel):
 
 
 class Guard:
-    """Checks one plant against its limits.
-
-    Args:
-        settings: The limits.
-        period_ns: Period of a tick [ns].
-        voltage_limit: Voltage at which a motor counts as saturated [V].
-    """
+    """Checks one plant against its limits. At `voltage_limit` [V] a motor counts as saturated."""
 
     def __init__(self, settings: LimitSettings, period_ns: int, voltage_limit: float) -> None:
         self._settings = settings
@@ -54,21 +46,14 @@ class Guard:
         self._saturated = self._invalid = 0
 
     def check(self, seen: Measurement, voltages: Sequence[float]) -> Trip | None:
-        """Return a reason to trip, or None.
-
-        Args:
-            seen: Measurement of this tick.
-            voltages: Commanded voltages [V]. Shape (actuators,).
-        """
+        """Return a reason to trip, or None, for this tick's measurement and commanded voltages [V] (actuators,)."""
         limits = self._settings
         (w, x, y, z), (wx, wy, wz) = seen
         if not isfinite(w + x + y + z + wx + wy + wz):
             self._invalid += 1
-            if self._seconds(self._invalid) > limits.max_invalid_s:
-                return Trip(
-                    TripCause.SENSORS,
-                    f"the sensors have had no valid value for {self._seconds(self._invalid) * 1e3:.0f} ms",
-                )
+            if (invalid_s := self._seconds(self._invalid)) > limits.max_invalid_s:
+                reason = f"the sensors have had no valid value for {invalid_s * 1e3:.0f} ms"
+                return Trip(TripCause.SENSORS, reason)
             return None
         self._invalid = 0
         upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
@@ -83,8 +68,8 @@ class Guard:
             self._saturated = 0
             return None
         self._saturated += 1
-        if self._seconds(self._saturated) > limits.max_saturated_s:
-            reason = f"a motor has been at its voltage limit for {self._seconds(self._saturated):.1f} s"
+        if (saturated_s := self._seconds(self._saturated)) > limits.max_saturated_s:
+            reason = f"a motor has been at its voltage limit for {saturated_s:.1f} s"
             return Trip(TripCause.SATURATION, reason)
         return None
 

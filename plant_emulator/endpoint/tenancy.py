@@ -53,6 +53,7 @@ class Tenancy:
         session: Name of the session, or None.
         holder: Controller that holds the plant, or None.
         trip: Cause of the last trip, until it is cleared.
+        cause: Why the latch refuses claims, or None.
         notices: Events since the owner last emptied this list.
         operations: Changes of this end between ticks since the owner last emptied this list.
         ticked: Index of the last tick; −1 before the first.
@@ -79,18 +80,13 @@ class Tenancy:
         self.refused = self.stale = 0
         self.unavailable: str | None = None
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
-        self._latch: str | None = None if armed else "not armed since it was started"
+        self.cause: str | None = None if armed else "not armed since it was started"
         self._operator_stop = False
 
     @property
     def state(self) -> PlantState:
         """State of the plant: idle, granted, driven or tripped."""
         return self._machine.state
-
-    @property
-    def cause(self) -> str | None:
-        """Why the latch refuses claims, or None."""
-        return self._latch
 
     @property
     def session_tick(self) -> int:
@@ -129,8 +125,8 @@ class Tenancy:
             return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
         if claim.auto_arm and not self._operator_stop:
             self._clear()
-        if self._latch is not None:
-            return Refusal(reason=f"{self._latch}; `aeroloop op arm` clears it")
+        if self.cause is not None:
+            return Refusal(reason=f"{self.cause}; `aeroloop op arm` clears it")
         self._machine.fire(PlantTrigger.GRANT)
         self.session, self.holder = claim.session, claim.controller
         self.operated("claim", claim=claim)
@@ -184,9 +180,6 @@ class Tenancy:
         Why: the age of an echo is known modulo the counter. Commands late by a whole round of the counter would look
         fresh, so the first one must be received before the counter is back at 0. A counter shorter than twice the
         watchdog's time cannot detect this, and gets the usual time.
-
-        Args:
-            watchdog_ns: The watchdog's time [ns].
         """
         usual, counters = round(FIRST_COMMAND_S * 1e9), self.wire.measurement.counters
         if counters * self.period_ns < 2 * watchdog_ns:
@@ -201,10 +194,10 @@ class Tenancy:
 
     def _trip(self, cause: TripCause, reason: str) -> None:
         self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V")
-        self._latch, self.trip = f"{reason}: 0 V", cause
+        self.cause, self.trip = f"{reason}: 0 V", cause
 
     def _clear(self) -> None:
-        self._latch = self.trip = None
+        self.cause = self.trip = None
         self._machine.fire(PlantTrigger.ARM)
 
     def _end(self, trigger: PlantTrigger, kind: EventKind, text: str) -> None:

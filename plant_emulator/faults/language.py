@@ -26,7 +26,7 @@ from __future__ import annotations
 from math import inf, isfinite, ulp
 from typing import Final, Literal, NamedTuple, TypeAlias, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 Kind: TypeAlias = Literal["off", "stuck", "bias", "noise", "delay", "drop", "garble", "duplicate", "reorder"]
 Whole: TypeAlias = Literal["attitude", "rate", "motors", "measurement", "command"]
@@ -80,14 +80,12 @@ _VALUES: Final[dict[Kind, tuple[float, float, str]]] = {
 """Range of each kind's value, in numbers and in words. Other kinds take no value."""
 
 
-class Fault(BaseModel):
+class Fault(BaseModel, frozen=True, extra="forbid"):
     """One kind of failure of one signal for a span of time.
 
     Raises:
         ValidationError: A ValueError; each of its messages is one line. `parse` raises a ValueError of one line.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     signal: str = Field(description="sensor, motor or stream that fails")
     kind: Kind = Field(description="kind of failure")

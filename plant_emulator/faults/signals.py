@@ -9,7 +9,6 @@ Times are rounded to the nanosecond, so that a fault starts at exactly the tick 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from math import cos, hypot, inf, nan, sin
@@ -26,21 +25,18 @@ GARBLED_RATE: Final = 10.0
 """Bound of a garbled angular velocity about each axis, ± [rad/s]."""
 
 
-class ValueFault(ABC):
-    """A fault of values sampled once a period.
+class ValueFault:
+    """A fault of values sampled once a period: of an angular velocity [rad/s]; the other signals' are subclasses.
 
-    Args:
-        fault: The fault to apply.
-        random: Its random numbers.
-        size: Number of components of an error.
-        last: The values just before, if there are any.
-
-    Attributes:
-        fault: The fault to apply.
+    `size` is the number of components of an error, `last` the values just before, if there are any, and `bound` the
+    largest size of a garbled value.
     """
 
-    def __init__(self, fault: Fault, random: np.random.Generator, size: int, last: Values | None) -> None:
+    def __init__(
+        self, fault: Fault, random: np.random.Generator, size: int, last: Values | None, bound: float = GARBLED_RATE
+    ) -> None:
         self.fault = fault
+        self._bound = bound
         self._value = 0.0 if fault.value is None else fault.value
         self._random, self._size, self._last = random, size, last
         part = fault.target.part
@@ -70,13 +66,13 @@ class ValueFault(ABC):
             return values
         return self.missing(values) if kind == "drop" else self.replaced(values, self.garbled())
 
-    @abstractmethod
     def missing(self, values: Values) -> Values:
-        """Values that stand for missing ones."""
+        """No valid value, on all axes: a rate with one axis missing is invalid."""
+        return (nan,) * len(values)
 
-    @abstractmethod
     def garbled(self) -> Values:
-        """Random values."""
+        """Uniformly distributed values within ±`bound`."""
+        return tuple(self._random.uniform(-self._bound, self._bound, self._size).tolist())
 
     def shifted(self, values: Values, error: Sequence[float]) -> Values:
         """The values with an error added. Shape of error: (size,)."""
@@ -99,10 +95,6 @@ class ValueFault(ABC):
 
 class AttitudeFault(ValueFault):
     """A fault of a quaternion. Errors are rotation vectors in the body frame [rad]."""
-
-    def missing(self, values: Values) -> Values:
-        """No valid value."""
-        return (nan,) * len(values)
 
     def garbled(self) -> Values:
         """A uniformly distributed attitude."""
@@ -130,34 +122,17 @@ class AttitudeFault(ValueFault):
         return by
 
 
-class RateFault(ValueFault):
-    """A fault of an angular velocity [rad/s]."""
-
-    def missing(self, values: Values) -> Values:
-        """No valid value, on all axes: a rate with one axis missing is invalid."""
-        return (nan,) * len(values)
-
-    def garbled(self) -> Values:
-        """A uniformly distributed rate within ±GARBLED_RATE."""
-        return tuple(self._random.uniform(-GARBLED_RATE, GARBLED_RATE, self._size).tolist())
-
-
 class MotorFault(ValueFault):
     """A fault of the motors' voltages [V].
 
-    Args:
-        fault: The fault to apply.
-        random: Its random numbers.
-        last: The motors' present voltages [V]. Shape (actuators,).
-        limit: Largest voltage of a garbled one [V].
+    `last` are the motors' present voltages [V], shape (actuators,); `limit` is the largest garbled voltage [V].
 
     Raises:
         ValueError: The plant has no such motor.
     """
 
     def __init__(self, fault: Fault, random: np.random.Generator, last: Values, limit: float) -> None:
-        super().__init__(fault, random, len(last), last)
-        self._limit = limit
+        super().__init__(fault, random, len(last), last, limit)
         if self._parts.stop > len(last):
             there = ", ".join(f"motor{i + 1}" for i in range(len(last)))
             raise ValueError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
@@ -166,20 +141,12 @@ class MotorFault(ValueFault):
         """0 V."""
         return self.replaced(values, (0.0,) * len(values))
 
-    def garbled(self) -> Values:
-        """Uniformly distributed voltages within the limit."""
-        return tuple(self._random.uniform(-self._limit, self._limit, self._size).tolist())
-
 
 class FaultyPlant(Plant):
     """A plant with faults. Before `start` its time is 0 and no fault acts.
 
-    Args:
-        plant: The plant.
-        faults: Faults to apply; those of streams are ignored here, FaultyStream applies them.
-        period: Time of one `advance` [s].
-        voltage_limit: Largest voltage of a garbled command [V].
-        seed: Seed of all random numbers, 0 or more.
+    Faults of streams are ignored here; FaultyStream applies them. `period` is the time of one `advance` [s],
+    `voltage_limit` the largest voltage of a garbled command [V]; `seed` is 0 or more.
 
     Raises:
         ValueError: A fault of a motor that the plant does not have.
@@ -295,7 +262,7 @@ class FaultyPlant(Plant):
         elif whole == "attitude":
             self._sensors.append(AttitudeFault(fault, random, 3, seen.attitude if seen else None))
         elif whole == "rate":
-            self._sensors.append(RateFault(fault, random, 3, seen.rate if seen else None))
+            self._sensors.append(ValueFault(fault, random, 3, seen.rate if seen else None))
         self._attached += 1
 
 

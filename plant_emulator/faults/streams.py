@@ -16,16 +16,7 @@ from aeroloop.plant_emulator.faults.signals import generator
 
 
 class StreamFault:
-    """A fault of frames.
-
-    Args:
-        fault: The fault to apply.
-        random: Its random numbers.
-        last: The frame that passed last, if there was one.
-
-    Attributes:
-        fault: The fault to apply.
-    """
+    """A fault of frames; `last` is the frame that passed last, if there was one."""
 
     def __init__(self, fault: Fault, random: np.random.Generator, last: bytes | None) -> None:
         self.fault = fault
@@ -105,13 +96,7 @@ class StreamFault:
 
 
 class FaultyStream:
-    """Frames of one direction, with faults.
-
-    Args:
-        signal: Direction of the frames.
-        faults: Faults to apply; those of other signals are ignored here.
-        seed: Seed of all random numbers, 0 or more.
-    """
+    """Frames of one direction, with faults; those of other signals are ignored here. `seed` is 0 or more."""
 
     def __init__(self, signal: Literal["measurement", "command"], faults: Sequence[Fault], seed: int = 0) -> None:
         self._signal, self._seed = signal, seed
@@ -122,11 +107,7 @@ class FaultyStream:
             self.inject(fault, 0.0)
 
     def passes(self, frame: bytes | None, t: float) -> list[bytes]:
-        """Pass the frame of a tick through the faults.
-
-        Args:
-            frame: The frame, or None.
-            t: The plant's time [s], rising.
+        """Pass the frame of a tick, if any, through the faults at time t [s], which rises.
 
         Returns:
             The frames that pass at this tick, in order.

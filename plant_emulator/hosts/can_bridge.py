@@ -30,19 +30,14 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 WAIT_S: Final = 0.01
-REOPEN_S: Final = 0.5
 SESSIONS: Final = 16
+_UNBEGUN_NS: Final = round(FIRST_COMMAND_S * 1e9)  # for the first command, before the session's first measurement
 
 
 class Relay(Tenancy):
     """Claims, sessions and watchdog for a plant on a bus, sans-I/O.
 
-    Args:
-        wire: Format of the frames.
-        period_ns: Period of a tick [ns].
-        lockstep: Whether the loop waits for each command.
-        watchdog_s: The session ends after this long without a fresh command [s].
-        armed: Whether the first claim is granted without `arm`.
+    The session ends after `watchdog_s` without a fresh command [s]; the other arguments are Tenancy's.
 
     Attributes:
         number: Number of the session on the bus.
@@ -133,19 +128,16 @@ class Relay(Tenancy):
         if self._fresh_ns is None:
             self._fresh_ns = now_ns
         waited_ns = now_ns - self._fresh_ns
+        first_ns = self._first_command_ns if self._begun else _UNBEGUN_NS
         if self.state is PlantState.DRIVEN and waited_ns > self._watchdog_ns and not self.lockstep:
             text = f"no fresh command for {waited_ns * 1e-6:.0f} ms"
-        elif self.state is PlantState.GRANTED and waited_ns > (limit_ns := self._first_limit_ns):
-            text = f"no first command within {limit_ns * 1e-9:.3g} s"
+        elif self.state is PlantState.GRANTED and waited_ns > first_ns:
+            text = f"no first command within {first_ns * 1e-9:.3g} s"
         else:
             return False
         self._count(1)
         self._trip(TripCause.COMMAND_TIMEOUT, text)
         return True
-
-    @property
-    def _first_limit_ns(self) -> int:
-        return self._first_command_ns if self._begun else round(FIRST_COMMAND_S * 1e9)
 
     def _count(self, ticks: int) -> None:
         """Count a tick, this many periods after the session's last one."""
@@ -180,14 +172,7 @@ class Relay(Tenancy):
 
 
 class Bridge:
-    """The bridge's loop.
-
-    Args:
-        role: Its role on Zenoh.
-        loop: Loop settings.
-        wire: Format of the frames.
-        settings: Watchdog and arming of the plant end.
-        bus: The CAN bus and the plant's node number.
+    """The bridge's loop. Of `settings` it uses watchdog and arming, of the plant on the bus the node number in `bus`.
 
     Raises:
         CanError: The bus cannot be opened, or a frame does not fit it.
@@ -200,18 +185,13 @@ class Bridge:
         self._loop = loop
         self._node = bus.node
         self._relay = Relay(
-            wire,
-            loop.period_ns,
-            lockstep=loop.lockstep,
-            watchdog_s=settings.watchdog_s,
-            armed=settings.armed_at_start,
+            wire, loop.period_ns, lockstep=loop.lockstep, watchdog_s=settings.watchdog_s, armed=settings.armed_at_start
         )
         self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
         self._front = ZenohFront(role, loop, self._relay, self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._beat_due = 0.0
-        self._reopen_due = 0.0
         self._sent_state = self._relay.state  # by heartbeat
         self._arrival: Arrival | None = None  # the last command since the last tick
         self._machine_notes: list[str] = []
@@ -278,7 +258,9 @@ class Bridge:
         relay, bus = self._relay, self._bus
         if bus.fault is not None:
             relay.expire(TripCause.BUS, bus.fault)
-            self._mend(bus.fault)
+            self._role.warn("bus", "fault", f"{bus.fault}; trying again twice a second")
+            if bus.mend():
+                self._role.event("changed", "the bus is open again")
             return
         peer = bus.peer
         if relay.session is None or peer is None:
@@ -325,10 +307,3 @@ class Bridge:
         state = PlantState.GRANTED if driven else PlantState.IDLE
         self._beat_due = time.monotonic() + HEARTBEAT_S
         self._bus.beat(Heartbeat(state, self._relay.number, self._fingerprint))
-
-    def _mend(self, fault: str) -> None:
-        self._role.warn("bus", "fault", f"{fault}; trying again twice a second")
-        if time.monotonic() >= self._reopen_due:
-            self._reopen_due = time.monotonic() + REOPEN_S
-            if self._bus.reopen():
-                self._role.event("changed", "the bus is open again")

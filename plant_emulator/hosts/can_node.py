@@ -16,24 +16,18 @@ from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.runtime.throttle import Throttle
-from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint, number_of
+from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
 
 log: Final = logging.getLogger("aeroloop")
 
-REOPEN_S: Final = 0.5
 MASTER: Final = "the controller's side"
 
 
 class CanFront(Front):
-    """A plant end on a CAN bus.
-
-    Args:
-        settings: The bus and this node's number.
-        loop: Loop settings.
-        endpoint: The plant's endpoint.
+    """A plant end on a CAN bus; `settings` have the bus and this node's number.
 
     Raises:
         CanError: The bus cannot be opened, or a frame does not fit it.
@@ -50,7 +44,6 @@ class CanFront(Front):
         self._throttle = Throttle()
         self._beat_due = 0.0
         self._sent_state = endpoint.state  # by heartbeat
-        self._reopen_due = 0.0
 
     @property
     def link(self) -> Link | None:
@@ -66,7 +59,9 @@ class CanFront(Front):
         """Follow the controller side's heartbeat: begin, end or lose a session."""
         bus, endpoint = self._bus, self._endpoint
         if bus.fault is not None:
-            self._mend(bus.fault)
+            if self._throttle.let_pass("bus") is not None:
+                log.warning("node: %s; trying again twice a second", bus.fault)
+            bus.mend()
         peer = bus.peer
         gone = peer is None or bus.silent
         if gone or peer is None or peer.state is not PlantState.GRANTED:
@@ -112,7 +107,8 @@ class CanFront(Front):
     def publish_status(self) -> None:
         """Send a heartbeat."""
         self._beat_due = time.monotonic() + HEARTBEAT_S
-        self._bus.beat(Heartbeat(self._endpoint.state, number_of(self._endpoint.trip), self._fingerprint))
+        trip = self._endpoint.trip
+        self._bus.beat(Heartbeat(self._endpoint.state, trip.number if trip else 0, self._fingerprint))
 
     def leave(self) -> None:
         """Release a session, send an idle heartbeat, and close the bus."""
@@ -138,10 +134,3 @@ class CanFront(Front):
                 wire=self._endpoint.wire,
             )
         )
-
-    def _mend(self, fault: str) -> None:
-        if self._throttle.let_pass("bus") is not None:
-            log.warning("node: %s; trying again twice a second", fault)
-        if time.monotonic() >= self._reopen_due:
-            self._reopen_due = time.monotonic() + REOPEN_S
-            self._bus.reopen()

@@ -31,14 +31,7 @@ ANSWER_SHARE: Final = 0.6
 
 
 class Driver:
-    """Runs the plant end's loop.
-
-    Args:
-        plant: The plant.
-        loop: Loop settings.
-        wire: Format of the frames.
-        settings: Watchdog, limits and arming.
-        stop: Set to end the loop.
+    """Runs the plant end's loop until `stop` is set; `settings` give watchdog, limits and arming.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
@@ -126,12 +119,7 @@ class Driver:
             arrival = None if echo is None else self._await_answer(echo)
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Tick the plant end without the network: `Endpoint.tick` with the frames' hooks before and after it.
-
-        Args:
-            frame: The newest command frame received since the last tick, or None.
-            k: Tick index, from 0, rising.
-        """
+        """Tick the plant end without the network: `Endpoint.tick`, with the hook for commands before it."""
         if frame and len(frame) != self._command_bytes:
             frame = self._malformed
         passed = self._incoming(frame)
@@ -162,7 +150,7 @@ class Driver:
         deadline = time.monotonic() + self._settings.answer_timeout_s
         while self._front.link and not self._stop.is_set():
             arrival = self._front.link.wait(IDLE_WAIT_S)
-            if arrival is not None and _echo(self.endpoint.wire, arrival) in (echo, None):
+            if arrival is not None and self.endpoint.wire.command.counter(arrival.frame) in (echo, None):
                 return arrival
             self._front.take_inbox()
             if time.monotonic() > deadline:
@@ -184,8 +172,3 @@ class Driver:
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
         """Return the frames to send for the endpoint's measurement."""
         return [] if frame is None else [frame]
-
-
-def _echo(wire: WireSpec, arrival: Arrival) -> int | None:
-    read = wire.command.unpack(arrival.frame)
-    return None if read is None else read[0]

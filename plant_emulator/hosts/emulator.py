@@ -47,12 +47,6 @@ class FaultError(AeroloopError):
 class Emulator(Driver):
     """The emulator, for any network.
 
-    Args:
-        loop: Loop settings.
-        wire: Format of the frames.
-        settings: The plant.
-        stop: Set to end the loop.
-
     Raises:
         ValueError: A fault of a motor that the plant does not have.
     """
@@ -101,12 +95,6 @@ class Emulator(Driver):
 
 class EmulatorOnZenoh(Emulator):
     """The emulator on Zenoh.
-
-    Args:
-        role: Its role on the network.
-        loop: Loop settings.
-        wire: Format of the frames.
-        settings: The plant.
 
     Raises:
         ValueError: A fault of a motor that the plant does not have.

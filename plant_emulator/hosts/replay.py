@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
@@ -29,10 +29,8 @@ _FIELDS: Final = ("session", "session_tick", "sent_as", "outcome", "trip", "answ
 """Compared columns of a row; the first that differs is reported."""
 
 
-class PlantDifference(BaseModel):
+class PlantDifference(BaseModel, frozen=True):
     """The first row with computed values that differ from the logged ones."""
-
-    model_config = ConfigDict(frozen=True)
 
     tick: int = Field(description="of the plant, since its process started")
     session: str
@@ -42,10 +40,8 @@ class PlantDifference(BaseModel):
     computed: str
 
 
-class PlantReplayed(BaseModel):
+class PlantReplayed(BaseModel, frozen=True):
     """Result of the replay of one process of the plant."""
-
-    model_config = ConfigDict(frozen=True)
 
     ticks: int = Field(description="rows compared")
     differ: int = Field(description="rows that differ from the logged ones")
@@ -59,12 +55,7 @@ def why_not(plant: PlantSettings) -> str | None:
 
 
 class PlantReplay:
-    """Replays one process of an emulated plant.
-
-    Args:
-        loop: Loop settings at the start of the process.
-        wire: Format of the frames.
-        plant: The plant's settings at the start of the process; later changes are in the trace.
+    """Replays one process of an emulated plant, from its settings at its start; later changes are in the trace.
 
     Raises:
         ValueError: The plant cannot be replayed, with the reason of `why_not`.
@@ -120,11 +111,8 @@ class PlantReplay:
         header = batch.header
         if header.run != self._run:
             return "the plant was started again"
-        if (header.measurement_bytes, header.command_bytes, header.actuators) != (
-            self._wire.measurement.size,
-            self._wire.command.size,
-            self._wire.actuators,
-        ):
+        wire = self._wire.measurement.size, self._wire.command.size, self._wire.actuators
+        if (header.measurement_bytes, header.command_bytes, header.actuators) != wire:
             return "the rows are not of the wire that the description describes"
         if header.first_row > self._rows:
             if not self._rows:
@@ -158,10 +146,7 @@ class PlantReplay:
         session = batch.header.session
         answered = rows["answered"].astype(np.int64)
         columns = [
-            rows["session_tick"].tolist(),
-            rows["sent_as"].tolist(),
-            rows["outcome"].tolist(),
-            rows["trip"].tolist(),
+            *(rows[name].tolist() for name in ("session_tick", "sent_as", "outcome", "trip")),
             np.where(answered == NEVER, -1, answered).tolist(),
             _frames(rows["measurement"]),
             [row.tobytes() for row in rows["voltages"]],
@@ -182,13 +167,12 @@ class PlantReplay:
         endpoint = self._emulator.endpoint
         session = endpoint.session
         measurement = self._emulator.tick(frame, tick)
-        ended = endpoint.session is None and endpoint.trip is not None
         computed = (
             session,
             endpoint.session_tick,
             Sent.FRAME if measurement else Sent.NONE if measurement is None else Sent.SILENT,
             endpoint.outcome,
-            endpoint.trip.number if ended and endpoint.trip is not None else 0,
+            0 if endpoint.session or endpoint.trip is None else endpoint.trip.number,
             endpoint.answered,
             measurement or self._none,
             np.array(endpoint.voltages).tobytes(),
@@ -197,19 +181,16 @@ class PlantReplay:
         if computed != logged:
             self._differ += 1
             if self._first is None:
-                self._first = self._difference(tick, logged, computed)
-
-    @staticmethod
-    def _difference(tick: int, logged: tuple[object, ...], computed: tuple[object, ...]) -> PlantDifference:
-        i = next(i for i, (a, b) in enumerate(zip(logged, computed, strict=True)) if a != b)
-        return PlantDifference(
-            tick=tick,
-            session=str(logged[0]),
-            session_tick=int(str(logged[1])),
-            field=_FIELDS[i],
-            logged=_text(_FIELDS[i], logged[i]),
-            computed=_text(_FIELDS[i], computed[i]),
-        )
+                columns = zip(_FIELDS, logged, computed, strict=True)
+                field, was, now = next((field, a, b) for field, a, b in columns if a != b)
+                self._first = PlantDifference(
+                    tick=tick,
+                    session=str(logged[0]),
+                    session_tick=int(str(logged[1])),
+                    field=field,
+                    logged=_text(field, was),
+                    computed=_text(field, now),
+                )
 
     # ── between ticks ──
 
@@ -241,17 +222,14 @@ class PlantReplay:
             case "inject":
                 emulator.inject(None if operation.name is None else Fault.parse(operation.name))
             case "reconfigure":
-                self._reconfigure(operation)
+                changed = operation.settings or {}
+                limits = LimitSettings.model_validate(changed["limits"])
+                update = {"watchdog_s": changed["watchdog_s"], "limits": limits}
+                self._plant = self._plant.model_copy(update=update)
+                emulator.reconfigure(self._plant)
         endpoint.operations.clear()
         endpoint.notices.clear()
         return self._stopped is None
-
-    def _reconfigure(self, operation: Operation) -> None:
-        changed = operation.settings or {}
-        self._plant = self._plant.model_copy(
-            update={"watchdog_s": changed["watchdog_s"], "limits": LimitSettings.model_validate(changed["limits"])}
-        )
-        self._emulator.reconfigure(self._plant)
 
 
 def _frames(column: npt.NDArray[np.void]) -> list[bytes]:

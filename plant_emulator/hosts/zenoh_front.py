@@ -14,7 +14,7 @@ from typing import Final
 
 from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
-from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, Status
 from aeroloop.protocol.messages.operator import Answer, Ask
@@ -29,13 +29,9 @@ STATUS_PERIOD_NS: Final = 1_000_000_000
 
 
 class ZenohFront(Front):
-    """A plant end on the network.
+    """A plant end, an Endpoint or the bridge's Relay, on the network.
 
-    Args:
-        role: Its role on Zenoh.
-        loop: Loop settings.
-        endpoint: The plant's endpoint, or the bridge's relay.
-        changed: Notified when a command arrives, for an owner that waits for more than one thing.
+    `changed` is notified when a command arrives, for an owner that waits for more than one thing.
     """
 
     def __init__(self, role: Role, loop: LoopSettings, endpoint: Tenancy, changed: Condition | None = None) -> None:
@@ -145,11 +141,19 @@ class ZenohFront(Front):
 
     def _claim(self, claim: Claim) -> Grant | Refusal:
         answer = self._endpoint.claim(claim)
-        if isinstance(answer, Grant):
-            self._open_link(claim.session)
-        else:
+        if isinstance(answer, Refusal):
             text = f"{claim.controller} refused: {answer.reason}"
             self._role.warn(text, "refused", text, claim.session)
+            return answer
+        vehicle = self._role.vehicle
+        self._sent_at = [(-1, 0)] * self._counters
+        self._link = ZenohLink(  # before the grant is sent, so that the first command is not lost
+            self._role.zenoh,
+            send_key=topics.key("measurement", vehicle, session=claim.session),
+            receive_key=topics.key("command", vehicle, session=claim.session),
+            lossless=self._loop.lockstep,
+            mailbox=Mailbox(self._changed),
+        )
         return answer
 
     def _release(self, release: Release) -> Answer:
@@ -165,18 +169,6 @@ class ZenohFront(Front):
     def _stop(self) -> Answer:
         self._endpoint.stop()
         return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
-
-    def _open_link(self, session: str) -> None:
-        """Subscribe to commands before the grant is sent, so that the first one is not lost."""
-        vehicle = self._role.vehicle
-        self._sent_at = [(-1, 0)] * self._counters
-        self._link = ZenohLink(
-            self._role.zenoh,
-            send_key=topics.key("measurement", vehicle, session=session),
-            receive_key=topics.key("command", vehicle, session=session),
-            lossless=self._loop.lockstep,
-            mailbox=Mailbox(self._changed),
-        )
 
     def publish_status(self) -> None:
         """Publish the status."""

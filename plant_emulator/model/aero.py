@@ -17,29 +17,26 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
-from aeroloop.protocol.wire.attitude import R, S, from_euler
+from aeroloop.protocol.wire.attitude import R, S, Vector, from_euler
 
 
-class AeroSettings(BaseModel):
+class AeroSettings(BaseModel, extra="forbid"):
     """The Aero's body. Defaults: Table C.1 of the paper, except the centre of mass, fitted by `lab calibrate`."""
-
-    model_config = ConfigDict(extra="forbid")
 
     inertia: Inertia = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
-    centre_of_mass: tuple[float, float, float] = Field(
+    centre_of_mass: Vector = Field(
         default=(0.0, 0.0, -0.003951),
         description="r_g, pivot to centre of mass, body frame [m]; height by `lab calibrate`, Table C.1: -0.0038",
     )
     thrust: tuple[tuple[float, float], tuple[float, float]] = Field(
-        default=((0.0011, 0.0011), (-0.0014, 0.00176)),
-        description="pitch and yaw rows of B, columns u2 and u3 [N·m/V]",
+        default=((0.0011, 0.0011), (-0.0014, 0.00176)), description="pitch and yaw rows of B, columns u2 and u3 [N·m/V]"
     )
-    damping: tuple[float, float, float] = Field(
+    damping: Vector = Field(
         default=(0.0, 0.0, 0.0),
         description="θ of (C.2), damping about the *body* axes [N·m·s/rad]; 0: friction of the bench is in the joints",
     )
@@ -74,11 +71,7 @@ def aero_dynamics(settings: AeroSettings) -> ca.Function:
 
 
 class Aero(Mechanism):
-    """x = [pitch, yaw, ṗ, ẏ] in rad and rad/s; the axes are the two joints. Starts level, at rest, at yaw 0.
-
-    Args:
-        settings: The physical parameters.
-    """
+    """x = [pitch, yaw, ṗ, ẏ] in rad and rad/s; the axes are the two joints. Starts level, at rest, at yaw 0."""
 
     initial = (0.0, 0.0, 0.0, 0.0)
     actuators = 2

@@ -6,12 +6,11 @@ Runge–Kutta steps integrate one period, and the sensors sample the new state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import casadi as ca
 
 from aeroloop.plant_emulator.model.friction import FrictionSettings, friction_torque
-from aeroloop.plant_emulator.model.integrate import rk4
 from aeroloop.plant_emulator.model.mechanism import Mechanism
 from aeroloop.plant_emulator.model.rotor import RotorSettings, rotor_derivative, thrust_voltage
 from aeroloop.plant_emulator.model.sensors import Sensors
@@ -19,6 +18,21 @@ from aeroloop.plant_emulator.model.wind import Wind
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.symbolic import Compiled
+
+
+def rk4(derivative: Callable[[ca.SX], ca.SX], x: ca.SX, period: float, substeps: int) -> ca.SX:
+    """The state one `period` [s] later, by the classical fourth-order Runge–Kutta method in equal substeps.
+
+    One unrolled expression: the same steps in the same order every time. `derivative` is ẋ of a state, inputs held.
+    """
+    h = period / substeps
+    for _ in range(substeps):
+        k1 = derivative(x)
+        k2 = derivative(x + h / 2 * k1)
+        k3 = derivative(x + h / 2 * k2)
+        k4 = derivative(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x
 
 
 def step_function(
@@ -55,15 +69,7 @@ def step_function(
 class EmulatedPlant(Plant):
     """A computed plant with an accessible true state.
 
-    Args:
-        mechanism: The body.
-        rotor: Rotor lag and dead zone.
-        friction: Friction about the axes.
-        wind: Wind torque about the axes.
-        sensors: Sensors of the plant.
-        period: Time of one `advance` [s].
-        voltage_limit: Largest voltage of the supply [V].
-        substeps: Runge–Kutta steps a period.
+    `period` is the time of one `advance` [s], in `substeps` Runge–Kutta steps; `voltage_limit` is the supply's [V].
     """
 
     def __init__(
@@ -88,11 +94,10 @@ class EmulatedPlant(Plant):
         for i, value in enumerate(mechanism.initial):
             self._x[i] = value
         start = ca.SX(mechanism.initial)
-        initial = ca.Function("start", [], [mechanism.attitude(start), mechanism.rate(start)])()
-        self._attitude: Quaternion = tuple(float(v) for v in initial["o0"].elements())  # type: ignore[assignment]  # 4
-        self._rate: Vector = tuple(float(v) for v in initial["o1"].elements())  # type: ignore[assignment]  # 3
-        angles = ca.Function("start", [], [mechanism.axis_angles(start)])()["o0"]
-        self._measurement = sensors.read(self._attitude, self._rate, [float(v) for v in angles.elements()])
+        self._attitude: Quaternion = tuple(ca.evalf(mechanism.attitude(start)).elements())  # type: ignore[assignment]  # 4
+        self._rate: Vector = tuple(ca.evalf(mechanism.rate(start)).elements())  # type: ignore[assignment]  # 3
+        angles = ca.evalf(mechanism.axis_angles(start)).elements()
+        self._measurement = sensors.read(self._attitude, self._rate, angles)
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Hold voltages [V], clipped to the supply's limits. Shape (actuators,)."""

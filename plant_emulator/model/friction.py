@@ -7,13 +7,11 @@ Why: with a jump the result would depend on where the integration steps fall.
 from __future__ import annotations
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class FrictionSettings(BaseModel):
+class FrictionSettings(BaseModel, extra="forbid"):
     """Friction about the axes: pitch and yaw of the Aero, x, y, z of a free body (missing ones are 0)."""
-
-    model_config = ConfigDict(extra="forbid")
 
     viscous: tuple[float, ...] = Field(
         default=(0.0071, 0.0220), max_length=3, description="viscous friction about the axes [N·m·s/rad]; lab material"

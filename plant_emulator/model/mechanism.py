@@ -12,14 +12,16 @@ from typing import Annotated
 import casadi as ca
 from pydantic import AfterValidator
 
+from aeroloop.protocol.wire.attitude import Vector
 
-def _positive(values: tuple[float, float, float]) -> tuple[float, float, float]:
+
+def _positive(values: Vector) -> Vector:
     if not all(0 < value < float("inf") for value in values):
         raise ValueError("every moment of inertia must be positive and finite")
     return values
 
 
-Inertia = Annotated[tuple[float, float, float], AfterValidator(_positive)]
+Inertia = Annotated[Vector, AfterValidator(_positive)]
 """The diagonal of J [kg·m²]."""
 
 

@@ -6,35 +6,29 @@ from math import hypot
 
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
-from aeroloop.protocol.wire.attitude import R, S, T
-
-Triple = tuple[float, float, float]
+from aeroloop.protocol.wire.attitude import Quaternion, R, S, T, Vector
 
 
-class RigidBodySettings(BaseModel):
+class RigidBodySettings(BaseModel, extra="forbid"):
     """A body about a fixed point. Defaults: the inertia and mass of Table C.1, turning about its centre of mass."""
-
-    model_config = ConfigDict(extra="forbid")
 
     inertia: Inertia = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
     gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
-    centre_of_mass: Triple = Field(default=(0.0, 0.0, 0.0), description="r_g, origin to centre of mass, body frame [m]")
-    allocation: tuple[Triple, Triple, Triple] = Field(
+    centre_of_mass: Vector = Field(default=(0.0, 0.0, 0.0), description="r_g, origin to centre of mass, body frame [m]")
+    allocation: tuple[Vector, Vector, Vector] = Field(
         default=((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)), description="B [N·m/V]"
     )
-    damping: Triple = Field(default=(0.01, 0.01, 0.01), description="θ about the body axes [N·m·s/rad]")
-    attitude: tuple[float, float, float, float] = Field(default=(1.0, 0.0, 0.0, 0.0), description="q at the start [1]")
-    rate: Triple = Field(default=(0.0, 0.0, 0.0), description="ω at the start, body frame [rad/s]")
+    damping: Vector = Field(default=(0.01, 0.01, 0.01), description="θ about the body axes [N·m·s/rad]")
+    attitude: Quaternion = Field(default=(1.0, 0.0, 0.0, 0.0), description="q at the start [1]")
+    rate: Vector = Field(default=(0.0, 0.0, 0.0), description="ω at the start, body frame [rad/s]")
 
     @field_validator("attitude")
     @classmethod
-    def _attitude_has_a_direction(
-        cls, attitude: tuple[float, float, float, float]
-    ) -> tuple[float, float, float, float]:
+    def _attitude_has_a_direction(cls, attitude: Quaternion) -> Quaternion:
         if not 0 < hypot(*attitude) < float("inf"):
             raise ValueError("a quaternion of any finite length but zero")
         return attitude
@@ -71,9 +65,7 @@ class RigidBody(Mechanism):
         """ω."""
         return x[4:7]
 
-    def axis_rates(self, x: ca.SX) -> ca.SX:
-        """ω: the axes are the body's."""
-        return x[4:7]
+    axis_rates = rate  # the axes are the body's
 
     def axis_angles(self, x: ca.SX) -> ca.SX:
         """Empty: a free body has no joints."""

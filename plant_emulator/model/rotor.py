@@ -7,13 +7,11 @@ brakes a rotor less than the motor drives it. Below the dead zone a rotor makes 
 from __future__ import annotations
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 
-class RotorSettings(BaseModel):
+class RotorSettings(BaseModel, extra="forbid"):
     """Lag and dead zone of the rotors. Lags of 0 leave the rotors out."""
-
-    model_config = ConfigDict(extra="forbid")
 
     lag_up_s: float = Field(
         default=0.154, ge=0, le=10, description="time constant while |thrust| rises [s]; measured on an Aero"

@@ -11,7 +11,7 @@ from math import cos, exp, floor, nan, pi, sin, sqrt
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
@@ -22,10 +22,8 @@ NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))
 _BLOCK = 4096  # random numbers are drawn this many samples at a time
 
 
-class SensorSettings(BaseModel):
+class SensorSettings(BaseModel, extra="forbid"):
     """Sensors of attitude and angular velocity."""
-
-    model_config = ConfigDict(extra="forbid")
 
     attitude: Literal["encoders", "perfect"] = Field(default="encoders", description="encoders need joints: the Aero")
     counts: tuple[int, int] = Field(
@@ -44,10 +42,7 @@ class SensorSettings(BaseModel):
 class FilteredDerivative:
     """The rate of a sampled angle, by the filter ωn² s / (s² + 2ζωn s + ωn²), exact for an angle held over a period.
 
-    Args:
-        bandwidth: ωn [rad/s].
-        damping_ratio: ζ, 0…1.
-        period: Time between samples [s].
+    `bandwidth` is ωn [rad/s], `damping_ratio` is ζ, 0…1, and `period` the time between samples [s].
     """
 
     def __init__(self, bandwidth: float, damping_ratio: float, period: float) -> None:
@@ -72,12 +67,7 @@ class FilteredDerivative:
 
 
 class Sensors:
-    """Sensors of one plant.
-
-    Args:
-        settings: Kinds and errors of the sensors.
-        period: Time between samples [s].
-    """
+    """Sensors of one plant, sampled once a `period` [s]."""
 
     def __init__(self, settings: SensorSettings, period: float) -> None:
         self._settings = settings
@@ -91,22 +81,19 @@ class Sensors:
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
-        try:
-            return Measurement(*self._read(attitude, rate, angles))
-        except (OverflowError, ValueError):  # an infinite or undefined angle has no count
-            return NO_MEASUREMENT
-
-    def _read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> tuple[Quaternion, Vector]:
         if self._encoders:
             (pitch_step, yaw_step), (pitch_zero, yaw_zero) = self._steps, self._zeros
-            pitch = pitch_step * floor(angles[0] / pitch_step + pitch_zero)
-            yaw = yaw_step * floor(angles[1] / yaw_step + yaw_zero)
+            try:
+                pitch = pitch_step * floor(angles[0] / pitch_step + pitch_zero)
+                yaw = yaw_step * floor(angles[1] / yaw_step + yaw_zero)
+            except (OverflowError, ValueError):  # an infinite or undefined angle has no count
+                return NO_MEASUREMENT
             if self._attitude == "encoders":
                 attitude = attitude_of(pitch, yaw)
             if self._rate == "derivative":
                 pitch_rate, yaw_rate = self._filters[0].update(pitch), self._filters[1].update(yaw)
-                return attitude, rate_of(pitch, pitch_rate, yaw_rate)
-        return attitude, self._gyro(rate) if self._rate == "gyro" else rate
+                return Measurement(attitude, rate_of(pitch, pitch_rate, yaw_rate))
+        return Measurement(attitude, self._gyro(rate) if self._rate == "gyro" else rate)
 
     def _gyro(self, rate: Vector) -> Vector:
         if not self._noise:

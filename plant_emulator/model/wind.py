@@ -10,15 +10,13 @@ from __future__ import annotations
 from math import exp, hypot, sqrt
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 _BLOCK = 4096  # random numbers are drawn this many periods at a time: one draw costs more than a plant's step
 
 
-class WindSettings(BaseModel):
+class WindSettings(BaseModel, extra="forbid"):
     """Wind on the plant. The default is calm; the default torques are the fitted ones of the paper's fan."""
-
-    model_config = ConfigDict(extra="forbid")
 
     blowing: bool = Field(default=False, description="whether the fan is on")
     torque: tuple[float, ...] = Field(
@@ -37,38 +35,29 @@ class WindSettings(BaseModel):
 
 
 class Wind:
-    """Torque about each axis, period by period.
+    """Torque about each axis, `period` by `period` [s].
 
     Attributes:
         calm: Whether the torque is always 0.
-
-    Args:
-        settings: Steady torque and gusts.
-        axes: Number of axes.
-        period: Time between samples [s].
     """
 
     def __init__(self, settings: WindSettings, axes: int, period: float) -> None:
         self._steady = np.array((*settings.torque, 0.0, 0.0, 0.0)[:axes]) * settings.blowing
         self.calm = not self._steady.any()
-        self._deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
+        deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
         self._keep = exp(-period / settings.gust_time_s)
-        self._kick = self._deviation * sqrt(1 - self._keep**2)
+        self._kick = deviation * sqrt(1 - self._keep**2)
         self._random = np.random.default_rng(settings.seed)
-        self._gust = self._deviation * self._random.standard_normal(axes)
+        self._gust = deviation * self._random.standard_normal(axes)
         self._block: list[list[float]] = []
 
     def sample(self) -> list[float]:
         """Torque about each axis for the next period [N·m]. Shape (axes,)."""
         if not self._block:
-            self._block = self._draw()
+            torques = np.tile(self._steady, (_BLOCK, 1))
+            if self._kick:
+                for row, kick in zip(torques, self._random.standard_normal(torques.shape) * self._kick, strict=True):
+                    self._gust = self._keep * self._gust + kick
+                    row += self._gust
+            self._block = torques[::-1].tolist()
         return self._block.pop()
-
-    def _draw(self) -> list[list[float]]:
-        torques = np.tile(self._steady, (_BLOCK, 1))
-        if self._kick:
-            for row, kick in zip(torques, self._random.standard_normal(torques.shape) * self._kick, strict=True):
-                self._gust = self._keep * self._gust + kick
-                row += self._gust
-        drawn: list[list[float]] = torques[::-1].tolist()
-        return drawn

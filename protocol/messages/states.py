@@ -68,7 +68,7 @@ class ControllerTrigger(StrEnum):
     INVALID = "measurement without a valid value"
     ANSWERED = "valid measurement answered"
     LOST = "session lost"
-    STAND_DOWN = "told to release or to stop"
+    STAND_DOWN = "released or stopped by an operator"
     FAULT = "law gives no number"
     RECALL = "recalled"
 

@@ -85,15 +85,9 @@ RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorde
 FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
 """Topics of frames."""
 
+_CHUNKS: Final = {"session": "(?P<session>[^/]+)", "role": "(?P<role>[^/]+)"}
 _PATTERNS: Final = [
-    (
-        topic,
-        re.compile(
-            rf"{ROOT}/(?P<vehicle>{NAME})/"
-            + topic.key.replace("{session}", r"(?P<session>[^/]+)").replace("{role}", r"(?P<role>[^/]+)")
-        ),
-    )
-    for topic in TOPICS.values()
+    (topic, re.compile(f"{ROOT}/(?P<vehicle>{NAME})/{topic.key.format(**_CHUNKS)}")) for topic in TOPICS.values()
 ]
 
 

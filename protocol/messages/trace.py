@@ -122,36 +122,28 @@ class Tail(Message):
     operations: list[Operation] = Field(default_factory=list, description="plant: between its ticks")
 
 
+_COLUMNS: Final[dict[End, dict[str, str]]] = {
+    "controller": {"tick": "<u4", "received_as": "u1", "sent_as": "u1", "received": "<u4", "sent": "<u4"},
+    "plant": {
+        "tick": "<u8",
+        "session_tick": "<u4",
+        "sent_as": "u1",
+        "received_as": "u1",
+        "outcome": "u1",
+        "trip": "u1",
+        "answered": "<u4",
+        "sent": "<u4",
+        "received": "<u4",
+    },
+}
+"""Types of a row's columns, before the frames and, at the plant, the voltages."""
+
+
 def row_dtype(end: End, measurement: int, command: int, actuators: int) -> np.dtype[np.void]:
     """Fields of a row, in the order of the columns. Sizes of the frames in bytes."""
-    if end == "controller":
-        return np.dtype(
-            [
-                ("tick", "<u4"),
-                ("received_as", "u1"),
-                ("sent_as", "u1"),
-                ("received", "<u4"),
-                ("sent", "<u4"),
-                ("measurement", f"V{measurement}"),
-                ("command", f"V{command}"),
-            ]
-        )
-    return np.dtype(
-        [
-            ("tick", "<u8"),
-            ("session_tick", "<u4"),
-            ("sent_as", "u1"),
-            ("received_as", "u1"),
-            ("outcome", "u1"),
-            ("trip", "u1"),
-            ("answered", "<u4"),
-            ("sent", "<u4"),
-            ("received", "<u4"),
-            ("measurement", f"V{measurement}"),
-            ("command", f"V{command}"),
-            ("voltages", "<f8", (actuators,)),
-        ]
-    )
+    frames = [("measurement", f"V{measurement}"), ("command", f"V{command}")]
+    voltages = [("voltages", "<f8", (actuators,))] if end == "plant" else []
+    return np.dtype([*_COLUMNS[end].items(), *frames, *voltages])
 
 
 class Header(NamedTuple):
@@ -210,18 +202,14 @@ def read_header(payload: bytes) -> Header | None:
     """Parse a batch's header; None if it is malformed or of another version."""
     if len(payload) < HEADER_BYTES:
         return None
-    version, end, flags, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, name = (
-        _HEADER.unpack_from(payload)
-    )
+    version, end, flags, *figures, name = _HEADER.unpack_from(payload)
+    actuators, measurement, command = figures[:3]
     session = _name(name)
     if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3):
         return None
     if session is None or not measurement or not command:
         return None
-    final = bool(flags & _FINAL)
-    return Header(
-        ENDS[end], final, actuators, measurement, command, rows, tail, run, first_row, monotonic_ns, wall_ns, session
-    )
+    return Header._make((ENDS[end], bool(flags & _FINAL), *figures, session))
 
 
 @lru_cache(maxsize=16)
@@ -261,10 +249,8 @@ def batch_bytes(header: Header) -> int:
 def join_columns(batches: Sequence[tuple[Header, bytes]]) -> dict[str, npt.NDArray[Any]]:
     """Concatenate the columns of batches of one end and wire. Shapes (rows,).
 
-    Times stay relative to the base of their own batch; see `Batch.times_ns`.
-
-    Args:
-        batches: At least one; headers, and payloads of the size that `batch_bytes` gives.
+    There is at least one batch, as header and payload of the size that `batch_bytes` gives. Times stay relative to the
+    base of their own batch; see `Batch.times_ns`.
     """
     first = batches[0][0]
     dtype = row_dtype(first.end, first.measurement_bytes, first.command_bytes, first.actuators)
@@ -296,11 +282,7 @@ def _columns_dtype(end: End, measurement: int, command: int, actuators: int, row
 class TraceWriter:
     """Buffers one end's rows and packs them into batches.
 
-    Args:
-        end: Which end.
-        wire: Sizes of the frames.
-        run: A random number of this process, 64 bits.
-        every_ns: A batch is due this long after its first row [ns].
+    `run` is a random number of this process, 64 bits; a batch is due `every_ns` after its first row [ns].
 
     Attributes:
         rows: Number of rows in the buffer.
@@ -422,12 +404,9 @@ class TraceWriter:
         self.rows = rows + 1
 
     def take(self, now_ns: int, wall_ns: int, *, final: bool = False) -> bytes:
-        """Pack all that is buffered into a batch, and clear the buffer.
+        """Pack all that is buffered into a batch, and clear the buffer. If `final`, the session's rows end here.
 
-        Args:
-            now_ns: The end's monotonic clock now [ns].
-            wall_ns: Its wall clock now [ns since 1970].
-            final: Whether the session's rows end here.
+        `now_ns` is the end's monotonic clock now [ns], `wall_ns` its wall clock now [ns since 1970].
         """
         rows = self.rows
         base_ns = self._base_ns if rows else now_ns
@@ -451,7 +430,10 @@ class TraceWriter:
         records = np.frombuffer(self._buffer, self._dtype, rows)
         names = self._dtype.names
         assert names is not None
-        columns = [_steps(records[name]).tobytes() if name in STEPS else records[name].tobytes() for name in names]
+        columns = [
+            (np.diff(records[name], prepend=records.dtype[name].type(0)) if name in STEPS else records[name]).tobytes()
+            for name in names
+        ]
         self._published += rows
         self.rows = 0
         self.state, self.changes, self.operations = None, [], []
@@ -462,11 +444,6 @@ def batches_per_s(loop: LoopSettings) -> float:
     """Bound on the batches that an end publishes per second, in the long run."""
     rate_hz = _FASTEST_HZ if loop.lockstep else loop.rate_hz
     return _BATCHES_BEYOND * max(1 / loop.trace_s, rate_hz / MAX_ROWS)
-
-
-def _steps(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Steps of a column, the first one from 0. Shapes (n,)."""
-    return np.diff(column, prepend=column.dtype.type(0))
 
 
 def _record_format(end: End, measurement: int, command: int, actuators: int) -> str:

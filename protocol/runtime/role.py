@@ -16,7 +16,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from types import FrameType, TracebackType
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
@@ -55,12 +54,8 @@ def notify_systemd(state: str) -> None:
 class Role:
     """A process's presence on the network.
 
-    Args:
-        role: `plant`, `controller` or `recorder`.
-        vehicle: Vehicle in the keys of its topics.
-        network: How to join the network.
-        config: Its effective configuration, for the description.
-        name: Name of its liveliness token; the role's name if None.
+    `role` is `plant`, `controller` or `recorder`, `vehicle` the vehicle in the keys of its topics, `config` its
+    effective configuration, for the description. `name` is its liveliness token's; the role's if None.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -88,9 +83,7 @@ class Role:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         notify_systemd("STOPPING=1")
         self.zenoh.close()
 
@@ -101,12 +94,8 @@ class Role:
 
     def stop_on_signals(self) -> None:
         """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""
-
-        def request_stop(_signum: int, _frame: FrameType | None) -> None:
-            self.stop.set()
-
-        signal.signal(signal.SIGTERM, request_stop)
-        signal.signal(signal.SIGINT, request_stop)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self.stop.set())
 
     def on_hangup(self, reload: Callable[[], Action]) -> None:
         """On SIGHUP, call `reload` in a thread of its own; the action that it returns runs between two ticks.
@@ -123,12 +112,7 @@ class Role:
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
 
     def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
-        """Publish the role's description: its configuration, and the certificate if there is one.
-
-        Args:
-            config: The effective configuration.
-            certificate: The theorem's bounds for it; controller only.
-        """
+        """Publish the role's description: its effective configuration and, from a controller, its certificate."""
         freshness_s = None
         if "wire" in config and "loop" in config:
             period_ns = LoopSettings.model_validate(config["loop"]).period_ns

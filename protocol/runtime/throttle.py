@@ -7,11 +7,7 @@ from typing import Final
 
 
 class Throttle:
-    """Passes one message of each kind per period, and counts those it holds back.
-
-    Args:
-        period_s: Least time between two messages of a kind [s].
-    """
+    """Passes one message of each kind per `period_s` [s], and counts those it holds back."""
 
     MAX_KINDS: Final = 1000
 

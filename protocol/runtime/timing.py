@@ -87,10 +87,7 @@ class RollingHistogram:
 class LoopTiming:
     """Timing of a loop: wake-up latency, duration of a tick, period between ticks.
 
-    The first second is left out: caches are cold, and code runs for the first time.
-
-    Args:
-        warm_up_ns: Duration of the start-up [ns].
+    The start-up of `warm_up_ns` [ns] is left out: caches are cold, and code runs for the first time.
     """
 
     def __init__(self, warm_up_ns: int = 1_000_000_000) -> None:

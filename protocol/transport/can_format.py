@@ -16,7 +16,7 @@ import hashlib
 import json
 from typing import Any, Final, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.states import PlantState, TripCause
@@ -30,7 +30,7 @@ PLANT_HEARTBEAT_ID: Final = 0x300
 CONTROLLER_HEARTBEAT_ID: Final = 0x380
 MAX_NODE: Final = 127
 CLASSIC_BYTES: Final = 8
-FD_LENGTHS: Final = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 HEARTBEAT_S: Final = 0.1
 
 _STATES: Final = list(PlantState)
@@ -38,14 +38,17 @@ _CAUSES: Final = list(TripCause)
 _FINGERPRINT_BYTES: Final = 7
 
 
+def carried_bytes(size: int) -> int:
+    """Length of the CAN payload that carries this many bytes."""
+    return next(length for length in FD_LENGTHS if length >= size)
+
+
 class CanError(AeroloopError):
     """The bus cannot be used; one line with the reason and what to do."""
 
 
-class CanSettings(BaseModel):
+class CanSettings(BaseModel, extra="forbid"):
     """The CAN bus, and which node of it is the plant. `options` go to python-can's interface as they are."""
-
-    model_config = ConfigDict(extra="forbid")
 
     interface: str = Field(
         default="udp_multicast", description="python-can's: socketcan, slcan, gs_usb, pcan, udp_multicast, virtual…"
@@ -73,18 +76,13 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
     ):
         if frame.size <= longest:
             continue
-        widest = max(
-            bits
-            for bits in range(MIN_BITS, MAX_BITS + 1)
-            if FrameFormat([bits] * len(frame.widths), wire.counter_bits).size <= longest
-        )
+        sizes = {n: FrameFormat([n] * len(frame.widths), wire.counter_bits).size for n in range(MIN_BITS, MAX_BITS + 1)}
+        widest = max(bits for bits, size in sizes.items() if size <= longest)
         ways = ["set can.fd = true", f"{signals} to {widest} at the most"]
         if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
             ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
-        ways_out = ", or ".join(ways)
-        raise CanError(
-            f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}: {ways_out}"
-        )
+        problem = f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}"
+        raise CanError(f"{problem}: {', or '.join(ways)}")
 
 
 def fingerprint(wire: WireSpec, period_ns: int, *, lockstep: bool) -> bytes:
@@ -123,8 +121,3 @@ class Heartbeat(NamedTuple):
         if len(data) != 1 + _FINGERPRINT_BYTES or data[0] & 0x0F >= len(_STATES):
             return None
         return cls(_STATES[data[0] & 0x0F], data[0] >> 4, bytes(data[1:]), at_ns)
-
-
-def number_of(cause: TripCause | None) -> int:
-    """A cause's number on the bus; 0 for none."""
-    return 0 if cause is None else cause.number

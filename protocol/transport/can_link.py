@@ -16,21 +16,22 @@ from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
-    FD_LENGTHS,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     CanError,
     CanSettings,
     Heartbeat,
+    carried_bytes,
     check_widths,
 )
-from aeroloop.protocol.transport.link import Arrival, Link, Mailbox
+from aeroloop.protocol.transport.link import Link, Mailbox
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 _BUS_OFF: Final = 0x40  # of a SocketCAN error frame's id
 _RECEIVE_S: Final = 0.1
 _SEND_S: Final = 0.002
+_REOPEN_S: Final = 0.5
 _UNSENT: Final = 20
 """Failed sends in a row after which the bus counts as lost."""
 
@@ -40,12 +41,7 @@ End = Literal["plant", "controller"]
 class CanLink(Link):
     """One end's frames and heartbeats on a bus. A thread of its own receives.
 
-    Args:
-        settings: The bus.
-        wire: Sizes of the frames.
-        end: Which end this is.
-        changed: Notified when a frame is received; see Mailbox.
-        lockstep: Whether an empty frame may stand for a silent tick.
+    `changed` is notified when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
 
     Attributes:
         peer: The other end's last heartbeat, or None.
@@ -78,6 +74,7 @@ class CanLink(Link):
         self._may_be_silent = lockstep and (transmit.command if plant else transmit.measurement) == "on_change"
         self._mailbox = Mailbox(changed)
         self._unsent = 0
+        self._reopen_due = 0.0
         self._open = False
         self.peer: Heartbeat | None = None
         self.peer_ns = 0  # last reception from the other end
@@ -92,19 +89,6 @@ class CanLink(Link):
     def beat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat."""
         self._put(self._beat_id, heartbeat.pack())
-
-    @property
-    def pending(self) -> bool:
-        """Whether a received frame waits to be taken."""
-        return self._mailbox.pending
-
-    def take(self) -> Arrival | None:
-        """The newest frame not yet taken, or None."""
-        return self._mailbox.take()
-
-    def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame."""
-        return self._mailbox.wait(timeout_s)
 
     def silent_s(self) -> float:
         """Time since the last reception from the other end [s]; infinite if there was none."""
@@ -123,6 +107,13 @@ class CanLink(Link):
         except CanError:
             return False
         return True
+
+    def mend(self) -> bool:
+        """As `reopen`, but twice a second at the most; False in between."""
+        if time.monotonic() < self._reopen_due:
+            return False
+        self._reopen_due = time.monotonic() + _REOPEN_S
+        return self.reopen()
 
     def close(self) -> None:
         """Stop receiving, and leave the bus."""
@@ -157,13 +148,12 @@ class CanLink(Link):
         if not self._open or self.fault is not None:
             return
         fd = len(payload) > CLASSIC_BYTES
-        length = next(length for length in FD_LENGTHS if length >= len(payload))
         message = can.Message(
             arbitration_id=identifier,
             is_extended_id=False,
             is_fd=fd,
             bitrate_switch=fd,
-            data=payload.ljust(length, b"\0"),
+            data=payload.ljust(carried_bytes(len(payload)), b"\0"),
         )
         try:
             self._bus.send(message, timeout=_SEND_S)

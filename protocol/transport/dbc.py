@@ -27,12 +27,11 @@ from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
-    FD_LENGTHS,
     HEARTBEAT_S,
     MAX_NODE,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
-    number_of,
+    carried_bytes,
 )
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
@@ -60,12 +59,7 @@ class _Quantity(NamedTuple):
 
 
 def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
-    """The DBC file of a plant's node and the controller that drives it.
-
-    Args:
-        wire: What the frames carry.
-        node: Number of the plant's node, 1…127.
-        period_ns: Period of the plant's grid [ns].
+    """The DBC file of a plant's node, 1…127, and the controller that drives it. `period_ns` is the plant grid's [ns].
 
     Raises:
         ValueError: A node or a period out of bounds.
@@ -98,7 +92,7 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         cycle_ms,
         f"Command of the controller, which answers a measurement: {rate}. {idle}",
     )
-    causes: Choices = OrderedDict([(0, "none"), *((number_of(cause), str(cause)) for cause in TripCause)])
+    causes: Choices = OrderedDict([(0, "none"), *((cause.number, str(cause)) for cause in TripCause)])
     cause = _unsigned("cause", 0, 4, "Cause of the plant's last trip.", causes)
     session = _unsigned("session", 0, 4, "Number of the session, modulo 16.")
     messages = [
@@ -139,17 +133,9 @@ def _message(
     """A message that carries `size` bytes from `sender` to the other end."""
     for signal in signals:
         signal.receivers = [_CONTROLLER if sender == _PLANT else _PLANT]
-    length = next(length for length in FD_LENGTHS if length >= size)
-    return Message(
-        identifier,
-        name,
-        length,
-        signals,
-        comment=comment,
-        senders=[sender],
-        cycle_time=cycle_ms,
-        is_fd=length > CLASSIC_BYTES,
-    )
+    length = carried_bytes(size)
+    fd = length > CLASSIC_BYTES
+    return Message(identifier, name, length, signals, comment=comment, senders=[sender], cycle_time=cycle_ms, is_fd=fd)
 
 
 def _heartbeat(name: str, identifier: int, sender: str, number: Signal) -> Message:
@@ -200,10 +186,8 @@ def _signal(quantity: _Quantity, at: int) -> Signal:
         if formula is None:
             scale = quantizer.step
         else:
-            level, constants = formula
-            comment += (
-                f" This is the bare code i; the level is 0 for i = 0, else {level} [{unit or 1}] with {constants}."
-            )
+            level, constants = f"{formula[0]} [{unit or 1}]", formula[1]
+            comment += f" This is the bare code i; the level is 0 for i = 0, else {level} with {constants}."
             unit = ""
     return Signal(
         quantity.name,

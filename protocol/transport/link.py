@@ -28,24 +28,26 @@ class Arrival(NamedTuple):
 
 
 class Link(ABC):
-    """Sends frames and receives frames; implemented for each transport."""
+    """Sends frames, and receives frames in a mailbox; implemented for each transport."""
+
+    _mailbox: Mailbox
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
         """Send a frame. Blocks only to hand it over, and never raises for a lost peer."""
 
     @property
-    @abstractmethod
     def pending(self) -> bool:
         """Whether a received frame waits to be taken."""
+        return self._mailbox.pending
 
-    @abstractmethod
     def take(self) -> Arrival | None:
         """The newest frame not yet taken, or None."""
+        return self._mailbox.take()
 
-    @abstractmethod
     def wait(self, timeout_s: float) -> Arrival | None:
         """As `take`, but wait up to `timeout_s` for a frame."""
+        return self._mailbox.wait(timeout_s)
 
     @abstractmethod
     def close(self) -> None:
@@ -90,14 +92,10 @@ class Mailbox:
 
 
 class ZenohLink(Link):
-    """Frames over Zenoh: express, at real-time priority.
+    """Frames over Zenoh: express, at real-time priority. The session outlives the link.
 
-    Args:
-        session: An open session; it outlives the link.
-        send_key: Key of the frames sent.
-        receive_key: Key of the frames received.
-        mailbox: Slot for received frames; one of its own if None.
-        lossless: Block when a peer does not keep up, instead of dropping. For lockstep, where each frame is waited for.
+    If `lossless`, `send` blocks when a peer does not keep up, instead of dropping: for lockstep, where each frame is
+    waited for. Without a `mailbox` the link has one of its own.
     """
 
     def __init__(
@@ -111,8 +109,7 @@ class ZenohLink(Link):
     ) -> None:
         self._mailbox = mailbox or Mailbox()
         self._subscriber = session.declare_subscriber(
-            receive_key,
-            lambda sample: self._mailbox.put(sample.payload.to_bytes()),
+            receive_key, lambda sample: self._mailbox.put(sample.payload.to_bytes())
         )
         self._publisher = session.declare_publisher(
             send_key,
@@ -125,19 +122,6 @@ class ZenohLink(Link):
     def send(self, frame: bytes) -> None:
         """Send a frame."""
         self._publisher.put(frame)
-
-    @property
-    def pending(self) -> bool:
-        """Whether a received frame waits to be taken."""
-        return self._mailbox.pending
-
-    def take(self) -> Arrival | None:
-        """The newest frame not yet taken, or None."""
-        return self._mailbox.take()
-
-    def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame."""
-        return self._mailbox.wait(timeout_s)
 
     def close(self) -> None:
         """Stop receiving."""

@@ -12,7 +12,7 @@ import time
 from typing import Any, Final
 
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 
@@ -37,10 +37,8 @@ class NetworkError(AeroloopError):
     """The network cannot be joined; one line with the reason and what to do."""
 
 
-class NetworkSettings(BaseModel):
+class NetworkSettings(BaseModel, extra="forbid"):
     """Zenoh endpoints of this process and its peers."""
-
-    model_config = ConfigDict(extra="forbid")
 
     rendezvous: str = Field(
         default="tcp/127.0.0.1:7447",

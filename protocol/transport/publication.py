@@ -41,14 +41,10 @@ _Publisher = tuple[zenoh.ZenohId, int]
 
 
 class CachedPublisher:
-    """Publishes on one key from a cache.
+    """Publishes on one key from a cache. The session outlives the publisher.
 
-    Args:
-        session: An open session; it outlives the publisher.
-        key: Key to publish on.
-        per_s: Bound on the messages per second, in the long run; the cache holds `KEPT_S` of them.
-        lossless: Wait for peers that do not keep up instead of dropping; for lockstep.
-        encoding: Of the payload.
+    `per_s` bounds the messages per second, in the long run; the cache holds `KEPT_S` of them. If `lossless`, for
+    lockstep, it waits for peers that do not keep up instead of dropping.
     """
 
     def __init__(
@@ -112,10 +108,6 @@ class CacheQuery:
     cache; it then drops the cache's older messages without a miss (seen with zenoh 1.10). The query includes that first
     message, which the cache holds: an answer without it is incomplete, and the cache is queried again. Until then all
     messages of this publisher are held back, so that they are delivered in order.
-
-    Args:
-        session: An open session.
-        first: The first message received.
     """
 
     def __init__(self, session: zenoh.Session, first: Delivery) -> None:
@@ -160,10 +152,7 @@ class CacheQuery:
 class RecoveringSubscriber:
     """Subscriber that recovers earlier messages from publishers' caches. No Python runs when a message is received.
 
-    Args:
-        session: An open session; it outlives the subscriber.
-        key: A key expression.
-        waiting: Messages that may wait to be taken.
+    At most `waiting` messages wait to be taken. The session outlives the subscriber.
     """
 
     def __init__(self, session: zenoh.Session, key: str, waiting: int = WAITING) -> None:
@@ -189,8 +178,7 @@ class RecoveringSubscriber:
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
         """Messages received and not yet taken, each publisher's in order. Never waits.
 
-        Args:
-            held: Also take messages that are held back until a cache has answered.
+        If `held`, also those that are held back until a cache has answered.
         """
         while (sample := self._subscriber.try_recv()) is not None:
             received = read_sample(sample)

@@ -46,10 +46,7 @@ def conjugate(q: ca.SX) -> ca.SX:
 
 def product(p: ca.SX, q: ca.SX) -> ca.SX:
     """Hamilton product `p ⊗ q`. Shape (4, 1)."""
-    return ca.vertcat(
-        p[0] * q[0] - ca.dot(p[1:4], q[1:4]),
-        p[0] * q[1:4] + q[0] * p[1:4] + ca.cross(p[1:4], q[1:4]),
-    )
+    return ca.vertcat(p[0] * q[0] - ca.dot(p[1:4], q[1:4]), p[0] * q[1:4] + q[0] * p[1:4] + ca.cross(p[1:4], q[1:4]))
 
 
 def from_euler(angles: ca.SX) -> ca.SX:

@@ -137,11 +137,9 @@ class TickCounter:
         self.tick = tick
 
     def advance(self, counter: int, at_ns: int) -> int | None:
-        """The tick of a measurement; None if it is not newer than the last one.
+        """The tick of a measurement that arrived at `at_ns` on the receiver's monotonic clock [ns].
 
-        Args:
-            counter: Its counter.
-            at_ns: Its arrival time on the receiver's monotonic clock [ns].
+        None if it is not newer than the last one.
         """
         if self._origin_ns is None:
             tick = self.tick + 1 + (counter - self.tick - 1) % self._counters
@@ -174,9 +172,7 @@ class TickCounter:
     def late_ns(self, tick: int, at_ns: int) -> int:
         """Latency of a tick's frame above the lowest seen [ns]; 0 in lockstep and before any frame.
 
-        Args:
-            tick: Its tick.
-            at_ns: Its arrival time on the receiver's monotonic clock [ns].
+        `at_ns` is its arrival time on the receiver's monotonic clock [ns].
         """
         if self._origin_ns is None:
             return 0

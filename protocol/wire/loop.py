@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 WATCHDOG_S: Final = 0.1
 """0 V after this long without a fresh command [s], unless configured; as industrial drives do."""
@@ -13,10 +13,8 @@ FIRST_COMMAND_S: Final = 1.0
 """How long a granted claim may wait for its first command [s]."""
 
 
-class LoopSettings(BaseModel):
+class LoopSettings(BaseModel, extra="forbid"):
     """Tick grid and process set-up of an end."""
-
-    model_config = ConfigDict(extra="forbid")
 
     rate_hz: float = Field(default=500.0, ge=1, le=10_000, description="ticks a second [Hz]")
     lockstep: bool = Field(

@@ -36,11 +36,17 @@ class Quantizer(ABC):
         limit: Edge of the range, in the signal's unit.
         bound: δ_y of (C.13), in the signal's unit.
         saturated: Number of values beyond the range, which got the outermost level.
+        outermost: The largest level, where saturation begins [signal's unit].
+        invalid: The code of "no valid value".
+        level: `decode` without its check, for codes out of a frame, which are always valid.
     """
 
     limit: float
     bound: float
     saturated: int
+    outermost: float
+    invalid: float
+    level: Callable[[float], float]
 
     @abstractmethod
     def encode(self, y: float) -> float:
@@ -63,21 +69,6 @@ class Quantizer(ABC):
 
     def resume(self, code: float) -> None:  # noqa: B027  # the same
         """Restore the memory: this code was the last. `invalid` changes nothing."""
-
-    @property
-    @abstractmethod
-    def outermost(self) -> float:
-        """The largest level, where saturation begins [signal's unit]."""
-
-    @property
-    @abstractmethod
-    def invalid(self) -> float:
-        """The code of "no valid value"."""
-
-    @property
-    @abstractmethod
-    def level(self) -> Callable[[float], float]:
-        """`decode` without its check, for codes out of a frame, which are always valid."""
 
     def quantize(self, y: float) -> float:
         """y^Q, the level that the quantizer gives y; (C.15) applies it to each element of a vector."""
@@ -102,6 +93,7 @@ class CodedQuantizer(Quantizer):
 
     deadzone: float
     levels: list[float]
+    invalid: int
 
     def __init__(self, bits: int, limit: float) -> None:
         if not MIN_BITS <= bits <= MAX_BITS:
@@ -111,30 +103,18 @@ class CodedQuantizer(Quantizer):
         self.bits = bits
         self.limit = limit
         self.top: int = 2 ** (bits - 1) - 1
+        self.invalid = -self.top - 1
         self.saturated = 0
 
     def _tabulate(self, positive: Sequence[float]) -> None:
         """Set the levels 1…N."""
         self.levels = [0.0, *positive, nan, *(-y for y in reversed(positive))]
-
-    @property
-    def outermost(self) -> float:
-        """See `Quantizer.outermost`."""
-        return self.levels[self.top]
-
-    @property
-    def invalid(self) -> int:
-        """−2^(R−1)."""
-        return -self.top - 1
-
-    @property
-    def level(self) -> Callable[[float], float]:
-        """See `Quantizer.level`."""
-        return self.levels.__getitem__  # type: ignore[return-value]  # a code out of a frame is an int
+        self.outermost = self.levels[self.top]
+        self.level = self.levels.__getitem__  # type: ignore[assignment]  # a code out of a frame is an int
 
     def decode(self, code: float) -> float:
         """The level of a code; NaN for `invalid`."""
-        if not (isinstance(code, int) and -self.top - 1 <= code <= self.top):
+        if not (isinstance(code, int) and self.invalid <= code <= self.top):
             raise ValueError(f"{code!r} is not a code of {self.bits} bits")
         return self.levels[code]
 
@@ -185,9 +165,6 @@ class UniformQuantizer(CodedQuantizer):
 class Continuous(Quantizer):
     """The paper's "cont.": no quantization. The value is its own code; beyond the range, the limit; NaN is invalid.
 
-    Args:
-        limit: Edge of the range [signal's unit], > 0.
-
     Raises:
         ValueError: The limit is not positive and finite.
     """
@@ -195,24 +172,11 @@ class Continuous(Quantizer):
     def __init__(self, limit: float) -> None:
         if not 0 < limit < float("inf"):
             raise ValueError(f"a signal's limit is positive and finite, not {limit}")
-        self.limit = limit
+        self.limit = self.outermost = limit
         self.bound = 0.0
         self.saturated = 0
-
-    @property
-    def outermost(self) -> float:
-        """The limit."""
-        return self.limit
-
-    @property
-    def invalid(self) -> float:
-        """NaN."""
-        return nan
-
-    @property
-    def level(self) -> Callable[[float], float]:
-        """See `Quantizer.level`."""
-        return float
+        self.invalid = nan
+        self.level = float
 
     def encode(self, y: float) -> float:
         """The value itself, within ±limit; see `Quantizer.encode`."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from aeroloop.protocol.wire.frames import DEFAULT_COUNTER_BITS, MAX_COUNTER_BITS, MIN_COUNTER_BITS, FrameFormat
 from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
@@ -23,10 +23,7 @@ def bits_or_continuous(value: object) -> object:
     return None if value == "cont" else value
 
 
-Bits: TypeAlias = Annotated[
-    Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)] | None,
-    BeforeValidator(bits_or_continuous),
-]
+Bits: TypeAlias = Annotated[Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)] | None, BeforeValidator(bits_or_continuous)]
 
 
 Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
@@ -35,10 +32,8 @@ _OWNER: Final[dict[str, Kind]] = {"hysteresis": "hysteresis-uniform", "threshold
 """Parameters that only one kind of quantizer has."""
 
 
-class SignalSpec(BaseModel):
+class SignalSpec(BaseModel, frozen=True, extra="forbid"):
     """How one signal is quantized. The range runs from −limit to +limit, in the signal's unit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
     limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
@@ -91,10 +86,8 @@ class SignalSpec(BaseModel):
         return changed
 
 
-class WireSpec(BaseModel):
+class WireSpec(BaseModel, frozen=True, extra="forbid"):
     """Everything the two ends must agree on to read each other's frames. The default is the paper's 8/6-bit Aero."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     attitude: SignalSpec = Field(
         default=SignalSpec(bits=8, limit=1.0), description="ε, the quaternion's vector part [1]"
@@ -123,11 +116,7 @@ class WireSpec(BaseModel):
         return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
 
     def freshness_ns(self, period_ns: int) -> int:
-        """Lateness at which a frame may be taken for a newer one: 2^counter_bits periods [ns].
-
-        Args:
-            period_ns: Period of a tick [ns].
-        """
+        """Lateness at which a frame may be taken for a newer one: 2^counter_bits periods [ns]."""
         return period_ns << self.counter_bits
 
     def with_bits(self, out: int | None, inp: int | None) -> WireSpec:

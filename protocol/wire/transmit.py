@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from math import copysign
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 SILENCE: Final = b""
 """Empty frame: stands for a frame that is not sent because it equals the last one."""
@@ -20,10 +20,8 @@ SILENCE: Final = b""
 Policy = Literal["periodic", "on_change"]
 
 
-class Transmit(BaseModel):
+class Transmit(BaseModel, frozen=True, extra="forbid"):
     """When each end sends its frames. The word `on_change` alone stands for both directions."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     measurement: Policy = Field(default="periodic", description="measurement frames: every tick, or on a change")
     command: Policy = Field(default="periodic", description="command frames: every tick, or on a change")
@@ -41,22 +39,14 @@ class Transmit(BaseModel):
         return {"measurement": value, "command": value} if isinstance(value, str) else value
 
     def heartbeat_ticks(self, period_ns: int, counters: int) -> int:
-        """The most ticks from one frame to the next, 1…counters/2 − 1.
-
-        Args:
-            period_ns: Period of a tick [ns].
-            counters: Number of values of the frames' counter.
-        """
+        """The most ticks from one frame to the next, 1…counters/2 − 1, for a counter with this many values."""
         return max(1, min(counters // 2 - 1, round(self.heartbeat_s * 1e9) // period_ns))
 
 
 class Sender:
     """Decides, tick by tick, whether a frame is to be sent.
 
-    Args:
-        policy: When frames are sent.
-        heartbeat: The most ticks from one frame to the next.
-        counters: Number of values of the frames' counter.
+    `heartbeat` is the most ticks from one frame to the next, `counters` the number of values of the frames' counter.
     """
 
     def __init__(self, policy: Policy, heartbeat: int, counters: int) -> None:
@@ -67,11 +57,9 @@ class Sender:
         self._at: int | None = None
 
     def due(self, k: int, codes: Sequence[float]) -> bool:
-        """Whether a frame with these codes is to be sent at tick k; if so, it counts as sent.
+        """Whether a frame with these codes is to be sent at tick k, which rises; if so, it counts as sent.
 
-        Args:
-            k: Tick index, rising.
-            codes: Codes of the frame; not to be modified afterwards.
+        The codes must not be modified afterwards.
         """
         if self._always:
             return True

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -12,19 +13,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, No
 
 import typer
 
+from aeroloop.protocol.errors import AeroloopError
+
 if TYPE_CHECKING:
     from threading import Event
 
+    from pydantic import BaseModel
+
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.config import Settings
-    from aeroloop.service.figures import Figures
 
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
 _PR_SET_PDEATHSIG: Final = 1
 PAPER_DURATION_S: Final = 50.0
 
-T = TypeVar("T")
+Result = TypeVar("Result", bound="BaseModel")
 
 state = {"debug": False}
 
@@ -81,48 +85,47 @@ def fail(message: str, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
-def settings_of(config: Path | None, overrides: list[str] | None) -> Settings:
-    """The effective configuration; a configuration error ends the command."""
+def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
+    """The effective configuration, with more overrides; a configuration error ends the command."""
+    return reloadable(config, overrides, *more)[0]
+
+
+def reloadable(
+    config: Path | None, overrides: Sequence[str] | None, *more: str
+) -> tuple[Settings, Callable[[], Settings]]:
+    """The effective configuration, with more overrides, and a function that loads it again."""
     from aeroloop.service.config import load
 
-    return _configured(lambda: load(config, overrides or []))
+    def again() -> Settings:
+        return load(config, [*(overrides or ()), *more])
 
-
-def reloadable(config: Path | None, overrides: list[str]) -> tuple[Settings, Callable[[], Settings]]:
-    """The effective configuration, and a function that loads it again."""
-
-    def load() -> Settings:
-        from aeroloop.service import config as configuration
-
-        return configuration.load(config, overrides)
-
-    return settings_of(config, overrides), load
+    with _configured():
+        return again(), again
 
 
 def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
     """The settings with the bits given on the command line."""
     from aeroloop.service.config import with_bits
 
-    return _configured(lambda: with_bits(settings, bits_out, bits_in))
+    with _configured():
+        return with_bits(settings, bits_out, bits_in)
 
 
-def _configured(make: Callable[[], Settings]) -> Settings:
-    from aeroloop.service.config import ConfigError
-
+@contextmanager
+def _configured() -> Iterator[None]:
     try:
-        return make()
-    except ConfigError as error:
+        yield
+    except AeroloopError as error:
         if state["debug"]:
             raise
         fail(str(error), 2)
 
 
-def guarded(run: Callable[[], T]) -> T:
-    """Run, and turn expected errors into one line and an exit code."""
-    from aeroloop.protocol.errors import AeroloopError
-
+@contextmanager
+def guarded() -> Iterator[None]:
+    """Turn expected errors into one line and an exit code."""
     try:
-        return run()
+        yield
     except (AeroloopError, ValueError) as error:
         if state["debug"]:
             raise
@@ -131,14 +134,13 @@ def guarded(run: Callable[[], T]) -> T:
         raise typer.Exit(130) from None
 
 
-def checked(make: Callable[[], T]) -> T:
-    """Build a value from user input; invalid input ends the command with exit code 2."""
+@contextmanager
+def checked() -> Iterator[None]:
+    """Build values from user input; invalid input ends the command with exit code 2."""
     from pydantic import ValidationError
 
-    from aeroloop.protocol.errors import AeroloopError
-
     try:
-        return make()
+        yield
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -150,17 +152,13 @@ def checked(make: Callable[[], T]) -> T:
 def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:
     """Join the network as a role and run until SIGTERM or SIGINT."""
     _prepare(options)
+    from aeroloop.protocol.runtime.role import Role
+    from aeroloop.service.daemon.claim import controller_name
 
-    def join_and_run() -> None:
-        from aeroloop.protocol.runtime.role import Role
-        from aeroloop.service.daemon.claim import controller_name
-
-        name = controller_name() if kind == "controller" else None
-        with Role(kind, settings.vehicle, settings.network, settings.description(), name) as role:
-            role.stop_on_signals()
-            run(role)
-
-    guarded(join_and_run)
+    name = controller_name() if kind == "controller" else None
+    with guarded(), Role(kind, settings.vehicle, settings.network, settings.description(), name) as role:
+        role.stop_on_signals()
+        run(role)
 
 
 def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
@@ -171,7 +169,8 @@ def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
     stop = Event()
     for which in (signal.SIGTERM, signal.SIGINT):
         signal.signal(which, lambda *_: stop.set())
-    guarded(lambda: run(stop))
+    with guarded():
+        run(stop)
 
 
 def _prepare(options: DaemonOptions) -> None:
@@ -187,11 +186,9 @@ def _prepare(options: DaemonOptions) -> None:
             raise typer.Exit(0)
 
 
-def print_figures(figures: Figures, json: bool) -> None:
-    """Print figures of merit, as JSON or as a table."""
+def show(result: Result, json: bool, table: Callable[[Result], None]) -> None:
+    """Print a result, as JSON or by a function that prints it for a person."""
     if json:
-        typer.echo(figures.model_dump_json(indent=2))
+        typer.echo(result.model_dump_json(indent=2))
     else:
-        from aeroloop.service.terminal.display import figures_table
-
-        figures_table(figures)
+        table(result)

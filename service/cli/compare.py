@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from aeroloop.service.review.report import Report
 
 Html = Annotated[
-    Path | None,
-    typer.Option("--html", help="Write an interactive page that needs no network.", show_default=False),
+    Path | None, typer.Option("--html", help="Write an interactive page that needs no network.", show_default=False)
 ]
 
 
@@ -39,26 +38,21 @@ def compare(
 
     if len(logs) < 2:
         fail("log compare takes two logs or more", 2)
-    limits = checked(lambda: [Limit.parse(text) for text in require or []])
+    with checked():
+        limits = [Limit.parse(text) for text in require or []]
 
-    def run() -> list[Report]:
-        from aeroloop.service.review.compare import read_runs
-        from aeroloop.service.terminal.display import share_bar
+    from aeroloop.service.review.compare import Comparison, broken_limits, read_runs
+    from aeroloop.service.terminal.display import share_bar
+    from aeroloop.service.terminal.side_by_side import comparison_tables
 
+    with guarded():
         with share_bar("reading", hidden=json) as update:
             reports = read_runs(logs, limits, update)
         if html is not None:
             write_html(reports, html)
-        return reports
-
-    reports = guarded(run)
-    from aeroloop.service.review.compare import Comparison, broken_limits
-
     if json:
         typer.echo(Comparison.of(reports).model_dump_json(indent=2))
     else:
-        from aeroloop.service.terminal.side_by_side import comparison_tables
-
         comparison_tables(reports)
     if broken := broken_limits(reports):
         fail("; ".join(broken), 1)

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, fail, guarded, settings_of
-
-if TYPE_CHECKING:
-    from aeroloop.service.host.doctor import Diagnosis
-    from aeroloop.service.host.soak import Soak
+from aeroloop.service.cli.common import Config, Json, Overrides, fail, guarded, settings_of, show
 
 group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
 
@@ -21,21 +17,12 @@ group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loo
 def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Check whether this machine holds the configured rate, and print what to change if not."""
     settings = settings_of(config, overrides)
+    from aeroloop.service.host.doctor import TRIAL_S, diagnose
+    from aeroloop.service.terminal.display import diagnosis_table, progress_bar
 
-    def run() -> Diagnosis:
-        from aeroloop.service.host.doctor import TRIAL_S, diagnose
-        from aeroloop.service.terminal.display import progress_bar
-
-        with progress_bar("check", TRIAL_S, hidden=json) as update:
-            return diagnose(settings.loop, update)
-
-    diagnosis = guarded(run)
-    if json:
-        typer.echo(diagnosis.model_dump_json(indent=2))
-    else:
-        from aeroloop.service.terminal.display import diagnosis_table
-
-        diagnosis_table(diagnosis)
+    with guarded(), progress_bar("check", TRIAL_S, hidden=json) as update:
+        diagnosis = diagnose(settings.loop, update)
+    show(diagnosis, json, diagnosis_table)
     if not diagnosis.holds:
         raise typer.Exit(1)
 
@@ -50,24 +37,15 @@ def soak(
 ) -> None:
     """Run the three processes for a long time and report growth, drift and losses."""
     settings = settings_of(config, overrides)
+    from datetime import datetime
 
-    def run() -> Soak:
-        from datetime import datetime
+    from aeroloop.service.host.soak import run_soak
+    from aeroloop.service.terminal.display import progress_bar, soak_table
 
-        from aeroloop.service.host.soak import run_soak
-        from aeroloop.service.terminal.display import progress_bar
-
-        path = log or settings.recorder.directory / datetime.now().strftime("soak-%Y%m%d-%H%M%S.mcap")
-        with progress_bar("soak", minutes * 60, hidden=json) as update:
-            return run_soak(settings, minutes, path, lambda reached, _: update(reached))
-
-    result = guarded(run)
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    else:
-        from aeroloop.service.terminal.display import soak_table
-
-        soak_table(result)
+    path = log or settings.recorder.directory / datetime.now().strftime("soak-%Y%m%d-%H%M%S.mcap")
+    with guarded(), progress_bar("soak", minutes * 60, hidden=json) as update:
+        result = run_soak(settings, minutes, path, update)
+    show(result, json, soak_table)
     if result.findings:
         raise typer.Exit(1)
 

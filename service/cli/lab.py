@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -17,17 +17,10 @@ from aeroloop.service.cli.common import (
     Overrides,
     checked,
     guarded,
-    print_figures,
     settings_of,
+    show,
     with_bits_of,
 )
-
-if TYPE_CHECKING:
-    from aeroloop.service.figures import Figures
-    from aeroloop.service.lab.burden import Burden
-    from aeroloop.service.lab.calibrate import Calibration
-    from aeroloop.service.lab.tables import Tables
-    from aeroloop.service.theorem.certificate import Certificate
 
 group = typer.Typer(no_args_is_help=True, help="Experiments, tables, calibration and certificates, in lockstep.")
 
@@ -43,18 +36,12 @@ def experiment(
 ) -> None:
     """Run the closed loop in this process, in lockstep through real frames, without a network."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    from aeroloop.service.lab.experiment import run_experiment
+    from aeroloop.service.terminal.display import figures_table, progress_bar
 
-    def run() -> Figures:
-        from aeroloop.service.lab.experiment import run_experiment
-
-        if json:
-            return run_experiment(settings, duration)
-        from aeroloop.service.terminal.display import progress_bar
-
-        with progress_bar("experiment", duration) as update:
-            return run_experiment(settings, duration, update)
-
-    print_figures(guarded(run), json)
+    with guarded(), progress_bar("experiment", duration, hidden=json) as update:
+        figures = run_experiment(settings, duration, update)
+    show(figures, json, figures_table)
 
 
 @group.command()
@@ -67,46 +54,25 @@ def tables(
 ) -> None:
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
     settings = settings_of(config, overrides)
+    from aeroloop.service.lab.tables import markdown as as_markdown
+    from aeroloop.service.lab.tables import predict
+    from aeroloop.service.terminal.display import count_bar, paper_tables
 
-    def run() -> Tables:
-        from aeroloop.service.lab.tables import predict
-        from aeroloop.service.terminal.display import count_bar
-
-        with count_bar("cells", hidden=json) as update:
-            return predict(settings, seeds, update)
-
-    result = guarded(run)
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    elif markdown:
-        from aeroloop.service.lab.tables import markdown as as_markdown
-
-        typer.echo(as_markdown(result))
-    else:
-        from aeroloop.service.terminal.display import paper_tables
-
-        paper_tables(result)
+    with guarded(), count_bar("cells", hidden=json) as update:
+        result = predict(settings, seeds, update)
+    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)
 
 
 @group.command()
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
     settings = settings_of(config, overrides)
+    from aeroloop.service.lab.calibrate import calibrate
+    from aeroloop.service.terminal.display import calibration_table, count_bar
 
-    def run() -> Calibration:
-        from aeroloop.service.lab.calibrate import calibrate
-        from aeroloop.service.terminal.display import count_bar
-
-        with count_bar("experiments", hidden=json) as update:
-            return calibrate(settings, lambda runs: update(runs, None))
-
-    result = guarded(run)
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    else:
-        from aeroloop.service.terminal.display import calibration_table
-
-        calibration_table(result)
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = calibrate(settings, lambda runs: update(runs, None))
+    show(result, json, calibration_table)
 
 
 @group.command()
@@ -130,11 +96,11 @@ def certify(
 ) -> None:
     """Check whether the paper's theorem holds for the configuration, and print the error that it guarantees."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    from aeroloop.service.terminal.certificate_table import certificate_table
+    from aeroloop.service.theorem.certificate import certify
 
-    def run() -> Certificate:
-        from aeroloop.service.theorem.certificate import certify
-
-        return certify(
+    with guarded():
+        result = certify(
             settings.wire,
             settings.law,
             settings.reference,
@@ -142,14 +108,7 @@ def certify(
             disturbance=disturbance,
             attitude_error_deg=attitude_error,
         )
-
-    result = guarded(run)
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    else:
-        from aeroloop.service.terminal.certificate_table import certificate_table
-
-        certificate_table(result)
+    show(result, json, certificate_table)
     raise typer.Exit(0 if result.holds else 1)
 
 
@@ -192,33 +151,23 @@ def burden(
 ) -> None:
     """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
     settings = settings_of(config, overrides)
-
-    def run() -> Burden:
-        from aeroloop.service.lab.burden import measure_burden
-        from aeroloop.service.terminal.display import count_bar
-
-        with count_bar("experiments", hidden=json) as update:
-            return measure_burden(settings, cells, duration, update)
-
+    from aeroloop.service.lab.burden import measure_burden
     from aeroloop.service.lab.burden_grid import grid
+    from aeroloop.service.lab.burden_table import burden_table
+    from aeroloop.service.lab.burden_table import markdown as as_markdown
+    from aeroloop.service.terminal.display import count_bar
 
-    if figure is not None:
-        from aeroloop.service.lab.burden_figure import check_path
+    with checked():
+        if figure is not None:
+            from aeroloop.service.lab.burden_figure import check_path
 
-        checked(lambda: check_path(figure))
-    cells = checked(lambda: grid(settings, bits or (), quantizer or (), sensors or ()))
-    result = guarded(run)
-    if json:
-        typer.echo(result.model_dump_json(indent=2))
-    elif markdown:
-        from aeroloop.service.lab.burden_table import markdown as as_markdown
-
-        typer.echo(as_markdown(result))
-    else:
-        from aeroloop.service.lab.burden_table import burden_table
-
-        burden_table(result)
+            check_path(figure)
+        cells = grid(settings, bits or (), quantizer or (), sensors or ())
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = measure_burden(settings, cells, duration, update)
+    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else burden_table)
     if figure is not None:  # last: a full disk must not cost the table
         from aeroloop.service.lab.burden_figure import draw_burden
 
-        guarded(lambda: draw_burden(result, figure))
+        with guarded():
+            draw_burden(result, figure)

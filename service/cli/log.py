@@ -17,6 +17,7 @@ from aeroloop.service.cli.common import (
     guarded,
     run_alone,
     settings_of,
+    show,
 )
 from aeroloop.service.cli.compare import Html, compare, write_html
 
@@ -25,15 +26,16 @@ if TYPE_CHECKING:
 
     from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.recover import Recovery
-    from aeroloop.service.logs.replay import Replay
-    from aeroloop.service.review.report import Report
+    from aeroloop.service.logs.ticks import Ticks
+
+Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)]
 
 group = typer.Typer(no_args_is_help=True, help="Review, compare, replay, recover and export logs; view a live loop.")
 
 
 @group.command()
 def review(
-    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    logs: Logs,
     figures: Annotated[
         Path | None, typer.Option("--figures", help="Draw the paper's figures into this folder.", show_default=False)
     ] = None,
@@ -52,14 +54,15 @@ def review(
     """Compute every figure of a run from its logs, check limits, and draw the paper's figures."""
     from aeroloop.service.review.requirements import Limit
 
-    limits = checked(lambda: [Limit.parse(text) for text in require or []])
+    with checked():
+        limits = [Limit.parse(text) for text in require or []]
 
-    def run() -> Report:
-        from aeroloop.service.logs.ticks import Ticks
-        from aeroloop.service.review.review import read
-        from aeroloop.service.terminal.display import share_bar
+    from aeroloop.service.review.review import read
+    from aeroloop.service.terminal.display import share_bar
+    from aeroloop.service.terminal.log_tables import review_account
 
-        kept: list[Ticks] = []
+    kept: list[Ticks] = []
+    with guarded():
         with share_bar("reading", hidden=json) as update:
             judged = read(*logs, watch=None if figures is None else kept.append, progress=update)
         report = judged.report(limits)
@@ -71,15 +74,8 @@ def review(
                 typer.echo(f"aeroloop: drew {path}", err=True)
         if html is not None:
             write_html([report], html)
-        return report
-
-    findings = guarded(run).findings
-    if json:
-        typer.echo(findings.model_dump_json(indent=2))
-    else:
-        from aeroloop.service.terminal.log_tables import review_account
-
-        review_account(findings)
+        findings = report.findings
+    show(findings, json, review_account)
     broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
     if broken:
         fail("; ".join(broken), 1)
@@ -90,10 +86,9 @@ group.command()(compare)
 
 @group.command()
 def replay(
-    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    logs: Logs,
     overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override the logged configuration."),
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override the logged configuration.")
     ] = None,
     end: Annotated[
         Literal["controller", "plant"] | None,
@@ -102,22 +97,14 @@ def replay(
     json: Json = False,
 ) -> None:
     """Compute both ends again from their traces and compare byte for byte."""
+    from aeroloop.protocol.messages.trace import ENDS
+    from aeroloop.service.logs.replay import replay
+    from aeroloop.service.terminal.display import share_bar
+    from aeroloop.service.terminal.log_tables import replay_table
 
-    def run() -> Replay:
-        from aeroloop.protocol.messages.trace import ENDS
-        from aeroloop.service.logs.replay import replay
-        from aeroloop.service.terminal.display import share_bar
-
-        with share_bar("replaying", hidden=json) as update:
-            return replay(logs, overrides or [], update, ends=[end] if end else ENDS)
-
-    replayed = guarded(run)
-    if json:
-        typer.echo(replayed.model_dump_json(indent=2))
-    else:
-        from aeroloop.service.terminal.log_tables import replay_table
-
-        replay_table(replayed)
+    with guarded(), share_bar("replaying", hidden=json) as update:
+        replayed = replay(logs, overrides or [], update, ends=[end] if end else ENDS)
+    show(replayed, json, replay_table)
     if not overrides and replayed.differs:
         raise typer.Exit(1)
 
@@ -129,21 +116,17 @@ def recover(
     json: Json = False,
 ) -> None:
     """Copy the whole records of a broken log into a new log and report what was lost."""
+    from aeroloop.service.logs.recover import recover
+    from aeroloop.service.terminal.display import share_bar
 
-    def run() -> Recovery:
-        from aeroloop.service.logs.recover import recover
-        from aeroloop.service.terminal.display import share_bar
-
-        with share_bar("recovering", hidden=json) as update:
-            return recover(broken, out, update)
-
-    recovery = guarded(run)
-    if json:
-        typer.echo(recovery.model_dump_json(indent=2))
-    else:
+    def account(recovery: Recovery) -> None:
         typer.echo(f"{recovery.out}: {recovery.messages} messages on {recovery.channels} channels")
         for line in recovery.lost:
             typer.echo(f"not recovered, {line}")
+
+    with guarded(), share_bar("recovering", hidden=json) as update:
+        recovery = recover(broken, out, update)
+    show(recovery, json, account)
 
 
 @group.command()
@@ -172,7 +155,7 @@ def live(
 
 @group.command()
 def export(
-    logs: Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)],
+    logs: Logs,
     to: Annotated[Literal["parquet", "csv", "mat", "mcap"], typer.Option("--to", help="Format of the new file.")],
     out: Annotated[
         Path | None,
@@ -185,21 +168,17 @@ def export(
     json: Json = False,
 ) -> None:
     """Write a log as a table with a row per tick or, with --to mcap, as a log with every message decoded."""
+    from aeroloop.service.logs.export import export
+    from aeroloop.service.terminal.display import share_bar
 
-    def run() -> Exported:
-        from aeroloop.service.logs.export import export
-        from aeroloop.service.terminal.display import share_bar
-
-        with share_bar("exporting", hidden=json) as update:
-            return export(logs, to, out, session=session, progress=update)
-
-    exported = guarded(run)
-    if json:
-        typer.echo(exported.model_dump_json(indent=2))
-    else:
+    def account(exported: Exported) -> None:
         if exported.sessions is None:
             typer.echo(f"{exported.out}: {exported.rows} messages on {len(exported.columns)} channels")
         else:
             typer.echo(f"{exported.out}: {exported.rows} ticks of {', '.join(exported.sessions)}")
         for line in exported.damages:
             typer.echo(f"not read, {line}")
+
+    with guarded(), share_bar("exporting", hidden=json) as update:
+        exported = export(logs, to, out, session=session, progress=update)
+    show(exported, json, account)

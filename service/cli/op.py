@@ -11,9 +11,10 @@ import typer
 from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, settings_of
 
 if TYPE_CHECKING:
-    from aeroloop.protocol.messages.operator import Reference
-    from aeroloop.service.host.operator import Statuses
+    from aeroloop.protocol.messages.operator import Message, Reference
+    from aeroloop.service.config import Settings
 
+Three = tuple[float, float, float]
 Within = Annotated[float, typer.Option("--in", metavar="S", help="Duration of the move, in s.")]
 
 group = typer.Typer(no_args_is_help=True, help="Operate running roles over the network.")
@@ -23,13 +24,10 @@ group = typer.Typer(no_args_is_help=True, help="Operate running roles over the n
 def status(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Print the status of every role of every vehicle on the network."""
     settings = settings_of(config, overrides)
+    from aeroloop.service.host.operator import gather
 
-    def run() -> Statuses:
-        from aeroloop.service.host.operator import gather
-
-        return gather(settings.network)
-
-    found = guarded(run)
+    with guarded():
+        found = gather(settings.network)
     if json:
         from json import dumps
 
@@ -48,75 +46,57 @@ def status(json: Json = False, config: Config = None, overrides: Overrides = Non
 def top(config: Config = None, overrides: Overrides = None) -> None:
     """Show every vehicle and role on the network, live, until ^C."""
     settings = settings_of(config, overrides)
+    import threading
 
-    def run() -> None:
-        import threading
+    from aeroloop.service.terminal.display import live_screen
+    from aeroloop.service.terminal.monitor import watch
 
-        from aeroloop.service.terminal.display import live_screen
-        from aeroloop.service.terminal.monitor import watch
-
-        stop = threading.Event()
-        signal.signal(signal.SIGINT, lambda *_: stop.set())
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
-        with live_screen() as show:
-            watch(settings.network, show, stop)
-
-    guarded(run)
+    stop = threading.Event()
+    for which in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(which, lambda *_: stop.set())
+    with guarded(), live_screen() as show:
+        watch(settings.network, show, stop)
 
 
 @group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
     """Arm the plant for the next claim, and let controllers that hold or are faulted claim again."""
-    from aeroloop.service.host import operator as operate
-
-    settings = settings_of(config, overrides)
-    typer.echo(guarded(lambda: operate.arm(settings.network, settings.vehicle)))
+    _send(settings_of(config, overrides), "arm")
 
 
 @group.command()
 def stop(config: Config = None, overrides: Overrides = None) -> None:
     """Stop the plant at once: 0 V, and no controller drives it until it is armed again."""
-    from aeroloop.service.host import operator as operate
-
-    settings = settings_of(config, overrides)
-    typer.echo(guarded(lambda: operate.stop(settings.network, settings.vehicle)))
+    _send(settings_of(config, overrides), "stop")
 
 
 @group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
     """Make the controller release the vehicle and hold until `op arm`, so that another can claim it."""
-    from aeroloop.service.host import operator as operate
-
-    settings = settings_of(config, overrides)
-    typer.echo(guarded(lambda: operate.release(settings.network, settings.vehicle)))
+    _send(settings_of(config, overrides), "stand_down")
 
 
 @group.command("set-gains")
 def set_gains(
-    c1: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--C1", help="For the attitude error (1/s).", show_default=False),
-    ] = None,
+    c1: Annotated[Three | None, typer.Option("--C1", help="For the attitude error (1/s).", show_default=False)] = None,
     c2: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--C2", help="For the rate error (N·m·s/rad).", show_default=False),
+        Three | None, typer.Option("--C2", help="For the rate error (N·m·s/rad).", show_default=False)
     ] = None,
     gamma: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--Gamma", help="For the adaptation (N·m·s²/rad² per s).", show_default=False),
+        Three | None, typer.Option("--Gamma", help="For the adaptation (N·m·s²/rad² per s).", show_default=False)
     ] = None,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Change the law's gains between two ticks; gains left out stay as they are."""
     from aeroloop.protocol.messages.operator import Gains
-    from aeroloop.service.host import operator as operate
 
     settings = settings_of(config, overrides)
     if c1 is c2 is gamma is None:
         fail("give --C1, --C2 or --Gamma, three numbers each", 2)
-    gains = checked(lambda: Gains(C1=c1, C2=c2, Gamma=gamma))
-    typer.echo(guarded(lambda: operate.set_gains(settings.network, settings.vehicle, gains)))
+    with checked():
+        gains = Gains(C1=c1, C2=c2, Gamma=gamma)
+    _send(settings, "set_gains", gains)
 
 
 @group.command(context_settings={"ignore_unknown_options": True})  # a negative angle is no option
@@ -130,11 +110,11 @@ def goto(
 ) -> None:
     """Turn smoothly to an attitude and hold it; a turn that would be too fast is refused."""
     from aeroloop.protocol.messages.operator import Hold, Track
-    from aeroloop.service.host import operator as operate
 
     settings = settings_of(config, overrides)
-    track = checked(lambda: Track(reference=Hold(attitude=(roll, pitch, yaw)), within_s=within_s))
-    typer.echo(guarded(lambda: operate.track(settings.network, settings.vehicle, track)))
+    with checked():
+        track = Track(reference=Hold(attitude=(roll, pitch, yaw)), within_s=within_s)
+    _send(settings, "track", track)
 
 
 @group.command()
@@ -144,11 +124,11 @@ def track(
     ],
     within_s: Within = 2.0,
     amplitude: Annotated[
-        tuple[float, float, float] | None,
+        Three | None,
         typer.Option(help="sinusoid: of roll, pitch, yaw (deg); the paper's if left out.", show_default=False),
     ] = None,
     frequency: Annotated[
-        tuple[float, float, float] | None,
+        Three | None,
         typer.Option(help="sinusoid: of roll, pitch, yaw (rad/s); the paper's if left out.", show_default=False),
     ] = None,
     timeout_s: Annotated[
@@ -159,7 +139,7 @@ def track(
 ) -> None:
     """Follow another reference: a sinusoid, the current attitude, a file, or set-points published on `reference`."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
-    from aeroloop.service.host import operator as operate
+    from aeroloop.service.host.operator import read_points
 
     settings = settings_of(config, overrides)
     given = {"amplitude": amplitude, "frequency": frequency, "timeout_s": timeout_s}
@@ -167,17 +147,24 @@ def track(
     misplaced = set(options) - {"sinusoid": {"amplitude", "frequency"}, "stream": {"timeout_s"}}.get(what, set())
     if misplaced:
         fail(f"{what} takes no --{misplaced.pop().removesuffix('_s')}", 2)
-
-    def reference() -> Reference:
+    with checked():
+        reference: Reference
         match what:
             case "sinusoid":
-                return Sinusoid.model_validate(options)
+                reference = Sinusoid.model_validate(options)
             case "hold":
-                return Hold()
+                reference = Hold()
             case "stream":
-                return Stream.model_validate(options)
+                reference = Stream.model_validate(options)
             case _:
-                return operate.read_points(Path(what))
+                reference = read_points(Path(what))
+        message = Track(reference=reference, within_s=within_s)
+    _send(settings, "track", message)
 
-    message = checked(lambda: Track(reference=reference(), within_s=within_s))
-    typer.echo(guarded(lambda: operate.track(settings.network, settings.vehicle, message)))
+
+def _send(settings: Settings, topic: str, message: Message | None = None) -> None:
+    from aeroloop.protocol.messages.operator import Ask
+    from aeroloop.service.host.operator import send
+
+    with guarded():
+        typer.echo(send(settings.network, settings.vehicle, topic, message or Ask()))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,11 +20,11 @@ from aeroloop.service.cli.common import (
     Overrides,
     daemon,
     guarded,
-    print_figures,
     reloadable,
     run_alone,
     run_role,
     settings_of,
+    show,
     with_bits_of,
 )
 
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.config import Settings
-    from aeroloop.service.figures import Figures
 
 Faults = Annotated[
     list[str] | None,
@@ -66,22 +64,19 @@ def demo(
 ) -> None:
     """Run the paper's experiment over Zenoh in three processes, and review its log."""
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
-    settings = settings_of(config, [*(overrides or []), *options])
-    settings = with_bits_of(settings, bits_out, bits_in)
+    settings = with_bits_of(settings_of(config, overrides, *options), bits_out, bits_in)
+    from aeroloop.service.lab.demo import run_demo
+    from aeroloop.service.terminal.display import figures_table, live_demo
 
-    def run() -> tuple[Figures, bool]:
-        from aeroloop.service.lab.demo import run_demo
-        from aeroloop.service.terminal.display import live_demo
-
+    with guarded():
         if json or not sys.stderr.isatty():
             how = "in lockstep" if settings.loop.lockstep else "in real time"
             typer.echo(f"aeroloop: {duration:g} s of the experiment {how}, three processes", err=True)
-            return run_demo(settings, duration, log)
-        with live_demo(duration) as update:
-            return run_demo(settings, duration, log, update)
-
-    figures, complete = guarded(run)
-    print_figures(figures, json)
+            figures, complete = run_demo(settings, duration, log)
+        else:
+            with live_demo(duration) as update:
+                figures, complete = run_demo(settings, duration, log, update)
+    show(figures, json, figures_table)
     if not complete:
         raise typer.Exit(130)
 
@@ -100,7 +95,7 @@ def controller(
     """Run the controller daemon until SIGTERM."""
     words = [f"controller.duration_s={duration}"] if duration is not None else []
     words += ["controller.auto_arm=true"] if auto_arm else []
-    settings, load = reloadable(options.config, [*(options.overrides or []), *words])
+    settings, load = reloadable(options.config, options.overrides, *words)
 
     def run(role: Role) -> None:
         from aeroloop.service.config import from_description
@@ -127,41 +122,30 @@ def controller(
 
 @group.command()
 @daemon
-def emulator(
-    options: DaemonOptions,
-    faults: Faults = None,
-) -> None:
+def emulator(options: DaemonOptions, faults: Faults = None) -> None:
     """Run the emulated plant until SIGTERM."""
-    settings, load = reloadable(
-        options.config, [*(options.overrides or []), "plant.via=emulator", *_fault_options(faults)]
-    )
-    _run_plant(settings, load, options)
+    _run_plant(options, "plant.via=emulator", *_fault_options(faults))
 
 
 @group.command()
 @daemon
 def plant(options: DaemonOptions) -> None:
     """Run the plant end that `plant.via` names until SIGTERM: emulator, CAN bridge or Quanser's board."""
-    settings, load = reloadable(options.config, options.overrides or [])
-    _run_plant(settings, load, options)
+    _run_plant(options)
 
 
 @group.command()
 @daemon
 def bridge(options: DaemonOptions) -> None:
     """Run the bridge to a plant on the configured CAN bus until SIGTERM."""
-    settings, load = reloadable(options.config, [*(options.overrides or []), "plant.via=can"])
-    _run_plant(settings, load, options)
+    _run_plant(options, "plant.via=can")
 
 
 @group.command("can-node")
 @daemon
-def can_node(
-    options: DaemonOptions,
-    faults: Faults = None,
-) -> None:
+def can_node(options: DaemonOptions, faults: Faults = None) -> None:
     """Run the emulated plant as a node on the configured CAN bus until SIGTERM."""
-    settings = settings_of(options.config, [*(options.overrides or []), *_fault_options(faults)])
+    settings = settings_of(options.config, options.overrides, *_fault_options(faults))
 
     def run(stop: Event) -> None:
         from aeroloop.plant_emulator.hosts.can_node import CanFront
@@ -177,7 +161,9 @@ def _fault_options(faults: list[str] | None) -> list[str]:
     return [f"plant.faults={dumps(faults)}"] if faults else []
 
 
-def _run_plant(settings: Settings, load: Callable[[], Settings], options: DaemonOptions) -> None:
+def _run_plant(options: DaemonOptions, *overrides: str) -> None:
+    settings, load = reloadable(options.config, options.overrides, *overrides)
+
     def run(role: Role) -> None:
         from aeroloop.service.daemon.plants import run_plant
 
@@ -194,7 +180,7 @@ def recorder(
 ) -> None:
     """Record the traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
-    settings, load = reloadable(options.config, [*(options.overrides or []), *words])
+    settings, load = reloadable(options.config, options.overrides, *words)
 
     def run(role: Role) -> None:
         from aeroloop.service.daemon.reload import reload_on_hangup

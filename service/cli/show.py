@@ -47,7 +47,7 @@ def layout(
     overrides: Overrides = None,
 ) -> None:
     """Print a layout file for Foxglove or Lichtblick that shows a log or `log live`."""
-    settings = settings_of(config, [*(overrides or []), *([f'vehicle="{vehicle}"'] if vehicle is not None else [])])
+    settings = settings_of(config, overrides, *([f'vehicle="{vehicle}"'] if vehicle is not None else []))
 
     from aeroloop.service.viewers.layout import layout as describe
 

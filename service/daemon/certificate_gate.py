@@ -67,13 +67,6 @@ class Verdict(NamedTuple):
 class CertificateGate:
     """Certificates of one controller: computed, cached, published and required.
 
-    Args:
-        role: Its presence on the network.
-        wire: Its quantizers.
-        law: Its model and initial gains.
-        reference: Its initial reference.
-        settings: How a session begins, and whether the theorem must hold.
-
     Attributes:
         required: Whether the theorem must hold.
     """
@@ -107,12 +100,7 @@ class CertificateGate:
         return verdict
 
     def admit(self, gains: Gains, reference: Reference, *, required: bool | None = None) -> None:
-        """Refuse a change that must be certified and is not.
-
-        Args:
-            gains: All three.
-            reference: The reference after the change.
-            required: Whether the theorem must hold; as configured if None.
+        """Refuse gains and a reference that must be certified, as configured or `required`, and are not.
 
         Raises:
             UncertifiedError: It must hold, and would not.
@@ -148,7 +136,12 @@ class CertificateGate:
 
         def weigh() -> None:
             verdict = self.weigh(gains, reference)
-            self._role.later(lambda: self._take_verdict(gains, reference, verdict))
+            self._role.later(lambda: take_verdict(verdict))
+
+        def take_verdict(verdict: Verdict) -> None:
+            if self._now == (gains, reference):
+                self._verdict = verdict
+                self.publish()
 
         threading.Thread(target=weigh, name="weigh", daemon=True).start()
 
@@ -161,11 +154,6 @@ class CertificateGate:
         if self._published != before:
             kind: EventKind = "fault" if blocks else "changed" if before else "started"
             self._role.event(kind, self._published)
-
-    def _take_verdict(self, gains: Gains, reference: Reference, verdict: Verdict) -> None:
-        if self._now == (gains, reference):
-            self._verdict = verdict
-            self.publish()
 
     def _cached(self, gains: Gains, reference: Reference) -> Verdict | None:
         return next((entry[2] for entry in tuple(self._cache) if entry[:2] == (gains, reference)), None)

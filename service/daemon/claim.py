@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import uuid
+from contextlib import suppress
 from typing import Final
 
 import zenoh
@@ -30,13 +31,7 @@ class SessionLostError(AeroloopError):
 
 
 class ClaimClient:
-    """Claims one vehicle.
-
-    Args:
-        role: The controller's; its name must be unique, because the plant identifies its holder by it.
-        loop: The grid.
-        wire: Format of the frames.
-        auto_arm: Whether to arm the plant with every claim.
+    """Claims one vehicle. The role's name must be unique: the plant identifies its holder by it.
 
     Attributes:
         auto_arm: As given; may change.
@@ -99,15 +94,10 @@ class ClaimClient:
             if reply.ok is None:
                 continue
             payload = reply.ok.payload.to_bytes()
-            for model in (Grant, Refusal):
-                try:
-                    return model.model_validate_json(payload)
-                except ValidationError:
-                    continue
-            try:
-                return Refusal(reason=Answer.model_validate_json(payload).text)
-            except ValidationError:
-                continue
+            for model in (Grant, Refusal, Answer):
+                with suppress(ValidationError):
+                    read = model.model_validate_json(payload)
+                    return Refusal(reason=read.text) if isinstance(read, Answer) else read
         return None
 
 

@@ -50,15 +50,7 @@ State, Trigger = ControllerState, ControllerTrigger
 
 
 class Daemon:
-    """The controller end as a process.
-
-    Args:
-        role: Its presence on the network; its name must be unique, because the plant identifies its holder by it.
-        loop: The grid.
-        wire: Format of the frames.
-        law: Parameters and gains.
-        reference: The initial reference.
-        settings: Its own settings.
+    """The controller end as a process. The role's name must be unique: the plant identifies its holder by it.
 
     Raises:
         ValueError: The law's B cannot be inverted.
@@ -186,15 +178,10 @@ class Daemon:
     def _record(self, now: PlantTick, command: bytes | None, sent_ns: int) -> None:
         """Add a row to the trace. A command that repeats the last one is silent, in lockstep too."""
         sent_as = Sent.NONE if command is None else Sent.FRAME if command else Sent.SILENT
-        self._trace.controller_row(
-            max(now.tick, 0),
-            now.received_as,
-            sent_as,
-            now.at_ns,
-            sent_ns if command is not None else 0,
-            now.frame,
-            command or b"",
-        )
+        if command is None:
+            sent_ns = 0
+        tick = max(now.tick, 0)
+        self._trace.controller_row(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
         self._publish_trace_when_due()
 
     def _publish_trace_when_due(self) -> None:
@@ -207,18 +194,19 @@ class Daemon:
         return not self._role.stop.is_set() and self._machine.state not in (State.HOLDING, State.FAULTED)
 
     def _account(self, command: bytes | None, now: PlantTick) -> None:
-        tick = now.tick
+        tick, session = now.tick, self._claims.session
+        assert session is not None
         self._ticks += 1
         if now.frame != SILENCE:
             self._received += 1
         self._skipped += now.missed
         if now.missed >= STALL_TICKS:
-            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", self._claims.session, tick)
+            self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", session, tick)
         if command is not None:
             self._sent += command != SILENCE
             self._advance_state(tick)
         if self._controller.tick_index == tick and tick % self._telemetry_every == 0:
-            self._publish_telemetry()
+            self._role.publish("telemetry", telemetry_of(self._controller, session))
         self._publish_when_due()
 
     def _advance_state(self, tick: int) -> None:
@@ -256,12 +244,13 @@ class Daemon:
         link = self._claims.claim()
         if link is None:
             return None
-        self._granted = self._plant is not None and self._plant.session == self._claims.session
+        session = self._claims.session
+        assert session is not None
+        self._granted = self._plant is not None and self._plant.session == session
         self._machine.fire(Trigger.GRANT)
-        assert self._claims.session is not None
-        self._trace.session = self._claims.session
+        self._trace.session = session
         self._trace.state = self._controller.state.model_dump(mode="json")
-        self._changes.begin(self._controller, self._claims.session)
+        self._changes.begin(self._controller, session)
         return link
 
     def _is_lost(self, silent_s: float) -> str | None:
@@ -352,10 +341,6 @@ class Daemon:
         return self._controller.tick_index if self._controller.tick_index >= 0 else None
 
     # ── publications ──
-
-    def _publish_telemetry(self) -> None:
-        assert self._claims.session is not None
-        self._role.publish("telemetry", telemetry_of(self._controller, self._claims.session))
 
     def _publish_when_due(self) -> None:
         if time.monotonic_ns() >= self._status_due:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from math import degrees, radians
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from pydantic import ValidationError
@@ -19,7 +19,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.operator import Answer, Change, Gains, Hold, Points, Reference, Setpoint, Stream, Track
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.wire.attitude import Vector, distance, to_euler
+from aeroloop.protocol.wire.attitude import distance, to_euler
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import FollowError, Limits, Plan
@@ -131,8 +131,7 @@ class OperatorChanges:
         controller.set_gains(self._gains)
         controller.motion.follow(Plan.of(self._reference), 0.0, 0.0)
         self._started_near = False
-        first = Change(session=session, tick=0, gains=self._gains, reference=self._reference)
-        self._trace.changes.append(first)
+        self._trace.changes.append(Change(session=session, tick=0, gains=self._gains, reference=self._reference))
 
     def end(self) -> None:
         """End the session."""
@@ -271,25 +270,8 @@ class OperatorChanges:
             raise FollowError(f"{self._role.name} does not have {self._role.vehicle}, so there is nothing to change")
         return self._controller
 
-    def _record(
-        self,
-        *,
-        gains: Gains | None = None,
-        reference: Reference | None = None,
-        within_s: float = 0.0,
-        ease_s: float = 0.0,
-        start: Vector | None = None,
-    ) -> None:
-        change = Change(
-            session=self._session,
-            tick=self._k,
-            gains=gains,
-            reference=reference,
-            within_s=within_s,
-            ease_s=ease_s,
-            start=start,
-        )
-        self._trace.changes.append(change)
+    def _record(self, **change: Any) -> None:
+        self._trace.changes.append(Change(session=self._session, tick=self._k, **change))
 
 
 class GainsChange:

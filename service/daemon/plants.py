@@ -10,12 +10,7 @@ from aeroloop.service.daemon.reload import reload_on_hangup
 
 
 def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> None:
-    """Run the configured plant end until the role's `stop` is set.
-
-    Args:
-        role: Its presence on the network.
-        settings: The configuration.
-        load: Reads it again, on SIGHUP.
+    """Run the configured plant end until the role's `stop` is set; `load` reads the configuration again, on SIGHUP.
 
     Raises:
         AeroloopError: It cannot run, in one line.

@@ -30,9 +30,9 @@ LIVE: Final = {
 """By role, the keys and sections that take effect at once."""
 
 _SECTIONS: Final = {
-    "controller": ("vehicle", "loop", "wire", "law", "reference", "controller", "network"),
-    "plant": ("vehicle", "loop", "wire", "plant", "network"),
-    "recorder": ("vehicle", "recorder", "network"),
+    "controller": {"vehicle", "loop", "wire", "law", "reference", "controller", "network"},
+    "plant": {"vehicle", "loop", "wire", "plant", "network"},
+    "recorder": {"vehicle", "recorder", "network"},
 }
 """By role, the sections that it uses."""
 
@@ -54,8 +54,7 @@ def reload_on_hangup(
         promise: Returns the certificate of an effective configuration, for the description. Raises an AeroloopError
             where the theorem must hold and does not; then nothing changes.
     """
-    current = settings
-    effective = settings.description()
+    current, effective = settings, settings.description()
 
     def reload() -> Action:
         nonlocal current, effective
@@ -87,23 +86,17 @@ def _with_live_keys(effective: dict[str, Any], after: dict[str, Any], role: str)
 
 def differences(before: Settings, after: Settings, role: str) -> list[str]:
     """The changes for a role, a line per key: old value, new value, and whether it needs a restart."""
-    old, new = (_flat(settings.description(), _SECTIONS[role]) for settings in (before, after))
-    lines = []
-    for key in sorted(old.keys() | new.keys()):
-        if old.get(key) != new.get(key):
-            live = any(key == name or key.startswith(f"{name}.") for name in LIVE[role])
-            line = f"{key}: {old.get(key)} → {new.get(key)}"
-            lines.append(line if live else f"{line}, after a restart")
-    return lines
+    old, new = (_flat(settings.model_dump(mode="json", include=_SECTIONS[role])) for settings in (before, after))
+    live = tuple(f"{name}." for name in LIVE[role])
+    return [
+        f"{key}: {old.get(key)} → {new.get(key)}" + ("" if f"{key}.".startswith(live) else ", after a restart")
+        for key in sorted(old.keys() | new.keys())
+        if old.get(key) != new.get(key)
+    ]
 
 
-def _flat(tree: dict[str, Any], sections: tuple[str, ...], prefix: str = "") -> dict[str, Any]:
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     leaves: dict[str, Any] = {}
     for name, value in tree.items():
-        if not prefix and name not in sections:
-            continue
-        if isinstance(value, dict):
-            leaves |= _flat(value, sections, f"{prefix}{name}.")
-        else:
-            leaves[prefix + name] = value
+        leaves |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return leaves

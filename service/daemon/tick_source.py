@@ -84,11 +84,7 @@ class TickSource:
         self.tick = -1
 
     def next(self, timeout_s: float) -> PlantTick | None:
-        """The next tick, or None if there is none in time.
-
-        Args:
-            timeout_s: The longest to wait [s].
-        """
+        """The next tick, or None if there is none within `timeout_s` [s]."""
         arrival = self._receive(timeout_s)
         if arrival is None:
             return self._silence()
@@ -101,8 +97,8 @@ class TickSource:
         self._last_read = tick
         late_ns = self._ticks.late_ns(tick, arrival.at_ns)
         stale = late_ns > self._stale_ns
-        # The newer frame or silence wins: then the tick of this frame is missed.
-        if stale or (self._sparse and (tick <= self.tick or self._link.pending or self._is_over(tick))):
+        # The newer frame, or the silence of the next tick, wins: then the tick of this frame is missed.
+        if stale or (self._sparse and (tick <= self.tick or self._link.pending or self._last_over() > tick)):
             return self._not_a_tick(tick, arrival, Received.LATE, late_ns, fresh=not stale)
         return self._as_tick(tick, arrival, Received.FRAME, late_ns, fresh=True)
 
@@ -133,10 +129,6 @@ class TickSource:
     def _last_over(self) -> int:
         """The last tick that is silent if it has no frame by now."""
         return self._ticks.tick_at(time.monotonic_ns() - self._patience_ns)
-
-    def _is_over(self, tick: int) -> bool:
-        """Whether the next tick's time for a frame is over, too."""
-        return self._last_over() > tick
 
     def _not_a_tick(
         self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool

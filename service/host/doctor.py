@@ -50,13 +50,8 @@ class Diagnosis(BaseModel):
 
 
 def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None) -> Diagnosis:
-    """Check the settings, then run the trial.
-
-    Args:
-        loop: The grid and the real-time set-up.
-        progress: Called five times a second with the elapsed time of the trial [s].
-    """
-    findings = [_clock(), _priority_limit(), _memory_limit(), _throttling(), _governor()]
+    """Check the settings, then run the trial; `progress` is called five times a second with its elapsed time [s]."""
+    findings = _settings()
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     findings += [Finding(what="set-up", good=False, found=line, advice="run it as a service") for line in refusals]
     timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
@@ -90,53 +85,44 @@ def _read(path: str) -> str | None:
         return None
 
 
-def _clock() -> Finding:
-    source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-    return Finding(
-        what="clock source",
-        good=source in GOOD_CLOCKS,
-        found=source or "not reported by this kernel",
-        advice="reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
-    )
-
-
-def _priority_limit() -> Finding:
-    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+def _settings() -> list[Finding]:
+    """The kernel's settings and this process's limits."""
     root = os.geteuid() == 0
-    return Finding(
-        what="real-time priority",
-        good=root or soft != 0,
-        found="root may" if root else f"limit {soft}",
-        advice="give the user LimitRTPRIO=10 (systemd), or 'rtprio 10' in /etc/security/limits.d",
-    )
-
-
-def _memory_limit() -> Finding:
-    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    root = os.geteuid() == 0
-    return Finding(
-        what="locked memory",
-        good=root or soft == resource.RLIM_INFINITY,
-        found="root may" if root else "no limit" if soft == resource.RLIM_INFINITY else f"limit {soft // 1024} KiB",
-        advice="give the user LimitMEMLOCK=infinity (systemd), or 'memlock unlimited' in /etc/security/limits.d",
-    )
-
-
-def _throttling() -> Finding:
+    priority, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    memory, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    unlimited = memory == resource.RLIM_INFINITY
+    clock = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     runtime = _read("/proc/sys/kernel/sched_rt_runtime_us")
-    return Finding(
-        what="real-time throttling",
-        good=runtime is not None,
-        found="off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not reported",
-        advice="the kernel does not report how much time real-time tasks may take",
-    )
-
-
-def _governor() -> Finding:
     governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-    return Finding(
-        what="CPU frequency",
-        good=governor in (None, "performance"),
-        found=governor or "not scaled by this kernel",
-        advice="set the governor to performance: cpupower frequency-set -g performance",
-    )
+    return [
+        Finding(
+            what="clock source",
+            good=clock in GOOD_CLOCKS,
+            found=clock or "not reported by this kernel",
+            advice="reading the clock may be slow; boot with clocksource=tsc if the CPU has a stable one",
+        ),
+        Finding(
+            what="real-time priority",
+            good=root or priority != 0,
+            found="root may" if root else f"limit {priority}",
+            advice="give the user LimitRTPRIO=10 (systemd), or 'rtprio 10' in /etc/security/limits.d",
+        ),
+        Finding(
+            what="locked memory",
+            good=root or unlimited,
+            found="root may" if root else "no limit" if unlimited else f"limit {memory // 1024} KiB",
+            advice="give the user LimitMEMLOCK=infinity (systemd), or 'memlock unlimited' in /etc/security/limits.d",
+        ),
+        Finding(
+            what="real-time throttling",
+            good=runtime is not None,
+            found="off" if runtime == "-1" else f"{runtime} µs of each second's million" if runtime else "not reported",
+            advice="the kernel does not report how much time real-time tasks may take",
+        ),
+        Finding(
+            what="CPU frequency",
+            good=governor in (None, "performance"),
+            found=governor or "not scaled by this kernel",
+            advice="set the governor to performance: cpupower frequency-set -g performance",
+        ),
+    ]

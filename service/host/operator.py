@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.operator import Answer, Ask, Gains, Message, Points, Track
+from aeroloop.protocol.messages.operator import Answer, Ask, Message, Points
 from aeroloop.protocol.transport.network import NetworkSettings, join
 
 GATHER_S: Final = 1.0
@@ -62,40 +62,23 @@ def gather(network: NetworkSettings) -> Statuses:
     return found
 
 
-def arm(network: NetworkSettings, vehicle: str) -> str:
-    """Arm a plant, so that the next claim is granted, and recall controllers that are holding or faulted.
+def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
+    """Send a command to a vehicle's plant (`arm`, `stop`) or controller (`stand_down`, `set_gains`, `track`).
+
+    `arm` also recalls controllers that are holding or faulted.
 
     Returns:
         What was done, in one line.
 
     Raises:
         NetworkError: The network cannot be joined.
-        OperatorError: No plant answers, or a controller holds it.
+        OperatorError: No role answers, or it refuses.
     """
     with join(network) as session:
-        text = _query(session, network, vehicle, "arm", Ask())
-        recalled = [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
-        return "; ".join([text, *recalled])
-
-
-def stop(network: NetworkSettings, vehicle: str) -> str:
-    """Stop a plant: 0 V at its next tick, and no claim until it is armed. Raises as `arm` does."""
-    return _send(network, vehicle, "stop", Ask())
-
-
-def release(network: NetworkSettings, vehicle: str) -> str:
-    """Let the controller of a vehicle release it and hold until `arm`. Raises as `arm` does."""
-    return _send(network, vehicle, "stand_down", Ask())
-
-
-def set_gains(network: NetworkSettings, vehicle: str, gains: Gains) -> str:
-    """Let the controller of a vehicle use other gains from its next tick on. Raises as `arm` does."""
-    return _send(network, vehicle, "set_gains", gains)
-
-
-def track(network: NetworkSettings, vehicle: str, track: Track) -> str:
-    """Let the controller of a vehicle follow another reference. Raises as `arm` does."""
-    return _send(network, vehicle, "track", track)
+        texts = [_query(session, network, vehicle, topic, message)]
+        if topic == "arm":
+            texts += [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
+        return "; ".join(texts)
 
 
 def read_points(path: Path) -> Points:
@@ -106,11 +89,10 @@ def read_points(path: Path) -> Points:
     """
     times: list[float] = []
     attitudes: list[tuple[float, float, float]] = []
-    number = 1
+    number = 1  # of the line
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file)
-            first = True
+            rows, first = csv.reader(file), True
             while True:
                 number = rows.line_num + 1  # of the next row, should it be unreadable
                 if (row := next(rows, None)) is None:
@@ -153,11 +135,6 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    with join(network) as session:
-        return _query(session, network, vehicle, topic, message)
 
 
 def _query(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:

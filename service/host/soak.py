@@ -18,13 +18,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import Settings
 from aeroloop.service.recording.rolling import parts
-from aeroloop.service.testing.process_group import (
-    ProcessGroup,
-    ProcessGroupError,
-    RoleName,
-    free_rendezvous,
-    private_bus,
-)
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, standalone
 
 ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 WARM_UP: Final = 0.1
@@ -70,30 +64,13 @@ class Soak(BaseModel):
     log_mb: float
 
 
-def run_soak(
-    settings: Settings, minutes: float, log: Path, progress: Callable[[float, Minute], None] | None = None
-) -> Soak:
-    """Run controller, emulator and recorder and sample them.
-
-    Args:
-        settings: The configuration; the rendezvous is replaced by a free one.
-        minutes: How long [min].
-        log: Where the recorder writes.
-        progress: Called once a sample with the seconds reached and the sample.
+def run_soak(settings: Settings, minutes: float, log: Path, progress: Callable[[float], None] | None = None) -> Soak:
+    """Run controller, emulator and recorder on a network of their own; `progress` is called at each sample [s].
 
     Raises:
         ProcessGroupError: A process did not start, or failed, or the log exists.
     """
-    if parts(log):
-        raise ProcessGroupError(f"{log} exists, and a log is never written over; name another with --log PATH")
-    settings = settings.model_copy(
-        update={
-            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
-            "controller": settings.controller.model_copy(update={"require_recorder": True, "auto_arm": True}),
-            "can": private_bus(settings.can),
-            "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
-        }
-    )
+    settings = standalone(settings, log)
     statuses: dict[str, Status] = {}
     sessions: list[str] = []
 
@@ -116,10 +93,9 @@ def run_soak(
         while (reached := time.monotonic() - start) < total_s:
             time.sleep(min(every_s, total_s - reached))
             processes.check()
-            sample = _sample(processes, statuses, time.monotonic() - start)
-            samples.append(sample)
+            samples.append(_sample(processes, statuses, time.monotonic() - start))
             if progress is not None:
-                progress(sample.at_s, sample)
+                progress(samples[-1].at_s)
     return Soak(
         rate_hz=settings.loop.rate_hz,
         minutes=samples,
@@ -162,8 +138,7 @@ def _findings(samples: list[Minute], sessions: list[str]) -> list[str]:
         first, last = settled[0].usage[role], settled[-1].usage[role]
         if last.memory_mb > first.memory_mb * (1 + MAX_GROWTH):
             found.append(f"the {role}'s memory grew from {first.memory_mb:.1f} to {last.memory_mb:.1f} MB")
-        if last.threads > first.threads:
-            found.append(f"the {role}'s threads grew from {first.threads} to {last.threads}")
-        if last.files > first.files:
-            found.append(f"the {role}'s open files grew from {first.files} to {last.files}")
+        for what, before, after in (("threads", first.threads, last.threads), ("open files", first.files, last.files)):
+            if after > before:
+                found.append(f"the {role}'s {what} grew from {before} to {after}")
     return found

@@ -60,9 +60,7 @@ def unit(name: str, executable: str) -> str:
 
 def install(folder: Path, executable: str) -> list[Path]:
     """Write every unit into a folder and return their paths. Raises OSError if it cannot be written."""
-    paths = []
-    for name in UNITS:
-        path = folder / f"aeroloop-{name}.service"
+    paths = {name: folder / f"aeroloop-{name}.service" for name in UNITS}
+    for name, path in paths.items():
         path.write_text(unit(name, executable))
-        paths.append(path)
-    return paths
+    return list(paths.values())

@@ -104,18 +104,11 @@ class Burden(BaseModel):
 
 
 class Observation(NamedTuple):
-    """Result of a cell's experiment.
-
-    Attributes:
-        figures: Its figures of merit; None if the loop ended early.
-        traffic: Measurements and commands under each policy.
-        zenoh: Bytes on a Zenoh link under each policy, if they were counted.
-        reason: Why there are no figures.
-    """
+    """Result of a cell's experiment; without figures if the loop ended early."""
 
     figures: Figures | None
-    traffic: dict[Policy, tuple[Traffic, Traffic]]
-    zenoh: dict[Policy, LinkBytes]
+    traffic: dict[Policy, tuple[Traffic, Traffic]]  # measurements and commands
+    zenoh: dict[Policy, LinkBytes]  # bytes on a Zenoh link, if they were counted
     reason: str | None = None
 
 
@@ -143,24 +136,19 @@ def measure_burden(
     with Workers() as workers:
         results = workers.each(observe, jobs, lambda done: report(done, len(jobs)))
     points = [point for cell, result in zip(cells, results, strict=True) for point in _points(cell, result)]
+    sensors = dict.fromkeys(cell.sensors for cell in cells)
     return Burden(
         duration_s=duration_s,
         rate_hz=settings.loop.rate_hz,
         heartbeat_s=_heartbeat(settings) * settings.loop.period,
         counter_bits=settings.wire.counter_bits,
-        sensors={name: SENSORS[name].text for name in dict.fromkeys(cell.sensors for cell in cells)},
-        points=[p for name in dict.fromkeys(cell.sensors for cell in cells) for p in _beside_float64(points, name)],
+        sensors={name: SENSORS[name].text for name in sensors},
+        points=[point for name in sensors for point in _beside_float64(points, name)],
     )
 
 
 def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observation:
-    """Run one cell.
-
-    Args:
-        config: Dump of a configuration that sends at every tick.
-        duration_s: Length of the run [s].
-        counted: Whether its bytes on a Zenoh link are counted, too.
-    """
+    """Run one cell for `duration_s` [s]; `config` dumps a configuration that sends at every tick."""
     settings = Settings.model_validate(config)
     measurements: list[bytes] = []
     commands: list[bytes] = []
@@ -180,10 +168,8 @@ def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observa
     zenoh: dict[Policy, LinkBytes] = {}
     for policy in POLICIES:
         out, inp = (sent_ticks(codes, policy, heartbeat, counters) for codes in (measured, commanded))
-        rates[policy] = (
-            traffic(measured, wire.measurement, out, period),
-            traffic(commanded, wire.command, inp, period),
-        )
+        measurement = traffic(measured, wire.measurement, out, period)
+        rates[policy] = measurement, traffic(commanded, wire.command, inp, period)
         if counted:
             zenoh[policy] = count_bytes(settings.network, [measurements[k] for k in out], [commands[k] for k in inp])
     return Observation(figures, rates, zenoh)
@@ -200,24 +186,16 @@ def _heartbeat(settings: Settings) -> int:
 
 
 def _points(cell: BurdenCell, found: Observation) -> list[Point]:
-    def point(policy: Policy, **figures: Any) -> Point:
-        return Point(
-            bits_out=cell.bits_out,
-            bits_in=cell.bits_in,
-            quantizer=cell.quantizer,
-            sensors=cell.sensors,
-            transmit=policy,
-            **figures,
-        )
-
+    choice = {name: getattr(cell, name) for name in ("bits_out", "bits_in", "quantizer", "sensors")}
     if found.figures is None:
-        return [point(policy, reason=found.reason) for policy in POLICIES]
+        return [Point(**choice, transmit=policy, reason=found.reason) for policy in POLICIES]
     points = []
     for policy, (measurement, command) in found.traffic.items():
         counted, seconds = found.zenoh.get(policy), found.figures.duration_s
         points.append(
-            point(
-                policy,
+            Point(
+                **choice,
+                transmit=policy,
                 z_track=found.figures.z_track,
                 u_total=found.figures.u_total,
                 measurement=measurement,

@@ -7,7 +7,8 @@ next. So besides one kind of quantizer for all signals, one choice has hysteresi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from itertools import product
 from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import ValidationError
@@ -17,6 +18,8 @@ from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Transmit
 from aeroloop.service.config import Settings
+
+_Bits = tuple[int | None, int | None]  # out and in; None is float64
 
 BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
 FLOAT64: Final = (None, None)
@@ -34,12 +37,7 @@ class BurdenError(AeroloopError):
 
 
 class SensorChoice(NamedTuple):
-    """A choice of sensors.
-
-    Attributes:
-        text: Description for a person.
-        changes: Fields of `plant.sensors`.
-    """
+    """A choice of sensors: a description for a person, and fields of `plant.sensors`."""
 
     text: str
     changes: dict[str, Any]
@@ -93,14 +91,14 @@ def grid(
     if settings.plant.ideal:
         raise BurdenError("plant.ideal has no sensors to choose: leave it out and give --sensors perfect")
     pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
-    kinds = [_one_of("--quantizer", name, tuple(QUANTIZERS)) for name in dict.fromkeys(quantizers)] or list(QUANTIZERS)
-    levels = [_one_of("--sensors", name, tuple(SENSORS)) for name in dict.fromkeys(sensors)] or list(SENSORS)
+    kinds = _chosen("--quantizer", quantizers, QUANTIZERS)
+    levels = _chosen("--sensors", sensors, SENSORS)
     counted_with = "encoders" if "encoders" in levels else levels[0]
+    choices: list[tuple[_Bits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
     cells = [
         BurdenCell(*pair, kind, level, pair in COUNTED and kind in (None, kinds[0]) and level == counted_with)
         for level in levels
-        for pair, of_kinds in (*((pair, kinds) for pair in pairs), (FLOAT64, [None]))
-        for kind in of_kinds
+        for pair, kind in choices
     ]
     for cell in cells:
         cell_settings(settings, cell)
@@ -141,19 +139,19 @@ def _quantized(signal: SignalSpec, bits: int | None, kind: Kind | None) -> Signa
     return SignalSpec(bits=bits, limit=signal.limit, kind=kind)
 
 
-def _pair(text: str) -> tuple[int | None, int | None]:
+def _pair(text: str) -> _Bits:
     words = text.split("/") if text != "cont" else [text] * 2
-    if len(words) != 2 or not all(_is_bits(word) for word in words):
+    if len(words) != 2 or not all(
+        word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS) for word in words
+    ):
         raise BurdenError(f"--bits takes bits out and in, {MIN_BITS} to {MAX_BITS} or cont, such as 8/6, not {text!r}")
     out, inp = (None if word == "cont" else int(word) for word in words)
     return out, inp
 
 
-def _is_bits(word: str) -> bool:
-    return word == "cont" or (word.isdecimal() and MIN_BITS <= int(word) <= MAX_BITS)
-
-
-def _one_of(option: str, name: str, choices: Sequence[Any]) -> Any:
-    if name not in choices:
-        raise BurdenError(f"{option} takes {', '.join(choices)}, not {name!r}")
-    return name
+def _chosen(option: str, names: Sequence[str], choices: Collection[str]) -> list[str]:
+    """The names without repetitions, or all choices if there are none."""
+    for name in names:
+        if name not in choices:
+            raise BurdenError(f"{option} takes {', '.join(choices)}, not {name!r}")
+    return list(dict.fromkeys(names or choices))

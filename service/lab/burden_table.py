@@ -79,16 +79,10 @@ def _rows(burden: Burden, sensors: str) -> Iterator[list[str]]:
     for always, changed in zip(points[::2], points[1::2], strict=True):
         label = short_name(always.quantizer) if always.quantizer else "float64"
         ratios = always.against_float64
-        if (
-            ratios is None
-            or always.z_track is None
-            or always.u_total is None
-            or changed.measurement is None
-            or changed.command is None
-        ):
+        out, inp = changed.measurement, changed.command
+        if ratios is None or always.z_track is None or always.u_total is None or out is None or inp is None:
             yield [always.bits, label, *["–"] * (len(HEADER) - 2)]
             continue
-        out, inp = changed.measurement, changed.command
         yield [
             always.bits,
             label,
@@ -149,31 +143,25 @@ def _name(point: Point) -> str:
     return f"{point.bits} {short_name(point.quantizer)}" if point.quantizer else "float64"
 
 
-def _counted_kbit(burden: Burden, bits: int) -> str:
-    """Rate of a counter of `bits` bits at every tick, both directions together [kbit/s]."""
-    return f"{2 * bits * burden.rate_hz / 1e3:g}"
-
-
 def _notes(burden: Burden) -> Iterator[str]:
-    rate, period = burden.rate_hz, 1e3 / burden.rate_hz
+    rate, bits, saved = burden.rate_hz, burden.counter_bits, STAMP_BYTES * burden.rate_hz / 1e3
     yield (
         f"{burden.duration_s:g} s each; of two numbers the first is measurements, the second commands; × and % are of "
         "float64 at every tick; ★ is on the Pareto front of z_track against payload bits."
     )
     yield (
-        f"Every tick: {rate:g} + {rate:g} frames/s, {period:g} ms apart. On change: at least every "
+        f"Every tick: {rate:g} + {rate:g} frames/s, {1e3 / rate:g} ms apart. On change: at least every "
         f"{burden.heartbeat_s * 1e3:g} ms. CAN: a classic bus of 1 Mbit/s and its load, worst-case stuffing, without "
         "heartbeats."
     )
-    bits = burden.counter_bits
-    shorter = f"; {MIN_COUNTER_BITS} bits would carry {_counted_kbit(burden, MIN_COUNTER_BITS)}"
+    shorter = f"; {MIN_COUNTER_BITS} bits would carry {2 * MIN_COUNTER_BITS * rate / 1e3:g}"
     yield (
-        f"The counter has {bits} bits: at every tick {rate:g} + {rate:g} frames/s carry {_counted_kbit(burden, bits)} "
+        f"The counter has {bits} bits: at every tick {rate:g} + {rate:g} frames/s carry {2 * bits * rate / 1e3:g} "
         f"kbit/s of it{shorter if bits > MIN_COUNTER_BITS else ''}, padding apart."
     )
     yield (
         f"A frame carries no time and no sender's number, {STAMP_BYTES} bytes on a Zenoh link: every tick, that saves "
-        f"{STAMP_BYTES * rate / 1e3:.1f} + {STAMP_BYTES * rate / 1e3:.1f} kB/s."
+        f"{saved:.1f} + {saved:.1f} kB/s."
     )
     if any(part and part.can_frames > 1 for point in burden.points for part in (point.measurement, point.command)):
         yield (

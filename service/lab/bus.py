@@ -20,10 +20,7 @@ _UNSTUFFED: Final = 13
 
 
 def classic_frame_bits(data_bytes: int) -> int:
-    """Bits of one classic frame with worst-case stuffing, interframe space included.
-
-    Args:
-        data_bytes: 0…8.
+    """Bits of one classic frame of 0…8 data bytes with worst-case stuffing, interframe space included.
 
     Raises:
         ValueError: A classic frame does not hold so many bytes.
@@ -35,11 +32,7 @@ def classic_frame_bits(data_bytes: int) -> int:
 
 
 def classic_frames(size: int) -> list[int]:
-    """Data bytes of each classic frame that a frame of the loop fills.
-
-    Args:
-        size: Bytes of the loop's frame, ≥ 1.
-    """
+    """Data bytes of each classic frame that a frame of the loop of `size` ≥ 1 bytes fills."""
     full, rest = divmod(size, CLASSIC_BYTES)
     return [CLASSIC_BYTES] * full + [rest] * (rest > 0)
 

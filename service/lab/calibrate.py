@@ -49,11 +49,7 @@ class CalibrationError(AeroloopError):
 
 
 def calibrate(settings: Settings, progress: Callable[[int], None] | None = None) -> Calibration:
-    """Fit the plant, then the wind.
-
-    Args:
-        settings: The configuration; the search starts from its values of the fitted parameters.
-        progress: Called with the number of experiments done.
+    """Fit the plant, then the wind, from the configured values on. `progress` is called with the experiments done.
 
     Raises:
         CalibrationError: A cell is not reached within MAX_ROUNDS.
@@ -85,15 +81,10 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
             raise CalibrationError(f"the {air} cell is not reached after {MAX_ROUNDS} rounds, last at {reached}")
 
         plant = settings.plant
-        x, calm = fit(
-            lambda p: _with_body(settings, p),
-            (plant.friction.coulomb[1], plant.aero.centre_of_mass[2]),
-            (1e-4, 2e-5),
-            "calm",
-        )
+        start = plant.friction.coulomb[1], plant.aero.centre_of_mass[2]
+        x, calm = fit(lambda p: _with_body(settings, p), start, (1e-4, 2e-5), "calm")
         body = _with_body(settings, x.tolist())
         w, windy = fit(lambda p: _with_wind(body, p), plant.wind.torque[:2], (5e-4, 5e-4), "wind")
-    figures = {"calm": calm, "wind": windy}
     return Calibration(
         yaw_coulomb=x[0],
         centre_of_mass_height=x[1],
@@ -101,9 +92,9 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
         calm={"z_track": calm[0], "u_total": calm[1]},
         windy={"z_track": windy[0], "u_total": windy[1]},
         residuals={
-            f"{air} {name}": float(reached / published[air][key] - 1)
-            for air, pair in figures.items()
-            for name, key, reached in zip(("z_track", "u_total"), ("z_track_1e-4", "u_total"), pair, strict=True)
+            f"{air} {name.removesuffix('_1e-4')}": float(reached / published[air][name] - 1)
+            for air, pair in (("calm", calm), ("wind", windy))
+            for name, reached in zip(("z_track_1e-4", "u_total"), pair, strict=True)
         },
         runs=runs,
     )

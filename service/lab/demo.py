@@ -20,7 +20,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.host.bandwidth import PayloadRate
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.process_group import ProcessGroup, ProcessGroupError, free_rendezvous, private_bus
+from aeroloop.service.testing.process_group import ProcessGroup, standalone
 
 REFRESH_S = 0.1
 
@@ -87,18 +87,7 @@ def run_demo(
         ReviewError: The log cannot be reviewed.
     """
     path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
-    if parts(path):
-        raise ProcessGroupError(f"{path} exists, and a log is never written over; name another with --log PATH")
-    settings = settings.model_copy(
-        update={
-            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
-            "controller": settings.controller.model_copy(
-                update={"duration_s": duration_s, "require_recorder": True, "auto_arm": True}
-            ),
-            "can": private_bus(settings.can),
-            "recorder": settings.recorder.model_copy(update={"path": path.absolute()}),
-        }
-    )
+    settings = standalone(settings, path, duration_s=duration_s)
     progress = Progress(settings)
     interrupted = threading.Event()
     with ProcessGroup(settings) as processes, _on_interrupt(interrupted):

@@ -31,14 +31,8 @@ U_TOTAL: Final = (
 """Table C.3 [V²·s]."""
 
 WIND: Final = {
-    "continuous": {
-        "calm": {"z_track_1e-4": 35, "u_total": 7980},
-        "wind": {"z_track_1e-4": 97, "u_total": 9241},
-    },
-    "quantized_8_6": {
-        "calm": {"z_track_1e-4": 49, "u_total": 8042},
-        "wind": {"z_track_1e-4": 119, "u_total": 9699},
-    },
+    "continuous": {"calm": {"z_track_1e-4": 35, "u_total": 7980}, "wind": {"z_track_1e-4": 97, "u_total": 9241}},
+    "quantized_8_6": {"calm": {"z_track_1e-4": 49, "u_total": 8042}, "wind": {"z_track_1e-4": 119, "u_total": 9699}},
 }
 """Table C.4."""
 

@@ -17,6 +17,7 @@ from aeroloop.service.lab import paper
 from aeroloop.service.lab.cells import Cell, Pool, Result
 
 CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
+_FIGURES: Final = {"z_track_1e-4": "z_track", "u_total": "u_total"}
 Rows = list[list[float]]
 
 
@@ -55,11 +56,7 @@ def predict(settings: Settings, seeds: int = 1, progress: Callable[[int, int], N
     with Pool() as pool:
         results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
     runs = {cell: results[i * seeds : (i + 1) * seeds] for i, cell in enumerate((*calm, *windy))}
-    return Tables(
-        C2=_grid(runs, "z_track", paper.Z_TRACK),
-        C3=_grid(runs, "u_total", paper.U_TOTAL),
-        C4=_wind(runs),
-    )
+    return Tables(C2=_grid(runs, "z_track", paper.Z_TRACK), C3=_grid(runs, "u_total", paper.U_TOTAL), C4=_wind(runs))
 
 
 _Runs = dict[tuple[int | None, int | None, bool], list[Result]]
@@ -96,10 +93,7 @@ def _wind(runs: _Runs) -> Table:
     def both(value: Callable[[Sequence[Result], str], float]) -> dict[str, dict[str, dict[str, float]]]:
         return {
             case: {
-                air: {
-                    "z_track_1e-4": round(value(runs[*bits, windy], "z_track"), 2),
-                    "u_total": round(value(runs[*bits, windy], "u_total"), 2),
-                }
+                air: {key: round(value(runs[*bits, windy], name), 2) for key, name in _FIGURES.items()}
                 for air, windy in (("calm", False), ("wind", True))
             }
             for case, bits in CASES.items()
@@ -116,6 +110,10 @@ def _wind(runs: _Runs) -> Table:
     )
 
 
+def _beside(ours: float, theirs: float, spread: float | None, digits: int) -> str:
+    return f"{ours:.{digits}f}{'' if spread is None else f' ±{spread:.{digits}f}'} ({theirs})"
+
+
 def markdown(tables: Tables) -> str:
     """Format the tables as Markdown: ours, with the paper's in brackets."""
     lines: list[str] = []
@@ -127,9 +125,7 @@ def markdown(tables: Tables) -> str:
         lines += [f"**{title}**: ours (paper's)", "", f"| bits in ╲ out | {header} |", "|---" * 5 + "|"]
         for i, inp in enumerate(paper.INPUT_BITS):
             cells = [
-                f"{table.ours[i][j]:.{digits}f}"
-                + (f" ±{table.spread[i][j]:.{digits}f}" if table.spread else "")
-                + f" ({table.paper[i][j]})"
+                _beside(table.ours[i][j], table.paper[i][j], table.spread and table.spread[i][j], digits)
                 for j in range(len(paper.OUTPUT_BITS))
             ]
             lines.append(f"| {'cont' if inp is None else inp} | {' | '.join(cells)} |")
@@ -137,10 +133,9 @@ def markdown(tables: Tables) -> str:
     lines += ["**With and without wind (Table C.4)**: ours (paper's)", "", "| | z_track calm | u_total calm | z_track "
               "wind | u_total wind |", "|---|---|---|---|---|"]  # fmt: skip
     for case, label in (("continuous", "continuous"), ("quantized_8_6", "8 bits out, 6 in")):
+        ours, theirs, spread = (part and part[case] for part in (tables.C4.ours, tables.C4.paper, tables.C4.spread))
         cells = [
-            f"{tables.C4.ours[case][air][name]:.{digits}f}"
-            + (f" ±{tables.C4.spread[case][air][name]:.{digits}f}" if tables.C4.spread else "")
-            + f" ({tables.C4.paper[case][air][name]})"
+            _beside(ours[air][name], theirs[air][name], spread and spread[air][name], digits)
             for air in ("calm", "wind")
             for name, digits in (("z_track_1e-4", 1), ("u_total", 0))
         ]

@@ -35,12 +35,7 @@ class Workers:
         jobs: Iterable[tuple[*Arguments]],
         progress: Callable[[int], None] | None = None,
     ) -> list[Result]:
-        """Results of a function for each tuple of arguments, in their order.
-
-        Args:
-            work: A function at the top level of a module.
-            jobs: Its arguments, one tuple per call.
-            progress: Called with the number done.
+        """Results of a function at the top level of a module for each tuple of arguments, in their order.
 
         Raises:
             Exception: The first exception that the function raised.

@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from types import TracebackType
 from typing import Final, NamedTuple, Self
 
 import zenoh
@@ -22,6 +21,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
 from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.service.testing.process_group import free_rendezvous
 
 _VEHICLE: Final = "aero"
 _SESSION: Final = "1ab0ra70"
@@ -43,10 +43,7 @@ class LinkBytes(NamedTuple):
 
 
 class CountingRelay:
-    """Forwards one TCP connection on loopback and counts its bytes. A context.
-
-    Args:
-        port: Port to forward to.
+    """Forwards one TCP connection to a port on loopback and counts its bytes. A context.
 
     Attributes:
         port: Port to connect to.
@@ -66,9 +63,7 @@ class CountingRelay:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         for one in self._sockets:
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)  # wakes a thread blocked in it; close alone does not
@@ -105,21 +100,16 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
     """Send frames over a Zenoh link, first all of one direction, then all of the other, and count their bytes.
 
     Express messages go one per batch, so their size does not depend on the rate. They are sent as in lockstep, blocking
-    rather than dropping; that sets one bit and adds no byte.
-
-    Args:
-        network: Settings of both sessions; their addresses are replaced.
-        measurements: Frames of the plant, in order.
-        commands: Frames of the controller, in order.
+    rather than dropping; that sets one bit and adds no byte. The addresses in the settings are replaced.
 
     Raises:
         CountError: A frame did not arrive.
         NetworkError: A session cannot be opened.
     """
-    port = _free_port()
+    address = free_rendezvous()
     here = {"rendezvous": "", "gossip": False}  # two peers need neither, and their bytes would count
-    plant_side = network.model_copy(update={**here, "listen": [f"tcp/127.0.0.1:{port}"], "connect": []})
-    with CountingRelay(port) as relay, join(plant_side) as plant:
+    plant_side = network.model_copy(update={**here, "listen": [address], "connect": []})
+    with CountingRelay(int(address.rpartition(":")[2])) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})
         with join(other_side) as controller:
             to_controller, to_plant = (Mailbox(depth=max(1, len(frames))) for frames in (measurements, commands))
@@ -153,10 +143,3 @@ def _await_declarations(plant: zenoh.Session, controller: zenoh.Session) -> None
         if time.monotonic() > deadline:
             raise CountError("two Zenoh sessions over loopback did not find each other")
         time.sleep(_POLL_S)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

@@ -192,17 +192,9 @@ class BatchController:
         )
         u = found["u"][3 - self._wire.actuators :, :n]
         u[:, np.isnan(u.sum(axis=0))] = nan  # ∞ − ∞ is no number either
-        return (
-            found["q"][:, :n],
-            given["q_d"][:, :n],
-            rates,
-            found["eps_e"][:, :n],
-            found["omega_e"][:, :n],
-            u,
-            given["s"][:, :n],
-            given["C1"][:, :n],
-            found["theta_before"][:, :n],
-        )
+        q, eps_e, omega_e, theta = (found[name] for name in ("q", "eps_e", "omega_e", "theta_before"))
+        columns = q, given["q_d"], rates, eps_e, omega_e, u, given["s"], given["C1"], theta
+        return [column[:, :n] for column in columns]
 
     def _apply(self, change: Change) -> None:
         if change.gains is not None:

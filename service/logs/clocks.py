@@ -37,13 +37,12 @@ class ClockOffset:
     def at(self, forward: Array, backward: Array) -> Array:
         """The offset at ticks in order [ns]; NaN before the first estimate. Shapes (n,).
 
-        Args:
-            forward: As above, NaN where a time is unknown [ns].
-            backward: Likewise.
+        `forward` and `backward` are as above, NaN where a time is unknown [ns].
         """
-        found = np.full(len(forward), self.last_ns)
+        found = np.empty(len(forward))
         edges = [*range(0, max(1, len(forward) - WINDOW // 2), WINDOW), len(forward)]
         for begin, end in pairwise(edges):
+            found[begin:end] = self.last_ns
             there, back = forward[begin:end], backward[begin:end]
             known = np.flatnonzero(~np.isnan(there + back))
             if len(known) >= _LEAST:
@@ -57,8 +56,6 @@ class ClockOffset:
                 slope = float(apart @ (offset - middle)) / spread if spread else 0.0
                 found[begin:end] = base + middle + slope * (np.arange(end - begin) - quick.mean())
                 self.last_ns = float(found[end - 1])
-            else:
-                found[begin:end] = self.last_ns
         known_ns = found[~np.isnan(found)]
         if self.first_ns != self.first_ns and len(known_ns):
             self.first_ns = float(known_ns[0])

@@ -51,16 +51,7 @@ def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array
 
 
 def frames_of(kind: FrameFormat, counters: NDArray[np.int64], codes: Array) -> NDArray[np.uint8]:
-    """Frames of counters and codes, as `pack` builds them.
-
-    Args:
-        kind: Their format.
-        counters: One per frame. Shape (n,).
-        codes: Shape (n, codes).
-
-    Returns:
-        A frame per row. Shape (n, size).
-    """
+    """Frames of counters and codes, as `pack` builds them, a row each. Shapes (n,) and (n, codes) to (n, size)."""
     bits = np.zeros((8 * kind.size, len(counters)), dtype=np.uint8)
     bits[: kind.counter_bits] = counters >> np.arange(kind.counter_bits - 1, -1, -1)[:, np.newaxis] & 1
     at = kind.first_bit

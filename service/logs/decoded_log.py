@@ -21,42 +21,39 @@ from aeroloop.service.viewers.channels import Decoder
 
 
 class Written(NamedTuple):
-    """Messages and topics written, and damages of the log by file."""
+    """Messages and topics written, and what of the log could not be read, a line each."""
 
     messages: int
     topics: list[str]
-    damages: dict[Path, list[Damage]]
+    damages: list[str]
 
 
 def write_decoded(files: LogFiles, out: Path, progress: Callable[[float], None]) -> Written:
-    """Write a run as one log with everything decoded.
+    """Write a run as one log with everything decoded; an existing file is overwritten.
 
-    Args:
-        files: The run.
-        out: The new file; an existing one is overwritten.
-        progress: Called repeatedly with the share done, 0…1.
-
-    Raises:
-        OSError: A file cannot be read or written.
+    Calls `progress` repeatedly with the share done, 0…1. Raises OSError if a file cannot be read or written.
     """
     decoder = Decoder(rate_hz=None)
     for description in files.descriptions.values():
         decoder.configure(description)
-    damages: dict[Path, list[Damage]] = {}
+    damages: list[str] = []
     sizes = [path.stat().st_size for path in files.paths]
     with out.open("wb") as file:
         copy = McapCopy(file, "aeroloop log export")
+        done = 0
+
+        def report(read: int) -> None:
+            progress((done + read) / sum(sizes))
 
         def follow(topic: str) -> Follow | None:
             """None for topics that the recorder decoded: they begin with a slash, as no key can."""
             return None if topic.startswith("/") else partial(_decode, copy, decoder, topics.read_key(topic))
 
-        for i, path in enumerate(files.paths):
+        for path, size in zip(files.paths, sizes, strict=True):
             found: list[Damage] = []
-            done = sum(sizes[:i])
-            copy.file(path, found, lambda read, done=done: progress((done + read) / sum(sizes)), follow)  # type: ignore[misc]  # the default binds it
-            if found:
-                damages[path] = found
+            copy.file(path, found, report, follow)
+            done += size
+            damages += [f"{path}: {damage.what}" for damage in found]
         copy.finish()
     return Written(copy.messages, sorted(copy.topics), damages)
 

@@ -52,7 +52,7 @@ class Evaluator:
         self._settings = settings
         self._controller = self._new_controller()
         self._beside: BatchController | None = None
-        self._dropped = [*(["gains"] if own_gains else []), *(["reference"] if own_reference else [])]
+        self._dropped = {name: None for name, own in (("gains", own_gains), ("reference", own_reference)) if own}
         self._resumes = resumes
         self._holds = settings.wire.transmit.measurement == "on_change"
         self._changes: deque[Change] = deque()
@@ -65,10 +65,7 @@ class Evaluator:
             state = ControllerSnapshot.model_validate(block.state)
             self._controller.restore(state)
             self._held = state.held
-        self._changes += [
-            change.model_copy(update=dict.fromkeys(self._dropped)) if self._dropped else change
-            for change in block.changes
-        ]
+        self._changes += [change.model_copy(update=self._dropped) for change in block.changes]
         rows = block.controller
         if not rows:
             none = np.empty(0, dtype=np.int64)

@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.topics import Address
@@ -28,19 +28,12 @@ from aeroloop.service.logs.traces import Integers, SessionKey
 Format = Literal["parquet", "csv", "mat", "mcap"]
 ALL: Final = "all"
 
-ENDINGS: Final[dict[Format, str]] = {
-    "parquet": ".parquet",
-    "csv": ".csv",
-    "mat": ".mat",
-    "mcap": "-decoded.mcap",
-}
+ENDINGS: Final[dict[Format, str]] = {"parquet": ".parquet", "csv": ".csv", "mat": ".mat", "mcap": "-decoded.mcap"}
 """Ending of a new file's name."""
 
 
-class Exported(BaseModel):
+class Exported(BaseModel, frozen=True):
     """What was exported."""
-
-    model_config = ConfigDict(frozen=True)
 
     out: str
     format: str
@@ -73,40 +66,42 @@ def export(
         ReviewError: The log cannot be read.
     """
     out = out or beside(paths[0], ENDINGS[to])
+    sessions: list[str] | None = None
     try:
         with writing(out) as part:
-            exported = (
-                _log(paths, part, session, progress) if to == "mcap" else _table(paths, to, part, session, progress)
-            )
+            if to == "mcap":
+                from aeroloop.service.logs.decoded_log import write_decoded
+
+                if session is not None:
+                    raise ExportError(
+                        "--session chooses the rows of a table; --to mcap writes the log with all its sessions"
+                    )
+                rows, columns, damages = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
+            else:
+                sessions, rows, columns, damages = _table(paths, to, part, session, progress)
+            size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
-    return exported.model_copy(update={"out": str(out)})
+    return Exported(out=str(out), format=to, sessions=sessions, rows=rows, columns=columns, bytes=size, damages=damages)
 
 
-def _log(paths: Sequence[Path], part: Path, session: str | None, progress: Progress | None) -> Exported:
-    from aeroloop.service.logs.decoded_log import write_decoded
-
-    if session is not None:
-        raise ExportError("--session chooses the rows of a table; --to mcap writes the log with all its sessions")
-    written = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
-    return Exported(
-        out=str(part),
-        format="mcap",
-        sessions=None,
-        rows=written.messages,
-        columns=written.topics,
-        bytes=part.stat().st_size,
-        damages=[f"{path}: {damage.what}" for path, found in written.damages.items() for damage in found],
-    )
-
-
-def _table(paths: Sequence[Path], to: Format, part: Path, session: str | None, progress: Progress | None) -> Exported:
+def _table(
+    paths: Sequence[Path], to: Format, part: Path, session: str | None, progress: Progress | None
+) -> tuple[list[str], int, list[str], list[str]]:
+    """Write a table; returns its sessions, number of rows and columns' names, and what could not be read."""
     run = Run(paths, progress)
     chosen = _chosen(run, session)
     settings = run.files.settings(chosen[0][0])
     table = groups(settings.wire, settings.loop.period)
     names = ["/".join(which) for which in chosen]
-    file = FILES[to](part, table, facts(run.files, settings, names))
+    facts = {
+        "config": settings.description(),
+        "sessions": names,
+        "logs": [str(path) for path in run.files.paths],
+        "recorded_by": {role: found.versions for (_, role), found in run.files.descriptions.items()},
+        "exported_by": versions(),
+    }
+    file = FILES[to](part, table, facts)
     writers = {which: _Writer(which, file, run.files.settings(which[0])) for which in chosen}
 
     def truth(vehicle: str, payload: bytes, _: int) -> None:
@@ -127,15 +122,7 @@ def _table(paths: Sequence[Path], to: Format, part: Path, session: str | None, p
     if not rows:
         raise ExportError(f"{run.files.name} has no answered measurement to export")
     file.close()
-    return Exported(
-        out=str(part),
-        format=to,
-        sessions=names,
-        rows=rows,
-        columns=[column.name for group in table for column in group.columns],
-        bytes=part.stat().st_size,
-        damages=run.files.unread,
-    )
+    return names, rows, [column.name for group in table for column in group.columns], run.files.unread
 
 
 class _Writer:
@@ -190,17 +177,6 @@ def writing(out: Path) -> Iterator[Path]:
         raise ExportError(f"cannot write {out}: {error.strerror or error}") from None
     finally:
         part.unlink(missing_ok=True)
-
-
-def facts(files: LogFiles, settings: Settings, sessions: Sequence[str]) -> dict[str, Any]:
-    """Metadata of an exported file."""
-    return {
-        "config": settings.description(),
-        "sessions": list(sessions),
-        "logs": [str(path) for path in files.paths],
-        "recorded_by": {role: description.versions for (_, role), description in files.descriptions.items()},
-        "exported_by": versions(),
-    }
 
 
 def _chosen(run: Run, session: str | None) -> list[SessionKey]:

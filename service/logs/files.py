@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from mcap.records import Channel, Message, Metadata
-from pydantic import ValidationError
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
@@ -27,8 +26,6 @@ from aeroloop.service.logs.mcap_file import (
     skim,
 )
 from aeroloop.service.logs.traces import SessionKey
-
-METADATA_PREFIX: Final = "aeroloop."
 
 Progress = Callable[[float], None]
 
@@ -112,9 +109,10 @@ class LogFiles:
             return None if address is None else route(address)
 
         read = 0
+        report = None if progress is None else lambda reached: progress((read + reached) / self._size)
         for path in self.paths:
             damages: list[Damage] = []
-            yield from messages(path, wanted, damages, _share_of(progress, read, self._size))
+            yield from messages(path, wanted, damages, report)
             read += path.stat().st_size
             if damages:
                 self.damages[path] = damages
@@ -125,11 +123,7 @@ class LogFiles:
         return [f"{path}: {damage.what}" for path, found in self.damages.items() for damage in found]
 
     def _prelude(self, path: Path) -> int:
-        """Collect descriptions and other metadata.
-
-        Returns:
-            When its first message was recorded [ns].
-        """
+        """Collect descriptions and other metadata; returns when the first message was recorded [ns]."""
         first = 0
         descriptions: set[int] = set()
         damages: list[Damage] = []
@@ -144,13 +138,13 @@ class LogFiles:
                 elif isinstance(record, Metadata):
                     try:
                         self._add_metadata(record, path)
-                    except (ValidationError, ValueError, KeyError) as error:
+                    except (ValueError, KeyError) as error:
                         damages.append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
         except NotMcapError as error:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
             raise ReviewError(f"cannot read {path}: {error.strerror}") from None
-        except (ValidationError, ValueError, KeyError) as error:
+        except (ValueError, KeyError) as error:
             raise ReviewError(f"{path} is not a log of this version: {str(error).splitlines()[0]}") from None
         if damages:
             self.damages[path] = damages
@@ -165,9 +159,9 @@ class LogFiles:
             known = self.changes.setdefault((address.vehicle if address else "", change.session), [])
             if change not in known:  # every file of a rotated run repeats it
                 known.append(change)
-        elif record.name.startswith(METADATA_PREFIX):
+        elif record.name.startswith("aeroloop."):
             content = json.loads(text)
-            self.metadata[record.name.removeprefix(METADATA_PREFIX)] = content if isinstance(content, dict) else {}
+            self.metadata[record.name.removeprefix("aeroloop.")] = content if isinstance(content, dict) else {}
 
     def _add_description(self, text: bytes, path: Path) -> None:
         content = json.loads(text)
@@ -186,19 +180,13 @@ def _is_description(key: str) -> bool:
     return address is not None and address.topic.name == "description"
 
 
-def _share_of(progress: Progress | None, before: int, size: int) -> Callable[[int], None] | None:
-    return None if progress is None else lambda reached: progress((before + reached) / size)
-
-
-def _logs_in(folder: Path) -> list[Path]:
-    """Logs in a folder, without those that `log export --to mcap` wrote there."""
-    return sorted(path for path in folder.glob("*.mcap") if not path.stem.endswith("-decoded"))
-
-
 def _files(paths: Sequence[Path]) -> list[Path]:
+    """Files, and those in folders without what `log export --to mcap` wrote there."""
     files: list[Path] = []
     for path in paths:
-        found = _logs_in(path) if path.is_dir() else [path]
+        found = [path]
+        if path.is_dir():
+            found = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-decoded"))
         if not found:
             raise ReviewError(f"there is no .mcap file in {path}")
         files += found

@@ -20,16 +20,8 @@ Follow = Callable[[Message], None]
 """Called with each message of a channel after it was copied."""
 
 
-def _only_copy(_: Message) -> None:
-    """Do nothing after copying a message."""
-
-
 class McapCopy:
-    """Copies records into a new file.
-
-    Args:
-        out: The file, empty.
-        library: Name of the writing program.
+    """Copies records into a new file, which is empty; `library` is the name of the writing program.
 
     Attributes:
         messages: Messages written.
@@ -51,7 +43,7 @@ class McapCopy:
         path: Path,
         damages: list[Damage],
         progress: Callable[[int], None],
-        follow: Callable[[str], Follow | None] = lambda _: _only_copy,
+        follow: Callable[[str], Follow | None] = lambda _: lambda _: None,
     ) -> None:
         """Copy what a file holds.
 
@@ -88,7 +80,12 @@ class McapCopy:
                     self._metadata[which] = record.metadata
                     self._writer.add_metadata(record.name, record.metadata)
             elif isinstance(record, Attachment):
-                self._attach(record)
+                what = record.name, hashlib.sha256(record.data).digest()
+                if what not in self._attachments:
+                    self._attachments.add(what)
+                    self._writer.add_attachment(
+                        record.create_time, record.log_time, record.name, record.media_type, record.data
+                    )
 
     def add(self, channel: int, log_time: int, publish_time: int, data: bytes, sequence: int = 0) -> None:
         """Add a message; times in ns since 1970."""
@@ -113,11 +110,3 @@ class McapCopy:
     def finish(self) -> None:
         """Write the index. Nothing more can be added."""
         self._writer.finish()
-
-    def _attach(self, record: Attachment) -> None:
-        what = record.name, hashlib.sha256(record.data).digest()
-        if what not in self._attachments:
-            self._attachments.add(what)
-            self._writer.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )

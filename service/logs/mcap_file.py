@@ -51,7 +51,6 @@ MAX_RECORD: Final = 256 << 20
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_AND_ID: Final = struct.Struct("<BQH")  # schemas, channels and messages begin with an id
 _MESSAGE: Final = struct.Struct("<9xHIQQ")
-_NUMBER_AND_TIMES: Final = struct.Struct("<11xIQQ")
 _FOOTER: Final = struct.Struct("<BQQQI")
 _END: Final = _FOOTER.size + len(MAGIC)
 _CRC_BYTES: Final = 4
@@ -135,20 +134,13 @@ def messages(
 ) -> Iterator[Logged[T]]:
     """Messages of some channels, in the file's order.
 
-    Args:
-        path: The file.
-        wanted: Called at the first message of a channel; None drops the channel.
-        damages: What could not be read is appended.
-        progress: Called after each chunk with the bytes read so far.
-
-    Raises:
-        NotMcapError: It is no MCAP file.
-        OSError: It cannot be read.
+    `wanted` is called at the first message of a channel; None drops the channel. The rest is as in `records`, which
+    raises the same errors.
     """
     damages = [] if damages is None else damages
     channels: dict[int, Channel] = {}
     answers: dict[int, T | None] = {}
-    head_of, number_and_times_of = _HEAD_AND_ID.unpack_from, _NUMBER_AND_TIMES.unpack_from
+    head_of, message_of = _HEAD_AND_ID.unpack_from, _MESSAGE.unpack_from
     for offset, data in _pieces(path, damages, progress):
         at, size = 0, len(data)
         try:
@@ -165,7 +157,7 @@ def messages(
                         answers[identifier] = wanted(channels[identifier]) if identifier in channels else None
                     answer = answers[identifier]
                     if answer is not None:
-                        sequence, log_time, publish_time = number_and_times_of(data, start)
+                        _, sequence, log_time, publish_time = message_of(data, start)
                         yield Logged(answer, data[start + _MESSAGE.size : at], publish_time, log_time, sequence)
                 elif opcode == _CHANNEL_OPCODE and identifier not in channels:
                     channel = _parsed(data[start:at])
@@ -181,10 +173,6 @@ def skim(path: Path, wanted: Callable[[str], bool]) -> list[McapRecord] | None:
 
     The index is used if it matches its checksum, has everything that the statistics count, and points to the right
     records. A damaged chunk is skipped silently: `messages` reports it.
-
-    Args:
-        path: The file.
-        wanted: Whether a topic's messages are wanted.
 
     Returns:
         The records, each kind in the file's order; None without a usable index.
@@ -233,13 +221,11 @@ def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] |
             raise NotMcapError(f"{path} does not begin as an MCAP file")
         index = _index(file)
         yield 0, b"".join(record for opcode, record in index if opcode in _DESCRIBING)
-        starts = [
-            int.from_bytes(record[(at := _STARTS[opcode]) : at + 8], "little")
-            for opcode, record in index
-            if opcode in _STARTS
-        ]
+        starts = sorted(
+            int.from_bytes(record[_STARTS[opcode] :][:8], "little") for opcode, record in index if opcode in _STARTS
+        )
         chunked = False
-        for offset, opcode, block in _blocks(file, sorted(starts), damages):
+        for offset, opcode, block in _blocks(file, starts, damages):
             if opcode != Opcode.CHUNK:
                 if chunked and opcode in _IN_CHUNKS:  # a flipped bit turns a message index into this
                     damages.append(Damage(offset, "a schema, channel or message outside of the chunks"))
@@ -258,10 +244,7 @@ def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] |
 def _blocks(file: BinaryIO, starts: list[int], damages: list[Damage]) -> Iterator[tuple[int, int, bytes]]:
     """Offset, opcode and bytes of each record in the file, up to the end of the data section.
 
-    Args:
-        file: The file.
-        starts: Offsets of records by the index, in order; after a damaged record, reading resumes at the next.
-        damages: What could not be read is appended.
+    `starts` has the offsets of records by the index, in order: after a damaged record, reading resumes at the next.
     """
     size = os.fstat(file.fileno()).st_size
     named, checksum = len(damages), zlib.crc32(MAGIC)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.logs.mcap_copy import McapCopy
@@ -19,10 +19,8 @@ class RecoverError(AeroloopError):
     """Nothing can be recovered; one line with the reason."""
 
 
-class Recovery(BaseModel):
+class Recovery(BaseModel, frozen=True):
     """What was recovered."""
-
-    model_config = ConfigDict(frozen=True)
 
     out: str
     messages: int

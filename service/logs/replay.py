@@ -11,10 +11,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from math import sqrt
 from pathlib import Path
-from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
 from aeroloop.protocol.messages.models import Description
@@ -30,13 +29,9 @@ from aeroloop.service.logs.files import Progress, ReviewError
 from aeroloop.service.logs.runs import Block, Run, Taker, TraceJoin
 from aeroloop.service.logs.traces import Array, SessionKey, Source
 
-_NOT_SELECTED: Final = "only the other end was replayed"
 
-
-class TickDifference(BaseModel):
+class TickDifference(BaseModel, frozen=True):
     """The first row whose computed command differs from the logged one."""
-
-    model_config = ConfigDict(frozen=True)
 
     tick: int
     time_s: float = Field(description="on the law's clock [s]")
@@ -44,10 +39,8 @@ class TickDifference(BaseModel):
     computed: str
 
 
-class SessionReplay(BaseModel):
+class SessionReplay(BaseModel, frozen=True):
     """Result of replaying one session's controller."""
-
-    model_config = ConfigDict(frozen=True)
 
     vehicle: str
     session: str
@@ -61,19 +54,15 @@ class SessionReplay(BaseModel):
     u_total_computed: float
 
 
-class EndReplay(BaseModel):
+class EndReplay(BaseModel, frozen=True):
     """Result of replaying one end, over all sessions."""
-
-    model_config = ConfigDict(frozen=True)
 
     ticks: int = Field(description="ticks that were computed again")
     differ: int = Field(description="how many of them differ in any bit")
 
 
-class Replay(BaseModel):
+class Replay(BaseModel, frozen=True):
     """Result of replaying a run."""
-
-    model_config = ConfigDict(frozen=True)
 
     controller: EndReplay | None = Field(description="null: it could not be replayed, see `reasons`")
     plant: EndReplay | None
@@ -88,13 +77,7 @@ class Replay(BaseModel):
 
 
 class Replayer:
-    """Replays one session's controller.
-
-    Args:
-        which: The session.
-        evaluator: Recomputes its rows.
-        settings: The configuration that the evaluator uses.
-    """
+    """Replays one session's controller by an evaluator; the settings are the evaluator's."""
 
     def __init__(self, which: SessionKey, evaluator: Evaluator, settings: Settings) -> None:
         self._which = which
@@ -113,24 +96,18 @@ class Replayer:
         if not rows:
             return
         commands = evaluator.commands(used, evaluator.compute(used))
-        expected = {
-            "sent_as": np.full(len(rows["tick"]), int(Sent.NONE), dtype=np.uint8),
-            "command": np.zeros((len(rows["tick"]), wire.command.size), dtype=np.uint8),
-        }
-        expected["sent_as"][used.rows] = np.where(commands.sent, int(Sent.FRAME), int(Sent.SILENT))
-        sent = used.rows[commands.sent]
+        n = len(rows["tick"])
+        sent_as = np.full(n, int(Sent.NONE), dtype=np.uint8)
+        sent_as[used.rows] = np.where(commands.sent, int(Sent.FRAME), int(Sent.SILENT))
         counters = used.k[commands.sent] % wire.measurement.counters
-        expected["command"][sent] = frames_of(wire.command, counters, commands.codes[commands.sent])
-        logged = np.ascontiguousarray(rows["command"]).view(np.uint8).reshape(len(rows["tick"]), -1)
-        differ = (rows["sent_as"] != expected["sent_as"]) | (logged != expected["command"]).any(axis=1)
+        frames = np.zeros((n, wire.command.size), dtype=np.uint8)
+        frames[used.rows[commands.sent]] = frames_of(wire.command, counters, commands.codes[commands.sent])
+        logged = np.ascontiguousarray(rows["command"]).view(np.uint8).reshape(n, -1)
+        differ = (rows["sent_as"] != sent_as) | (logged != frames).any(axis=1)
         if differ.any() and self._first is None:
             i = int(np.argmax(differ))
-            self._first = TickDifference(
-                tick=int(rows["tick"][i]),
-                time_s=round(int(rows["tick"][i]) * self._period, 9),
-                logged=_text(rows["sent_as"][i], logged[i]),
-                computed=_text(expected["sent_as"][i], expected["command"][i]),
-            )
+            tick, was, now = int(rows["tick"][i]), _text(rows["sent_as"][i], logged[i]), _text(sent_as[i], frames[i])
+            self._first = TickDifference(tick=tick, time_s=round(tick * self._period, 9), logged=was, computed=now)
         self._differ += int(differ.sum())
         self._ticks += len(used.k)
         if self._first_tick is None:
@@ -178,11 +155,7 @@ def _volts(signal: SignalSpec, codes: Array) -> Array:
 
 
 class Plants:
-    """Replays the plants of a run, each process from its first row.
-
-    Args:
-        run: The run.
-    """
+    """Replays the plants of a run, each process from its first row."""
 
     def __init__(self, run: Run) -> None:
         self._descriptions = dict(run.files.first_descriptions)
@@ -219,10 +192,7 @@ class Plants:
 
 
 def replay(
-    paths: Sequence[Path],
-    overrides: Sequence[str] = (),
-    progress: Progress | None = None,
-    ends: Collection[End] = ENDS,
+    paths: Sequence[Path], overrides: Sequence[str] = (), progress: Progress | None = None, ends: Collection[End] = ENDS
 ) -> Replay:
     """Replay every session of a run.
 
@@ -279,7 +249,7 @@ def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Repl
         reason = "the plant of a log does not follow another configuration"
     if reason is not None:
         reasons["plant"] = reason
-    reasons |= {end: _NOT_SELECTED for end in ENDS if end not in ends}
+    reasons |= {end: "only the other end was replayed" for end in ENDS if end not in ends}
     return Replay(
         controller=_sum(sessions),
         plant=_sum([result for result in results if result.ticks]),

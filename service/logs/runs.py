@@ -86,24 +86,23 @@ class Run:
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
         self.files = LogFiles(paths)
         self._progress = progress
-        index = TraceIndex()
+        self._index = TraceIndex()
 
         def of(address: Address) -> str | None:
             return address.vehicle if address.topic.name == "trace" else None
 
         for found in self.files.routed(of, self._share(0.0, _INDEXING)):
-            index.add(found.answer, found.data)
-        index.finish()
-        self._index = index
-        self.extents: dict[SessionKey, Extent] = index.extents
-        self.missing: list[Missing] = index.missing
+            self._index.add(found.answer, found.data)
+        self._index.finish()
+        self.extents: dict[SessionKey, Extent] = self._index.extents
+        self.missing: list[Missing] = self._index.missing
         self.reached: dict[SessionKey, int] = {}
         self.open_sessions: dict[str, str] = {}
 
     @property
     def longest(self) -> SessionKey:
         """The session with the most ticks. Raises ReviewError if there is none."""
-        which = self._index.longest
+        which = max(self.extents, key=lambda which: self.extents[which].ticks, default=None)
         if which is None:
             raise ReviewError(f"{self.files.name} holds no session: no trace of a controller or a plant was recorded")
         return which
@@ -135,13 +134,7 @@ class Run:
         route: Callable[[Address], Taker | None] = lambda _: None,
         block: int = BLOCK,
     ) -> Iterator[Block]:
-        """Blocks of some sessions; those of one session in order.
-
-        Args:
-            sessions: Sessions to read.
-            route: As for `batches`.
-            block: Approximate ticks of a block.
-        """
+        """Blocks of some sessions, of about `block` ticks; those of a session in order. `route` is as in `batches`."""
         joins = {which: self.join(which, block) for which in sessions}
         for arrived in self.batches(route):
             which = arrived.source.vehicle, arrived.header.session
@@ -152,13 +145,7 @@ class Run:
             yield from join.blocks(finished=True)
 
     def join(self, which: SessionKey, block: int = BLOCK, *, alone: bool = False) -> TraceJoin:
-        """The join of a session.
-
-        Args:
-            which: The session.
-            block: Approximate ticks of a block.
-            alone: Leave the plant's rows out.
-        """
+        """The join of a session into blocks of about `block` ticks; if `alone`, without the plant's rows."""
         extent = self.extents[which]
         begins = extent.first["controller"]
         before = [change for change in self.files.changes.get(which, ()) if change.tick < begins]

@@ -7,7 +7,6 @@ that the log lacks is NaN here, and the file format's own null in a file.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +16,8 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.logs.ticks import Ticks
 
 Array = npt.NDArray[Any]
-Kind = Literal["double", "int64", "int8", "bool", "text"]
+Kind = Literal["double", "int64", "int8", "bool", "string"]
+"""Type of a column's values, by Arrow's name."""
 
 AXES: Final = ("x", "y", "z")
 EULER: Final = ("roll", "pitch", "yaw")
@@ -62,8 +62,7 @@ class Column(NamedTuple):
     kind: Kind = "double"
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Columns that are computed together.
 
     Attributes:
@@ -75,82 +74,74 @@ class Group:
 
 
 def groups(wire: WireSpec, period: float) -> list[Group]:
-    """Every column of the table, in order.
-
-    Args:
-        wire: How the session's frames were quantized.
-        period: Time between ticks [s].
-    """
+    """Every column of the table, in order, by how the frames were quantized and the time between ticks [s]."""
     motors = [str(i) for i in range(4 - wire.actuators, 4)]
     outermost = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
     return [
-        _one(Column("tick", "", "tick k of the law", "int64"), lambda rows: rows.ticks.k),
-        _one(Column("time_s", "s", "the law's time, k times the period"), lambda rows: rows.ticks.k * period),
-        _one(
-            Column("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970", "int64"),
-            lambda rows: rows.ticks.wall_ns,
+        _group("tick", "", "tick k of the law", lambda rows: rows.ticks.k, kind="int64"),
+        _group("time_s", "s", "the law's time, k times the period", lambda rows: rows.ticks.k * period),
+        _group(
+            "published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970",
+            lambda rows: rows.ticks.wall_ns, kind="int64",
         ),
-        _one(Column("vehicle", "", "name of the vehicle", "text"), lambda rows: _text(rows, rows.vehicle)),
-        _one(Column("session", "", "name of the session", "text"), lambda rows: _text(rows, rows.session)),
+        _group("vehicle", "", "name of the vehicle", lambda rows: _text(rows, rows.vehicle), kind="string"),
+        _group("session", "", "name of the session", lambda rows: _text(rows, rows.session), kind="string"),
         *_attitude("", "as measured", lambda rows: rows.ticks.attitude),
         *_attitude("desired_", "as desired", lambda rows: rows.ticks.desired),
-        _vector("rate_{}_rad_s", "rad/s", "ω as measured, body frame, about {}", lambda rows: rows.ticks.rate),
-        _vector(
+        _group("rate_{}_rad_s", "rad/s", "ω as measured, body frame, about {}", lambda rows: rows.ticks.rate, AXES),
+        _group(
             "desired_rate_{}_rad_s", "rad/s", "ω as desired, body frame, about {}",
-            lambda rows: rows.ticks.desired_rate,
+            lambda rows: rows.ticks.desired_rate, AXES,
         ),
-        _vector(
-            "attitude_error_{}", "1", "ε̃ of the attitude as measured, {}", lambda rows: rows.ticks.attitude_error
+        _group(
+            "attitude_error_{}", "1", "ε̃ of the attitude as measured, {}",
+            lambda rows: rows.ticks.attitude_error, AXES,
         ),
-        _vector("rate_error_{}_rad_s", "rad/s", "ω_e, body frame, about {}", lambda rows: rows.ticks.rate_error),
-        _one(Column("error_angle_deg", "deg", "angle of the attitude error"), _angle_deg),
-        _vector(
+        _group("rate_error_{}_rad_s", "rad/s", "ω_e, body frame, about {}", lambda rows: rows.ticks.rate_error, AXES),
+        _group("error_angle_deg", "deg", "angle of the attitude error", _angle_deg),
+        _group(
             "voltage_{}_V", "V", "u{} as commanded; none where no command answered",
             lambda rows: rows.ticks.voltages, motors,
         ),
-        _one(
-            Column("latency_us", "µs", "from the measurement to the command that answers it, on the plant's clock"),
+        _group(
+            "latency_us", "µs", "from the measurement to the command that answers it, on the plant's clock",
             lambda rows: rows.ticks.latency_ns * 1e-3,
         ),
-        _one(
-            Column("measurement_delay_us", "µs", "from the plant to the controller, if both ways are equally fast"),
+        _group(
+            "measurement_delay_us", "µs", "from the plant to the controller, if both ways are equally fast",
             lambda rows: rows.ticks.measurement_delay_ns * 1e-3,
         ),
-        _one(
-            Column("command_delay_us", "µs", "from the controller to the plant, likewise"),
+        _group(
+            "command_delay_us", "µs", "from the controller to the plant, likewise",
             lambda rows: rows.ticks.command_delay_ns * 1e-3,
         ),
-        _vector(
+        _group(
             "saturated_attitude_{}", "", "whether ε has the quantizer's outermost level, {}; unknown where η = 0",
-            lambda rows: _outermost(_sent(rows), outermost["attitude"]), kind="bool",
+            lambda rows: _outermost(_sent(rows), outermost["attitude"]), AXES, "bool",
         ),
-        _vector(
+        _group(
             "saturated_rate_{}", "", "whether ω has the quantizer's outermost level, {}",
-            lambda rows: _outermost(rows.ticks.rate, outermost["rate"]), kind="bool",
+            lambda rows: _outermost(rows.ticks.rate, outermost["rate"]), AXES, "bool",
         ),
-        _vector(
+        _group(
             "saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
             lambda rows: _outermost(rows.ticks.voltages, outermost["voltage"]), motors, "bool",
         ),
-        _vector(
+        _group(
             "damping_estimate_{}_Nms_rad", "N·m·s/rad", "θ̂ as the law used it, {}",
-            lambda rows: rows.ticks.damping_estimate,
+            lambda rows: rows.ticks.damping_estimate, AXES,
         ),
-        _vector(
-            "unquantized_voltage_{}_V", "V", "u{} before quantization",
-            lambda rows: rows.ticks.unquantized, motors,
+        _group(
+            "unquantized_voltage_{}_V", "V", "u{} before quantization", lambda rows: rows.ticks.unquantized, motors
         ),
-        _one(
-            Column("sign", "1", "the equilibrium approached, z₁₊ or z₁₋", "int8"),
-            lambda rows: rows.ticks.sign,
-        ),
+        _group("sign", "1", "the equilibrium approached, z₁₊ or z₁₋", lambda rows: rows.ticks.sign, kind="int8"),
         *_attitude("truth_", "as the emulator had it", lambda rows: rows.truth.attitude),
-        _vector(
-            "truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", lambda rows: rows.truth.rate
+        _group(
+            "truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", lambda rows: rows.truth.rate, AXES
         ),
-        _vector("truth_voltage_{}_V", "V", "at the emulator's motor {}", lambda rows: rows.truth.voltages, motors),
-        _one(
-            Column("truth_age_s", "s", "from the tick of the truth to this one"),
+        _group("truth_voltage_{}_V", "V", "at the emulator's motor {}", lambda rows: rows.truth.voltages, motors),
+        _group(
+            "truth_age_s", "s", "from the tick of the truth to this one",
             lambda rows: (rows.ticks.k - rows.truth.k) * period,
         ),
     ]  # fmt: skip
@@ -166,20 +157,12 @@ def euler_deg(q: Array) -> Array:
     return degrees
 
 
-def _one(column: Column, of: Callable[[Rows], Array]) -> Group:
-    return Group([column], lambda rows: of(rows).reshape(-1, 1))
-
-
-def _vector(
-    name: str,
-    unit: str,
-    description: str,
-    of: Callable[[Rows], Array],
-    axes: Sequence[str] = AXES,
-    kind: Kind = "double",
+def _group(
+    name: str, unit: str, what: str, of: Callable[[Rows], Array], axes: Sequence[str] = ("",), kind: Kind = "double"
 ) -> Group:
-    """A column per axis, which replaces the braces in name and description."""
-    return Group([Column(name.format(axis), unit, description.format(axis), kind) for axis in axes], of)
+    """A column, or one per axis, which replaces the braces in its name and description."""
+    columns = [Column(name.format(axis), unit, what.format(axis), kind) for axis in axes]
+    return Group(columns, lambda rows: of(rows).reshape(-1, len(axes)))
 
 
 def _attitude(prefix: str, which: str, of: Callable[[Rows], Array]) -> list[Group]:

@@ -28,14 +28,6 @@ MAT_LIMIT: Final = 2**31 - 1
 MAT_NAME: Final = 63
 """Characters that a field of a MATLAB struct may have."""
 
-_ARROW: Final = {
-    "double": pa.float64(),
-    "int64": pa.int64(),
-    "int8": pa.int8(),
-    "bool": pa.bool_(),
-    "text": pa.string(),
-}
-
 
 class ExportError(AeroloopError):
     """A log cannot be exported; one line with the reason."""
@@ -70,7 +62,12 @@ class ArrowFile(TableFile):
 
     def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None:
         self._groups = groups
-        self._schema = _schema(groups, facts)
+        columns = [column for group in groups for column in group.columns]
+        fields = [
+            pa.field(c.name, pa.type_for_alias(c.kind), metadata={"unit": c.unit, "description": c.description})
+            for c in columns
+        ]
+        self._schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
         self._writer = self._open(path, self._schema)
 
     @abstractmethod
@@ -88,7 +85,7 @@ class ArrowFile(TableFile):
                 values, gaps = matrix[i], None if missing is None or not missing[i].any() else missing[i]
                 if column.kind in ("bool", "int8"):
                     values = (values if gaps is None else np.where(gaps, 0, values)).astype(column.kind)
-                arrays.append(pa.array(values, _ARROW[column.kind], mask=gaps))
+                arrays.append(pa.array(values, pa.type_for_alias(column.kind), mask=gaps))
         self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
 
     def close(self) -> None:
@@ -127,7 +124,7 @@ class MatFile(TableFile):
         self._groups = groups
         self._facts = facts
         self._batches: dict[str, list[Array]] = {column.name: [] for column in self._columns}
-        self._names: dict[str, dict[str, int]] = {c.name: {} for c in self._columns if c.kind == "text"}
+        self._names: dict[str, dict[str, int]] = {c.name: {} for c in self._columns if c.kind == "string"}
         self._bytes = 0
 
     def write(self, rows: Rows) -> None:
@@ -136,7 +133,7 @@ class MatFile(TableFile):
             matrix = group.of(rows)
             for i, column in enumerate(group.columns):
                 values = matrix[:, i]
-                if column.kind == "text":
+                if column.kind == "string":
                     names = self._names[column.name]
                     values = np.array([names.setdefault(text, len(names) + 1) for text in values])
                 values = values.astype(np.int64 if column.name == "published_ns" else np.float64)
@@ -162,16 +159,3 @@ class MatFile(TableFile):
 
 
 FILES: Final[dict[str, type[TableFile]]] = {"parquet": ParquetFile, "csv": CsvFile, "mat": MatFile}
-
-
-def _schema(groups: Sequence[Group], facts: dict[str, Any]) -> pa.Schema:
-    return pa.schema(
-        [
-            pa.field(
-                column.name, _ARROW[column.kind], metadata={"unit": column.unit, "description": column.description}
-            )
-            for group in groups
-            for column in group.columns
-        ],
-        metadata={f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()},
-    )

@@ -47,10 +47,7 @@ class Judged(NamedTuple):
 
 
 class TickReader:
-    """Reads one session's ticks.
-
-    Args:
-        settings: The configuration of its controller.
+    """Reads one session's ticks, by the configuration of its controller.
 
     Attributes:
         offset: Offset between both ends' clocks.
@@ -73,14 +70,12 @@ class TickReader:
         answered = _is(rows, at, "sent_as", Sent.FRAME, Sent.SILENT) | (block.acted >= 0)
         silent = answered & _is(rows, at, "sent_as", Sent.SILENT)
         after = int(np.flatnonzero(answered)[-1]) + 1 if answered.any() else 0
-        self._later.append((seen.where(slice(after)), over[:after], sent[:after]))
         judged, over_so_far, sent_so_far = seen.where(slice(0)), over[:0], sent[:0]
         if after:
-            ticks, overs, sents = zip(*self._later, strict=True)
+            until = seen.where(slice(after)), over[:after], sent[:after]
+            ticks, overs, sents = zip(*self._later, until, strict=True)
             judged, over_so_far, sent_so_far = Ticks.joined(ticks), np.concatenate(overs), np.concatenate(sents)
             self._later.clear()
-        else:
-            self._later.pop()
         if after < len(seen.k):
             self._later.append((seen.where(slice(after, None)), over[after:], sent[after:]))
         valid = ~np.isnan(judged.attitude[:, 0])
@@ -113,15 +108,11 @@ class TickReader:
             return np.empty((0, wire.actuators)), np.empty((0, wire.actuators))
         framed = rows["sent_as"] == Sent.FRAME
         codes = codes_in(wire.command, rows["command"][framed])
-        unknown = self._commanded is None
         held, self._commanded = held_codes(framed, codes, self._commanded)
-        before = int(np.argmax(framed)) if framed.any() else len(framed)
-        if unknown and before:
-            held[:before] = 0.0
-            volts = levels(wire.voltage, held)
-            volts[:before] = np.nan
-            return codes, volts
-        return codes, levels(wire.voltage, held)
+        unknown = np.isnan(held)
+        volts = levels(wire.voltage, np.where(unknown, 0.0, held))
+        volts[unknown] = np.nan
+        return codes, volts
 
     def _ticks(self, block: Block, plants_codes: Array, commanded: Array) -> tuple[Ticks, Flags, Flags]:
         """The block's ticks; which the plant measured and the controller did not compute; and which had a frame."""
@@ -170,9 +161,8 @@ class TickReader:
 
     def _times(self, block: Block) -> tuple[Integers, Integers, Array, Array, Array]:
         """Wall time, time of sending, latency and both delays of each tick [ns]. Shapes (n,)."""
-        rows, plant, at, at_plant, acted = (
-            block.controller, block.plant, block.at_controller, block.at_plant, block.acted,
-        )  # fmt: skip
+        rows, plant = block.controller, block.plant
+        at, at_plant, acted = block.at_controller, block.at_plant, block.acted
         sent = np.where(_is(plant, at_plant, "sent_as", Sent.FRAME), _column(plant, at_plant, "sent"), -1)
         acted_on = np.where(_is(plant, acted, "received_as", Sent.FRAME), _column(plant, acted, "received"), -1)
         received = np.where(_is(rows, at, "received_as", Received.FRAME), _column(rows, at, "received"), -1)
@@ -188,7 +178,7 @@ class TickReader:
 
 def _column(rows: Rows, at: Integers, name: str) -> Integers:
     """A column's values at places of rows; −1 where the place is −1. Shape (n,)."""
-    return np.where(at >= 0, rows[name][at], -1) if rows else np.full(len(at), -1)
+    return np.where(at >= 0, rows[name][at].astype(np.int64), -1) if rows else np.full(len(at), -1)
 
 
 def _is(rows: Rows, at: Integers, name: str, *kinds: int) -> Flags:

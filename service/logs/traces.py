@@ -15,10 +15,11 @@ from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import (
+    ENDS,
     HEADER_BYTES,
     NEVER,
     End,
@@ -53,10 +54,8 @@ class Source(NamedTuple):
     run: int
 
 
-class Missing(BaseModel):
+class Missing(BaseModel, frozen=True):
     """Rows of one end that the log lacks."""
-
-    model_config = ConfigDict(frozen=True)
 
     vehicle: str
     session: str
@@ -128,24 +127,20 @@ class TraceIndex:
         sources: Batches by source.
         extents: Extent of each session, in the order of recording; complete after `finish`.
         missing: Missing rows; likewise.
-        malformed: Batches that cannot be read.
     """
 
     def __init__(self) -> None:
         self.sources: dict[Source, Batches] = {}
         self.extents: dict[SessionKey, Extent] = {}
         self.missing: list[Missing] = []
-        self.malformed = 0
         self._names: dict[str, int] = {"": 0}
 
     def add(self, vehicle: str, payload: bytes) -> None:
-        """Add a batch."""
-        header = read_header(payload)
-        if header is None or len(payload) != batch_bytes(header):
-            self.malformed += 1
-            return
-        batches = self.sources.setdefault(Source(vehicle, header.end, header.run), Batches())
-        batches.add(header, payload, self._names.setdefault(header.session, len(self._names)))
+        """Add a batch; a malformed one is dropped."""
+        if found := _identified(vehicle, payload):
+            source, header = found
+            batches = self.sources.setdefault(source, Batches())
+            batches.add(header, payload, self._names.setdefault(header.session, len(self._names)))
 
     def finish(self) -> None:
         """Find sessions and their missing rows, once all batches are added."""
@@ -159,7 +154,7 @@ class TraceIndex:
             for number in dict.fromkeys(session.tolist()):
                 which, its = (vehicle, names[number]), session == number
                 if number and rows[its].any():
-                    extent = self.extents.setdefault(which, _nothing())
+                    extent = self.extents.setdefault(which, Extent(*(dict.fromkeys(ENDS, n) for n in (0, NO_TICK, 0))))
                     extent.first[end] = int(batches.column("first")[its & (rows > 0)].min())
                     extent.last[end], extent.rows[end] = int(last[its].max()), int(rows[its].sum())
                     proofs[which, other] = int(batches.column("proof")[its].max())
@@ -168,13 +163,8 @@ class TraceIndex:
         for source, batches in self.sources.items():
             self._find_gaps(source, batches, names)
         for which, extent in self.extents.items():
-            for end in ("controller", "plant"):
+            for end in ENDS:
                 self._find_end(which, end, extent.last[end], proofs.get((which, end), NO_TICK), (which, end) in ended)
-
-    @property
-    def longest(self) -> SessionKey | None:
-        """The session with the most ticks of a controller; None if there is none."""
-        return max(self.extents, key=lambda which: self.extents[which].ticks, default=None)
 
     def _find_gaps(self, source: Source, batches: Batches, names: list[str]) -> None:
         having = batches.table[batches.column("rows") > 0]
@@ -196,8 +186,7 @@ class TraceIndex:
 
     def _find_end(self, which: SessionKey, end: End, last: int, proof: int, ended: bool) -> None:
         """Report rows after the last one, if the other end proves them, or a missing end of the session."""
-        known = any((m.vehicle, m.session) == which and m.end == end and m.last_tick is None for m in self.missing)
-        if known:
+        if any((m.vehicle, m.session) == which and m.end == end and m.last_tick is None for m in self.missing):
             return
         if proof > last:
             self._lacks(Source(which[0], end, 0), which[1], last + 1, proof, proof - last)
@@ -205,11 +194,9 @@ class TraceIndex:
             self._lacks(Source(which[0], end, 0), which[1], last + 1, None, 0)
 
     def _lacks(self, source: Source, session: str, first: int, last: int | None, rows: int) -> None:
-        self.missing.append(
-            Missing(
-                vehicle=source.vehicle, session=session, end=source.end, first_tick=first, last_tick=last, rows=rows
-            )
-        )
+        vehicle, end, _ = source
+        lacks = Missing(vehicle=vehicle, session=session, end=end, first_tick=first, last_tick=last, rows=rows)
+        self.missing.append(lacks)
 
 
 class Arrived(NamedTuple):
@@ -247,55 +234,48 @@ class Arrived(NamedTuple):
 
 
 class InOrder:
-    """Puts batches in the order of their rows as they are read again, and drops duplicates.
-
-    Args:
-        index: Index of the same files.
-    """
+    """Puts the batches of an index in the order of their rows as they are read again, and drops duplicates."""
 
     def __init__(self, index: TraceIndex) -> None:
-        self._queues = {source: _Queue(batches) for source, batches in index.sources.items()}
+        self._queues = {source: _Queue(source, batches) for source, batches in index.sources.items()}
 
     def take(self, vehicle: str, payload: bytes) -> Iterator[Arrived]:
         """Add a batch; yields every batch that is next in order."""
-        header = read_header(payload)
-        if header is None or len(payload) != batch_bytes(header):
-            return
-        source = Source(vehicle, header.end, header.run)
-        queue = self._queues[source]
-        queue.put(header, payload)
-        while (batch := queue.next(source)) is not None:
-            yield batch
+        if found := _identified(vehicle, payload):
+            source, header = found
+            yield from self._queues[source].take(header, payload)
 
 
 class _Queue:
     """Batches of one source, waiting for those before them."""
 
-    def __init__(self, batches: Batches) -> None:
+    def __init__(self, source: Source, batches: Batches) -> None:
+        self._source = source
         self._keys: list[Key] = list(zip(*(column.tolist() for column in batches.table[:, :4].T), strict=True))
         self._last, self._next = batches.column("last").tolist(), _next_ticks(batches).tolist()
         self._waiting: dict[Key, tuple[Header, bytes]] = {}
         self._at = self._row = 0
 
-    def put(self, header: Header, payload: bytes) -> None:
-        """Add a batch, unless it is a duplicate."""
+    def take(self, header: Header, payload: bytes) -> Iterator[Arrived]:
+        """Add a batch; yields every batch that is next in order."""
         key, keys = key_of(header, payload), self._keys
-        place = self._at
-        if place == len(keys) or keys[place] != key:
-            place = bisect_left(keys, key, lo=place)
-            if place == len(keys) or keys[place] != key:
-                return  # a duplicate
+        place = bisect_left(keys, key, lo=self._at)
+        if keys[place : place + 1] != [key]:
+            return  # a duplicate
         self._waiting[key] = header, payload
+        while (at := self._at) < len(keys) and keys[at] in self._waiting:
+            header, payload = self._waiting.pop(keys[at])
+            gap = header.rows > 0 and header.first_row > self._row
+            self._row, self._at = header.first_row + header.rows, at + 1
+            yield Arrived(self._source, header, payload, gap, self._last[at], self._next[at])
 
-    def next(self, source: Source) -> Arrived | None:
-        """The next batch in order; None if it has not been read yet."""
-        at = self._at
-        if at == len(self._keys) or (found := self._waiting.pop(self._keys[at], None)) is None:
-            return None
-        header, payload = found
-        gap = header.rows > 0 and header.first_row > self._row
-        self._row, self._at = header.first_row + header.rows, at + 1
-        return Arrived(source, header, payload, gap, self._last[at], self._next[at])
+
+def _identified(vehicle: str, payload: bytes) -> tuple[Source, Header] | None:
+    """Source and header of a batch; None if it is malformed."""
+    header = read_header(payload)
+    if header is None or len(payload) != batch_bytes(header):
+        return None
+    return Source(vehicle, header.end, header.run), header
 
 
 def key_of(header: Header, payload: bytes) -> Key:
@@ -343,9 +323,3 @@ def _next_ticks(batches: Batches) -> Integers:
         if rows[i]:
             lowest = int(first[i]) if lowest == NO_TICK else min(lowest, int(first[i]))
     return following
-
-
-def _nothing() -> Extent:
-    return Extent(
-        {"controller": 0, "plant": 0}, {"controller": NO_TICK, "plant": NO_TICK}, {"controller": 0, "plant": 0}
-    )

@@ -20,13 +20,7 @@ from aeroloop.service.logs.traces import Integers, SessionKey
 
 
 class WireCheck:
-    """Compares the frames of one session.
-
-    Args:
-        which: The session.
-        wire: Format of the frames.
-        reached: The last tick that the traces have reached, by session.
-    """
+    """Compares the frames of one session; `reached` has the last tick that the traces have reached, by session."""
 
     def __init__(self, which: SessionKey, wire: WireSpec, reached: Mapping[SessionKey, int]) -> None:
         self._which = which
@@ -65,9 +59,7 @@ class WireCheck:
         if counter is None:
             self._counts[name]["differ"] += 1
             return
-        last = self._last.get(name)
-        if last is None:
-            last = self._reached.get(self._which, -1)
+        last = self._last.get(name, self._reached.get(self._which, -1))
         self._last[name] = tick = last + 1 + (counter - last - 1) % kind.counters
         self._waiting[name].append((tick, frame))
 

@@ -7,6 +7,7 @@ and the chunk stays in memory for the next try, so a full disk never leaves half
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -73,10 +74,7 @@ class _WholeChunks:
 
 
 class LogFile:
-    """An MCAP file that is being written.
-
-    Args:
-        path: A new file.
+    """An MCAP file that is being written; its path is a new file.
 
     Attributes:
         path: The same.
@@ -109,27 +107,25 @@ class LogFile:
         """Whether the file was moved or removed while it was written."""
         return not self._out.stands_at(self.path)
 
-    def add(self, received: Delivery, at_ns: int) -> None:
-        """Add a message to the chunk, under its key and its publisher's number.
+    def add(self, received: Delivery, at_ns: int, decoded: Iterable[Decoded] = ()) -> None:
+        """Add a message to the chunk, under its key and its publisher's number, and its decoded ones beside it.
 
         Args:
             received: The message.
             at_ns: When it was received [ns since 1970]; also its publish time where it carries none.
+            decoded: Each goes under its own topic; its log time is the raw message's publish time.
         """
         channel = self._channels.get(received.key)
         if channel is None:
             channel = self._channels[received.key] = self._raw_channel(received.key)
         published_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
         self._add(channel, at_ns, published_ns, received.payload, received.sequence)
-
-    def add_decoded(self, decoded: Decoded) -> None:
-        """Add a decoded message under its own topic; its log time is the raw message's publish time."""
-        channel = self._channels.get(decoded.topic)
-        if channel is None:
-            shape = self._schema(decoded.shape)
-            channel = self._writer.register_channel(decoded.topic, decoded.shape.message_encoding, shape)
-            self._channels[decoded.topic] = channel
-        self._add(channel, decoded.at_ns, decoded.at_ns, decoded.data, 0)
+        for one in decoded:
+            channel = self._channels.get(one.topic)
+            if channel is None:
+                encoding, schema = one.shape.message_encoding, self._schema(one.shape)
+                channel = self._channels[one.topic] = self._writer.register_channel(one.topic, encoding, schema)
+            self._add(channel, one.at_ns, one.at_ns, one.data, 0)
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Add a metadata record."""

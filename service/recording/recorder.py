@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
@@ -54,10 +54,6 @@ _address = lru_cache(maxsize=4096)(topics.read_key)
 class Recorder:
     """The recorder as a process.
 
-    Args:
-        role: Its presence on the network.
-        settings: Where the log is written.
-
     Attributes:
         log: The files.
 
@@ -74,15 +70,14 @@ class Recorder:
         self._status_written = 0
         self._status_at = time.monotonic()
         self.log = RollingLog(settings, self._report)
-        self._decoder = self._make_decoder(settings.decoded_hz) if settings.decoded_hz else None
-
-    def _make_decoder(self, rate_hz: float) -> Decoder | None:
-        try:
-            from aeroloop.service.viewers.channels import Decoder
-        except ModuleNotFoundError:
-            self._role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
-            return None
-        return Decoder(rate_hz)
+        self._decoder: Decoder | None = None
+        if settings.decoded_hz:
+            try:
+                from aeroloop.service.viewers.channels import Decoder
+            except ModuleNotFoundError:
+                role.event("changed", "no decoded channels: they need `pip install 'aeroloop[foxglove]'`")
+            else:
+                self._decoder = Decoder(settings.decoded_hz)
 
     def run(self) -> None:
         """Record until the role's `stop` is set; then take the messages in transit and close the log."""
@@ -179,16 +174,13 @@ class Recorder:
 
     def _publish_losses(self) -> None:
         """Publish, and thereby record, losses; those of the full backlog once the disk accepts writes again."""
-        for lost in self._subscriptions.losses():
-            self._lose(lost.key, lost.messages, lost.reason)
+        losses = self._subscriptions.losses()
         if self.log.writable:
-            refused, self._backlog.refused = self._backlog.refused, Counter()
-            for key, count in refused.items():
-                self._lose(key, count, "disk")
-
-    def _lose(self, key: str, count: int, reason: Literal["network", "queue", "disk"]) -> None:
-        self._lost[reason] += count
-        self._role.publish("loss", Loss(key=key, count=count, reason=reason))
+            losses += [Loss(key=key, count=count, reason="disk") for key, count in self._backlog.refused.items()]
+            self._backlog.refused.clear()
+        for loss in losses:
+            self._lost[loss.reason] += loss.count
+            self._role.publish("loss", loss)
 
     def _report(self, text: str, bad: bool) -> None:
         if bad:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Change
@@ -43,12 +43,6 @@ def parts(path: Path) -> list[Path]:
     return [path, *followed] if path.exists() else followed
 
 
-class _Entry(NamedTuple):
-    received: Delivery
-    at_ns: int
-    decoded: list[Decoded]
-
-
 class RollingLog:
     """A log in files.
 
@@ -72,7 +66,7 @@ class RollingLog:
         self._base = settings.path or settings.directory / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap")
         self._descriptions: dict[str, bytes] = {}
         self._changes: dict[str, list[Change]] = {}  # of the last session of each key
-        self._unwritten: list[_Entry] = []
+        self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []
         self._part = 0  # of the next file
         self._began = 0.0
         self._due = self._check_due = self._retry_due = 0.0
@@ -97,10 +91,9 @@ class RollingLog:
 
     def add(self, received: Delivery, at_ns: int, decoded: list[Decoded]) -> None:
         """Add a message received at `at_ns` [ns since 1970] and its decoded ones; only while `writable`."""
-        entry = _Entry(received, at_ns, decoded)
-        self._unwritten.append(entry)
+        self._unwritten.append((received, at_ns, decoded))
         self.written += 1
-        self._put(self._file, entry)
+        self._file.add(received, at_ns, decoded)
         if self._file.full:
             self._commit()
 
@@ -111,12 +104,7 @@ class RollingLog:
             self._file.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": payload.decode()})
 
     def add_change(self, key: str, change: Change) -> None:
-        """Keep a change of gains or reference for later files; this file has it in the trace.
-
-        Args:
-            key: Key of the trace.
-            change: From its tail.
-        """
+        """Keep a change from the tail of the trace `key` for later files; this file has it in the trace."""
         changes = self._changes.get(key)
         if changes is None or changes[0].session != change.session:
             changes = self._changes[key] = []
@@ -164,12 +152,6 @@ class RollingLog:
         if waiting:
             raise RecorderError(f"{waiting} messages could not be written: {self.trouble}")
 
-    @staticmethod
-    def _put(file: LogFile, entry: _Entry) -> None:
-        file.add(entry.received, entry.at_ns)
-        for decoded in entry.decoded:
-            file.add_decoded(decoded)
-
     def _commit(self) -> None:
         try:
             self._file.commit()
@@ -204,7 +186,7 @@ class RollingLog:
         file = self._begin()
         try:
             for entry in self._unwritten:
-                self._put(file, entry)
+                file.add(*entry)
             file.commit()
         except OSError:
             file.remove()
@@ -229,10 +211,8 @@ class RollingLog:
             last.end()
         except OSError as error:
             last.abandon()
-            self._report(
-                f"the index of {last.path} could not be written: {error.strerror}; `aeroloop log recover` gives it one",
-                True,
-            )
+            what = f"the index of {last.path} could not be written: {error.strerror}"
+            self._report(f"{what}; `aeroloop log recover` gives it one", True)
         self._remove_oldest()
 
     def _begin(self) -> LogFile:

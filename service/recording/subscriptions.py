@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
-from typing import Final, Literal, NamedTuple
+from typing import Final
 
 import zenoh
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Loss
 from aeroloop.protocol.transport.publication import WAITING, Delivery, RecoveringSubscriber, read_sample
 
 _MASK: Final = 0xFFFF_FFFF
@@ -23,20 +24,6 @@ _MASK: Final = 0xFFFF_FFFF
 
 _Source = tuple[zenoh.ZenohId, int]
 """A publisher: an EntityGlobalId cannot be compared."""
-
-
-class Lost(NamedTuple):
-    """Messages that are not in the log.
-
-    Attributes:
-        key: Their key, or a key expression where no message of their publisher was received.
-        messages: How many.
-        reason: As in Loss.
-    """
-
-    key: str
-    messages: int
-    reason: Literal["network", "queue"]
 
 
 class Subscriptions:
@@ -68,11 +55,7 @@ class Subscriptions:
         return any(subscriber.joining for subscriber in self._topics.values())
 
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
-        """Messages received and not yet taken, topic by topic, descriptions first. Never waits.
-
-        Args:
-            held: Also take messages that are held back.
-        """
+        """Messages received and not yet taken, topic by topic, descriptions first; with `held` all. Never waits."""
         for subscriber in self._topics.values():
             for received in islice(subscriber.take(held=held), self._waiting):
                 if received.source is not None:
@@ -84,26 +67,29 @@ class Subscriptions:
                     break
                 yield read_sample(sample)
 
-    def losses(self) -> list[Lost]:
+    def losses(self) -> list[Loss]:
         """Losses found since the last call.
 
-        Losses of a publisher of which nothing was taken yet are reported at the next call, when its key may be known.
+        Losses of a publisher of which nothing was taken yet are reported at the next call, when its key may be known;
+        a key expression stands in for a key that is still unknown then.
         """
-        found = [Lost(self._keys.get(source, key), count, "network") for source, key, count in self._unnamed]
+        found = [
+            Loss(key=self._keys.get(source, key), count=count, reason="network") for source, key, count in self._unnamed
+        ]
         self._unnamed.clear()
         for expression, subscriber in self._topics.items():
             for miss in subscriber.missed():
                 source = miss.source.zid, miss.source.eid
                 self._reported[source] += miss.missing
                 if source in self._keys:
-                    found.append(Lost(self._keys[source], miss.missing, "network"))
+                    found.append(Loss(key=self._keys[source], count=miss.missing, reason="network"))
                 else:
                     self._unnamed.append((source, expression, miss.missing))
         for source, gap in self._gaps.items():
             reported = min(gap, self._reported[source])
             self._reported[source] -= reported
             if gap > reported:
-                found.append(Lost(self._keys[source], gap - reported, "queue"))
+                found.append(Loss(key=self._keys[source], count=gap - reported, reason="queue"))
         self._gaps.clear()
         return found
 

@@ -35,8 +35,7 @@ class Durations:
 
     def spread(self) -> Spread | None:
         """Their distribution; None if there were none."""
-        total = int(self._counts.sum())
-        if not total:
+        if not (total := int(self._counts.sum())):
             return None
         reached = np.cumsum(self._counts)
 

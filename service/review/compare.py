@@ -10,26 +10,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.service.review.report import Findings, Report, differences
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import report
 
 
-class SettingDifference(BaseModel):
+class SettingDifference(BaseModel, frozen=True):
     """A key of the configuration whose value is not the same in every run."""
-
-    model_config = ConfigDict(frozen=True)
 
     key: str = Field(description="dotted, such as `law.C2`")
     values: dict[str, Any] = Field(description="by run; null where a run has no such key")
 
 
-class Comparison(BaseModel):
+class Comparison(BaseModel, frozen=True):
     """Runs side by side."""
-
-    model_config = ConfigDict(frozen=True)
 
     runs: dict[str, Findings] = Field(description="by the run's name")
     differences: list[SettingDifference]

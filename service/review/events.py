@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Loss, Status
-from aeroloop.protocol.messages.operator import Change, Gains, Hold, Points, Reference, Sinusoid
+from aeroloop.protocol.messages.operator import Change, Hold, Points, Reference, Sinusoid
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.timing import Histogram
 from aeroloop.service.logs.runs import Taker
@@ -30,7 +30,7 @@ Place = tuple[int, float]
 """Sort key of a mark: −1 before the session, 0 and a time [s] within it, 1 after it."""
 
 
-class Kind:
+class _Kind:
     """Marks of one kind: the first few hundred, and the count of the rest."""
 
     def __init__(self) -> None:
@@ -39,7 +39,6 @@ class Kind:
         self.last: tuple[Place, Mark] | None = None
 
     def add(self, place: Place, mark: Mark) -> None:
-        """Add a mark."""
         if len(self.first) < MAX_MARKS:
             self.first.append((place, mark))
         else:
@@ -52,26 +51,6 @@ class Kind:
             return self.first
         place, mark = self.last
         return [*self.first, (place, mark.model_copy(update={"text": f"{self.more} more, the last: {mark.text}"}))]
-
-
-class MeasurementAges:
-    """Age of measurements from a controller's statuses, each over ten seconds."""
-
-    def __init__(self) -> None:
-        self._p50 = Histogram()
-        self._p99 = self._max = 0.0
-
-    def add(self, status: Status) -> None:
-        """Add a status."""
-        if status.age_us is not None:
-            self._p50.add(round(status.age_us.p50 * 1e3))
-            self._p99, self._max = max(self._p99, status.age_us.p99), max(self._max, status.age_us.max)
-
-    def figures(self) -> dict[str, float] | None:
-        """Median of all medians, worst p99 and maximum [µs]; None without any."""
-        if not self._p50.count:
-            return None
-        return {"p50": round(self._p50.percentile(50), 1), "p99": self._p99, "max": self._max}
 
 
 class EventLog:
@@ -99,8 +78,8 @@ class EventLog:
         self._period = period
         self._reached = reached
         self._open = open_sessions
-        self._kinds: defaultdict[tuple[str, str], Kind] = defaultdict(Kind)
-        self._ages = MeasurementAges()
+        self._kinds: defaultdict[tuple[str, str], _Kind] = defaultdict(_Kind)
+        self._ages: tuple[Histogram, float, float] = Histogram(), 0.0, 0.0  # medians, largest p99, largest maximum
         self._recent: dict[int, None] = {}
         self._status_ns: dict[tuple[str, str], int] = {}
 
@@ -123,8 +102,9 @@ class EventLog:
 
     @property
     def age_us(self) -> dict[str, float] | None:
-        """Age of measurements when they were used [µs]; None if no status has it."""
-        return self._ages.figures()
+        """Age of measurements when used: median of all medians, worst p99 and maximum [µs]; None without."""
+        medians, p99, most = self._ages
+        return {"p50": round(medians.percentile(50), 1), "p99": p99, "max": most} if medians.count else None
 
     def marks(self) -> list[Mark]:
         """Marks of the vehicle in order of time; those outside of the session come first or last."""
@@ -137,9 +117,11 @@ class EventLog:
         event = Event.model_validate_json(payload)
         if event.kind == "tripped":
             self.trips.append(event.text)
-        if vehicle != self._which[0] or self._is_a_change(event):
+        of_session = event.session == self._which[1]
+        repeats_a_change = event.kind == "changed" and event.role == "controller" and of_session
+        if vehicle != self._which[0] or repeats_a_change:
             return
-        tick = event.tick if event.session == self._which[1] else None
+        tick = event.tick if of_session else None
         self._add(event.kind, event.role, event.text, tick, event.session)
 
     def _loss(self, vehicle: str, payload: bytes, at_ns: int) -> None:
@@ -156,8 +138,11 @@ class EventLog:
             return  # a duplicate
         self._status_ns[vehicle, role] = at_ns
         status = self.statuses[vehicle, role] = Status.model_validate_json(payload)
-        if (vehicle, status.session) == self._which and role == "controller":
-            self._ages.add(status)
+        age = status.age_us
+        if (vehicle, status.session) == self._which and role == "controller" and age is not None:
+            medians, p99, most = self._ages
+            medians.add(round(age.p50 * 1e3))
+            self._ages = medians, max(p99, age.p99), max(most, age.max)
 
     def _is_duplicate(self, vehicle: str, payload: bytes, at_ns: int) -> bool:
         """Whether the very same message was recorded before."""
@@ -168,10 +153,6 @@ class EventLog:
         if len(self._recent) > _RECENT:
             del self._recent[next(iter(self._recent))]
         return False
-
-    def _is_a_change(self, event: Event) -> bool:
-        """Whether an event only repeats a change of the session in words."""
-        return event.kind == "changed" and event.role == "controller" and event.session == self._which[1]
 
     def _add(self, kind: str, role: str, text: str, tick: int | None = None, session: str | None = None) -> None:
         reached = self._reached.get(self._which)
@@ -194,16 +175,12 @@ def described(change: Change) -> str:
     """A change in words."""
     parts = []
     if change.gains is not None:
-        parts.append(_gains(change.gains))
+        diagonals: dict[str, Any] = {name: value for name, value in change.gains if value is not None}
+        parts.append(", ".join(f"{name} = diag({', '.join(f'{x:g}' for x in xs)})" for name, xs in diagonals.items()))
     if change.reference is not None:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {_reference(change.reference)}{within}")
     return "; ".join(parts)
-
-
-def _gains(gains: Gains) -> str:
-    diagonals: dict[str, Any] = {name: value for name, value in gains if value is not None}
-    return ", ".join(f"{name} = diag({', '.join(f'{x:g}' for x in value)})" for name, value in diagonals.items())
 
 
 def _reference(reference: Reference) -> str:

@@ -13,17 +13,14 @@ from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.session import Session
 
+FrameCounts = dict[str, dict[str, int]] | None
+"""Of `WireCheck`."""
 
-def findings_of(figures: Figures, which: SessionKey, session: Session, events: EventLog, run: Run) -> Findings:
-    """Findings of a session.
 
-    Args:
-        figures: Its figures of merit, copied unchanged.
-        which: Its vehicle and name.
-        session: Its review.
-        events: Events of the log.
-        run: The log.
-    """
+def findings_of(
+    figures: Figures, which: SessionKey, session: Session, events: EventLog, run: Run, frames: FrameCounts
+) -> Findings:
+    """Findings of a session; its figures of merit are copied unchanged."""
     observer, offset = session.observer, session.reader.offset
     timing, age = observer.timing, events.age_us
     reasons = dict(figures.reasons)
@@ -54,6 +51,7 @@ def findings_of(figures: Figures, which: SessionKey, session: Session, events: E
         missing_ticks={end: sum(gap.rows for gap in run.missing if gap.end == end) for end in ("controller", "plant")},
         missing=run.missing,
         lapses={name: count for name, count in session.lapses.items() if count},
+        frames=frames,
         theorem=theorem,
         marks=events.marks(),
     )

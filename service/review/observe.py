@@ -80,21 +80,18 @@ class Observer:
         periods[known] = np.diff(sent[known], prepend=self._last_sent_ns)
         if len(known):
             self._last_sent_ns = float(sent[known[-1]])
-        durations = {
-            "period": periods,
-            "latency": ticks.latency_ns,
-            "measurement_delay": ticks.measurement_delay_ns,
-            "command_delay": ticks.command_delay_ns,
-        }
-        for name, values in durations.items():
-            self._timing[name].add(values[~np.isnan(values)])
+        durations = periods, ticks.latency_ns, ticks.measurement_delay_ns, ticks.command_delay_ns
+        for histogram, values in zip(self._timing.values(), durations, strict=True):
+            histogram.add(values[~np.isnan(values)])
         desired, error = ticks.desired, ticks.attitude_error
+        turned_away = np.sum(ticks.attitude * desired, axis=1, keepdims=True) < 0
+        attitude = np.where(turned_away, -ticks.attitude, ticks.attitude)  # of ±q, the nearer to q_d
         true_angle, theorem = self.trial.ticks(ticks)
         self._lines.add(
             np.column_stack(
                 [
                     ticks.k.astype(np.float64),
-                    _alternating(_beside(ticks.attitude, desired), desired),
+                    _alternating(attitude, desired),
                     _alternating(ticks.rate, ticks.desired_rate),
                     error,
                     ticks.rate_error,
@@ -126,10 +123,8 @@ class Observer:
     @property
     def gaps(self) -> list[Gap]:
         """The longest hundred, in order of time."""
-        return [
-            Gap(time_s=round(k * self._period, 9), tick=k, ticks=ticks)
-            for k, ticks in sorted((k, ticks) for ticks, k in self._longest)
-        ]
+        found = sorted((k, ticks) for ticks, k in self._longest)
+        return [Gap(time_s=round(k * self._period, 9), tick=k, ticks=ticks) for k, ticks in found]
 
     @property
     def saturated(self) -> dict[str, float]:
@@ -146,11 +141,6 @@ class Observer:
         points = self._lines.points()
         panels = panels_of(self._columns, points[:, 1:])
         return points[:, 0] * self._period, with_level(panels, "z_norm", "guaranteed in the end", self.trial.radius)
-
-
-def _beside(attitude: Array, desired: Array) -> Array:
-    """±q, with the sign that is nearer to q_d. Shape (n, 4)."""
-    return np.where(np.sum(attitude * desired, axis=1, keepdims=True) < 0, -attitude, attitude)
 
 
 def _alternating(one: Array, other: Array) -> Array:

@@ -7,7 +7,7 @@ that figure. Quantities without a figure in the paper follow: timing, estimates,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from typing import Final, Literal, NamedTuple
@@ -64,7 +64,6 @@ class PanelColumn(NamedTuple):
     label: str
     unit: str
     line: str
-    desired: bool = False
 
 
 def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
@@ -74,7 +73,28 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
         settings: The configuration of the controller.
         theta: Whether the plant's damping is known, so that V has all its terms.
     """
-    return list(_columns(case_of(settings), settings.wire.actuators, theta=theta))
+    case, beside = case_of(settings), ("measured", "desired")
+    true_V = "true, with θ̃" if theta else "true, without θ̃"
+    rate_errors, inputs = ("ω_e1", "ω_e2", "ω_e3"), ("u₁", "u₂", "u₃")[3 - settings.wire.actuators :]
+    panels: list[tuple[str, str, Sequence[str], str, Sequence[str]]] = [
+        ("attitude", title_of("attitude", "Attitude", case), ("η", "ε₁", "ε₂", "ε₃"), "1", beside),
+        ("rate", title_of("rate", "Angular velocity", case), ("ω₁", "ω₂", "ω₃"), "rad/s", beside),
+        ("attitude_error", title_of("error", "Attitude error", case), ("ε̃₁", "ε̃₂", "ε̃₃"), "1", ["measured"]),
+        ("rate_error", title_of("rate_error", "Angular velocity error", case), rate_errors, "rad/s", ["measured"]),
+        ("input", title_of("input", "Input", case), inputs, "V", ["commanded"]),
+        ("error_angle", "Attitude error, as an angle", ["angle"], "deg", ("measured", "true")),
+        ("latency", "Loop latency", ["latency"], "µs", ["latency"]),
+        ("period", "Period between measurements", ["period"], "µs", ["period"]),
+        ("damping_estimate", "Damping estimate", ("θ̂₁", "θ̂₂", "θ̂₃"), "N·m·s/rad", ["estimated"]),
+        ("z_norm", "Error of Theorem 1", ["‖z‖"], "1", ("measured", "true")),
+        ("lyapunov", "Lyapunov function", ["V"], "N·m", ("measured, without θ̃", true_V)),
+    ]
+    return [
+        PanelColumn(group, title, label, unit, line)
+        for group, title, labels, unit, lines in panels
+        for label in labels
+        for line in lines
+    ]
 
 
 def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
@@ -84,13 +104,11 @@ def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
         columns: Their descriptions.
         values: Shape (n, columns).
     """
-    panels = []
-    drawn = [(column, values[:, i]) for i, column in enumerate(columns) if (values[:, i] == values[:, i]).any()]
-    for (group, title, label, unit), lines in groupby(drawn, key=lambda pair: pair[0][:4]):
-        panels.append(
-            Panel(group, title, label, unit, [Line(column.line, found, column.desired) for column, found in lines])
-        )
-    return panels
+    drawn = [(column, values[:, i]) for i, column in enumerate(columns) if not np.isnan(values[:, i]).all()]
+    return [
+        Panel(group, title, label, unit, [Line(kept.line, found, kept.line == "desired") for kept, found in lines])
+        for (group, title, label, unit), lines in groupby(drawn, key=lambda pair: pair[0][:4])
+    ]
 
 
 def with_level(panels: list[Panel], group: str, label: str, level: float | None) -> list[Panel]:
@@ -103,31 +121,3 @@ def with_level(panels: list[Panel], group: str, label: str, level: float | None)
         else panel
         for panel in panels
     ]
-
-
-def _columns(case: Case, actuators: int, *, theta: bool) -> Iterator[PanelColumn]:
-    def titled(name: str, quantity: str) -> str:
-        return title_of(name, quantity, case)
-
-    for label in ("η", "ε₁", "ε₂", "ε₃"):
-        yield PanelColumn("attitude", titled("attitude", "Attitude"), label, "1", "measured")
-        yield PanelColumn("attitude", titled("attitude", "Attitude"), label, "1", "desired", desired=True)
-    for label in ("ω₁", "ω₂", "ω₃"):
-        yield PanelColumn("rate", titled("rate", "Angular velocity"), label, "rad/s", "measured")
-        yield PanelColumn("rate", titled("rate", "Angular velocity"), label, "rad/s", "desired", desired=True)
-    for label in ("ε̃₁", "ε̃₂", "ε̃₃"):
-        yield PanelColumn("attitude_error", titled("error", "Attitude error"), label, "1", "measured")
-    for label in ("ω_e1", "ω_e2", "ω_e3"):
-        yield PanelColumn("rate_error", titled("rate_error", "Angular velocity error"), label, "rad/s", "measured")
-    for label in ("u₁", "u₂", "u₃")[3 - actuators :]:
-        yield PanelColumn("input", titled("input", "Input"), label, "V", "commanded")
-    yield PanelColumn("error_angle", "Attitude error, as an angle", "angle", "deg", "measured")
-    yield PanelColumn("error_angle", "Attitude error, as an angle", "angle", "deg", "true")
-    yield PanelColumn("latency", "Loop latency", "latency", "µs", "latency")
-    yield PanelColumn("period", "Period between measurements", "period", "µs", "period")
-    for label in ("θ̂₁", "θ̂₂", "θ̂₃"):
-        yield PanelColumn("damping_estimate", "Damping estimate", label, "N·m·s/rad", "estimated")
-    yield PanelColumn("z_norm", "Error of Theorem 1", "‖z‖", "1", "measured")
-    yield PanelColumn("z_norm", "Error of Theorem 1", "‖z‖", "1", "true")
-    yield PanelColumn("lyapunov", "Lyapunov function", "V", "N·m", "measured, without θ̃")
-    yield PanelColumn("lyapunov", "Lyapunov function", "V", "N·m", "true, with θ̃" if theta else "true, without θ̃")

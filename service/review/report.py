@@ -10,16 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.traces import Array, Missing
 
 
-class Spread(BaseModel):
+class Spread(BaseModel, frozen=True):
     """Distribution of a duration: percentiles, and a histogram of bins 4.4 % wide."""
-
-    model_config = ConfigDict(frozen=True)
 
     count: int
     p50: float = Field(description="[µs]")
@@ -30,20 +28,16 @@ class Spread(BaseModel):
     bins: list[tuple[float, int]] = Field(description="lower edge [µs] and count of every bin that is not empty")
 
 
-class Gap(BaseModel):
+class Gap(BaseModel, frozen=True):
     """Ticks in a row that no command answered."""
-
-    model_config = ConfigDict(frozen=True)
 
     time_s: float = Field(description="the first of them, on the law's clock [s]")
     tick: int
     ticks: int
 
 
-class Mark(BaseModel):
+class Mark(BaseModel, frozen=True):
     """An event on the time axis: an event message, a change of gains or reference, a loss."""
-
-    model_config = ConfigDict(frozen=True)
 
     time_s: float | None = Field(description="on the law's clock [s]; null if outside the session")
     kind: str = Field(description="`tripped`, `fault`, `change`, `lost`… as in the log's events")
@@ -51,20 +45,16 @@ class Mark(BaseModel):
     text: str
 
 
-class Check(BaseModel):
+class Check(BaseModel, frozen=True):
     """A limit, and whether it holds."""
-
-    model_config = ConfigDict(frozen=True)
 
     text: str = Field(description="such as `z_track ≤ 0.005`")
     holds: bool
     found: str = Field(description="what was found, with its unit")
 
 
-class LemmaCheck(BaseModel):
+class LemmaCheck(BaseModel, frozen=True):
     """An inequality of Lemma 1, or of those that it builds on, checked at true states."""
-
-    model_config = ConfigDict(frozen=True)
 
     equation: str = Field(description="number in the paper")
     what: str = Field(description="its left-hand side, in the paper's letters")
@@ -75,13 +65,11 @@ class LemmaCheck(BaseModel):
     broken_s: float | None = Field(description="when it was first broken [s]; null where never")
 
 
-class TheoremFindings(BaseModel):
+class TheoremFindings(BaseModel, frozen=True):
     """What Theorem 1 guarantees for a session, and what the session did.
 
     The transient lasts three times the law's slower time constant: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
     """
-
-    model_config = ConfigDict(frozen=True)
 
     verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
     holds: bool | None = Field(description="null where nothing can be promised")

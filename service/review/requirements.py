@@ -17,17 +17,11 @@ UNITS: Final[dict[str, str]] = {
     "u_total": "V²·s",
     "max_error_deg": "°",
     "final_error_deg": "°",
-    "skipped_ticks": "",
-    "trips": "",
-    "gap_count": "",
-    "losses": "",
-    "lapses": "",
-    "missing_ticks": "",
-    "invalid": "",
-    "damages": "",
+    **dict.fromkeys(
+        ("skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks", "invalid", "damages"), ""
+    ),
     **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
-    **{f"timing.latency.{name}": "µs" for name in _PERCENTILES},
-    **{f"timing.{way}.{name}": "µs" for way in _SPREADS[1:] for name in _PERCENTILES},
+    **{f"timing.{spread}.{name}": "µs" for spread in _SPREADS for name in _PERCENTILES},
     **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
     **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
     **{f"theorem.{name}": "" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "broken")},
@@ -54,8 +48,20 @@ class LimitError(AeroloopError):
     """Not a limit; one line with the correct form."""
 
 
+def value_of(figures: Figures, path: str) -> float | None:
+    """Value of a dotted path; None if unavailable. A list counts by its length, counts by name by their sum."""
+    found: object = figures
+    for part in path.split("."):
+        found = found.get(part) if isinstance(found, dict) else getattr(found, part, None)
+    if isinstance(found, list):
+        return len(found)
+    if isinstance(found, dict):
+        return float(sum(found.values()))
+    return found if isinstance(found, int | float) else None
+
+
 class Limit(NamedTuple):
-    """Upper limit of a figure. A list counts by its length, counts by name by their sum."""
+    """Upper limit of a figure, as `value_of` finds it."""
 
     figure: str
     most: float
@@ -73,14 +79,7 @@ class Limit(NamedTuple):
 
     def value(self, figures: Figures) -> float | None:
         """The figure's value; None if it is unavailable."""
-        found: object = figures
-        for part in SHORT.get(self.figure, self.figure).split("."):
-            found = found.get(part) if isinstance(found, dict) else getattr(found, part, None)
-        if isinstance(found, list):
-            return len(found)
-        if isinstance(found, dict):
-            return float(sum(found.values()))
-        return found if isinstance(found, int | float) else None
+        return value_of(figures, SHORT.get(self.figure, self.figure))
 
     def broken(self, figures: Figures) -> str | None:
         """Why it does not hold, in a line; None if it does. It does not hold for an unavailable figure."""
@@ -96,5 +95,5 @@ class Limit(NamedTuple):
         space = "" if unit in ("", "°") else " "
         reasons = (why for key, why in findings.reasons.items() if name == key or name.startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
-        holds = self.broken(findings) is None
-        return Check(text=f"{self.figure} ≤ {self.most:g}{space}{unit}", holds=holds, found=found)
+        text = f"{self.figure} ≤ {self.most:g}{space}{unit}"
+        return Check(text=text, holds=self.broken(findings) is None, found=found)

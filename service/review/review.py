@@ -21,7 +21,7 @@ from aeroloop.service.logs.runs import Run, Taker
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.logs.wire_check import WireCheck
-from aeroloop.service.review.certificate_cache import CertificateCache, damping_of
+from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.findings import facts_of, findings_of, name_of
 from aeroloop.service.review.report import Findings, Report
@@ -97,11 +97,10 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         vehicle, files = which[0], run.files
         settings, plant = files.settings(vehicle), files.plant(vehicle)
         description = files.descriptions.get((vehicle, "controller"))
-        cache = CertificateCache(settings, description.certificate if description else None)
-        damping = damping_of(plant)
 
         def check(changes: Sequence[Change]) -> TheoremCheck:
-            return TheoremCheck(cache.of(changes), settings.loop.period, damping)
+            certified = certified_bounds(settings, changes, description.certificate if description else None)
+            return TheoremCheck(certified, settings.loop.period, damping_of(plant))
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
         session = Session(settings, plant.watchdog_s, check, missing, watch)
@@ -120,19 +119,11 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         session.finish()
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    figures = _figures(session, events, run, which)
-    findings = findings_of(figures, which, session, events, run)
-    findings = findings.model_copy(update={"frames": frames.findings()})
-    return Review(figures, findings, session, which, name_of(paths), facts_of(run, events, vehicle))
-
-
-def _figures(session: Session, events: EventLog, run: Run, which: SessionKey) -> Figures:
-    reasons: dict[str, str] = {}
-    plant = events.statuses.get((which[0], "plant"))
-    latency = plant.latency_us if plant else None
-    if latency is None:
-        reasons["latency_us"] = "the log has no status of the plant with a latency"
-    files = run.files
-    return session.score.figures(
+    status = events.statuses.get((vehicle, "plant"))
+    latency = status.latency_us if status else None
+    reasons = {} if latency else {"latency_us": "the log has no status of the plant with a latency"}
+    figures = session.score.figures(
         latency=latency, log=files.name, trips=events.trips, reasons=reasons, damages=files.unread
     )
+    findings = findings_of(figures, which, session, events, run, frames.findings())
+    return Review(figures, findings, session, which, name_of(paths), facts_of(run, events, vehicle))

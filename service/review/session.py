@@ -80,12 +80,10 @@ class Session:
 
     def take(self, block: Block) -> None:
         """Review the next block."""
-        if self._observer is None:
-            self._observer = Observer(self.settings, self._check(block.changes))
-        observer, check = self._observer, self._observer.trial
-        check.changed(block.changes)
+        observer = self._observer = self._observer or Observer(self.settings, self._check(block.changes))
+        observer.trial.changed(block.changes)
         self._session = block.which[1]
-        self._add_truths(check)
+        self._add_truths(observer.trial)
         self._count(block)
         found = self.reader.take(block)
         for tick in found.missed.tolist():

@@ -22,7 +22,7 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
-from aeroloop.service.review.certificate_cache import CertifiedBounds
+from aeroloop.service.review.certified_bounds import CertifiedBounds
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem.lemma import (
     Inequality,
@@ -98,6 +98,7 @@ class TheoremCheck:
 
     Attributes:
         damping_known: Whether θ is known.
+        radius: Where ‖z‖ is guaranteed to end; None without a guarantee.
     """
 
     def __init__(self, certified: CertifiedBounds, period: float, damping: Vector | None) -> None:
@@ -105,6 +106,7 @@ class TheoremCheck:
         self._period = period
         self._damping = damping
         self.damping_known = damping is not None
+        self.radius = certified.radius
         self._changes: list[Change] = []  # the first few
         self._since, self._until = 0, inf
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
@@ -141,7 +143,9 @@ class TheoremCheck:
             ‖z‖, measured and true V, shape (n, 4).
         """
         z, V = measured_norm(ticks, self._certified.law)
-        self._settle(ticks, z)
+        if (after := (ticks.k >= self._settled) & (ticks.k < self._until)).any():
+            square = (ticks.attitude_error[after] ** 2).sum(axis=1)
+            self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
         true = np.full((3, len(z)), nan)
         before, self._before = self._before, ticks
         if self._truths and self._truths[0][0] <= ticks.k[-1]:
@@ -159,11 +163,7 @@ class TheoremCheck:
             self._judge_truths(self._before)
 
     def _judge_truths(self, ticks: Ticks) -> Array | None:
-        """Judge the true states of these ticks.
-
-        Returns:
-            Tick, true ‖z‖, V and error [deg] of each, shape (n, 4); None without one.
-        """
+        """Judge the true states of these ticks: tick, ‖z‖, V, error [deg] of each, shape (n, 4); None without one."""
         truths = self._take_truths(int(ticks.k[0]), int(ticks.k[-1]))
         place = np.searchsorted(ticks.k, truths.k)
         there = ticks.k[place] == truths.k
@@ -171,13 +171,6 @@ class TheoremCheck:
             return None
         at = ticks.where(place[there])
         return np.column_stack([at.k, *self._judge_lemma(at, Truths(*(column[there] for column in truths)))])
-
-    def _settle(self, ticks: Ticks, z: Array) -> None:
-        """Update the largest ‖z‖ and attitude error after the transient."""
-        after = (ticks.k >= self._settled) & (ticks.k < self._until)
-        if after.any():
-            square = (ticks.attitude_error[after] ** 2).sum(axis=1)
-            self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
 
     def _take_truths(self, first: int, last: int) -> Truths:
         """Truths of these ticks; earlier ones are dropped, later ones wait."""
@@ -222,11 +215,6 @@ class TheoremCheck:
                 self._counts.setdefault(inequality.equation, InequalityCount(inequality)).add(inequality, judged, time)
 
     # ── results ──
-
-    @property
-    def radius(self) -> float | None:
-        """Where ‖z‖ is guaranteed to end; None without a guarantee."""
-        return self._certified.radius
 
     def findings(self) -> tuple[TheoremFindings, dict[str, str]]:
         """Findings, and the reason of each that is null, by name."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from math import degrees
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -22,8 +22,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
+from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import paper
 
@@ -35,56 +36,55 @@ if TYPE_CHECKING:
     from aeroloop.service.lab.demo import Progress as DemoProgress
     from aeroloop.service.lab.tables import Tables
 
+LABELS: Final = 22
+"""Width of the column of labels."""
+
 _stderr = Console(stderr=True)
 
 
 def figures_table(figures: Figures) -> None:
     """Print figures of merit."""
-    rows: list[tuple[str, str]] = [
-        ("duration", f"{figures.duration_s:g} s"),
-        ("z_track", _or_reason(figures, "z_track", lambda z: f"{z:.6f}   ({z * 1e4:.2f} ×10⁻⁴)")),
-        ("u_total", _or_reason(figures, "u_total", lambda u: f"{u:.1f} V²·s")),
-        ("largest attitude error", _or_reason(figures, "max_error_deg", lambda e: f"{e:.2f}°")),
-        ("final attitude error", _or_reason(figures, "final_error_deg", lambda e: f"{e:.2f}°")),
-    ]
+
+    def shown(name: str, text: Callable[[Any], str]) -> str:
+        value = getattr(figures, name)
+        return f"— ({figures.reasons.get(name, 'not measured')})" if value is None else text(value)
+
+    table = labelled()
+    table.add_row("duration", f"{figures.duration_s:g} s")
+    table.add_row("z_track", shown("z_track", lambda z: f"{z:.6f}   ({z * 1e4:.2f} ×10⁻⁴)"))
+    table.add_row("u_total", shown("u_total", "{:.1f} V²·s".format))
+    table.add_row("largest attitude error", shown("max_error_deg", "{:.2f}°".format))
+    table.add_row("final attitude error", shown("final_error_deg", "{:.2f}°".format))
     for name, stream in (("measurements", figures.measurement), ("commands", figures.command)):
         if stream.frames_per_s is not None and stream.bits_per_s is not None:
-            rows.append((name, f"{stream.frames_per_s:.1f} frames/s, {stream.bits_per_s:.0f} payload bits/s"))
-    rows.append(("skipped ticks", _or_reason(figures, "skipped_ticks", lambda n: f"{n:.0f}")))
-    latency = figures.latency_us
-    rows.append(
-        (
-            "loop latency",
-            f"p50 {latency.p50:.0f} µs, p99 {latency.p99:.0f} µs"
-            if latency
-            else f"— ({figures.reasons.get('latency_us', 'not measured')})",
-        )
-    )
+            table.add_row(name, f"{stream.frames_per_s:.1f} frames/s, {stream.bits_per_s:.0f} payload bits/s")
+    table.add_row("skipped ticks", shown("skipped_ticks", "{:.0f}".format))
+    table.add_row("loop latency", shown("latency_us", "p50 {0.p50:.0f} µs, p99 {0.p99:.0f} µs".format))
     for trip in figures.trips:
-        rows.append(("tripped", trip))
+        table.add_row("tripped", trip)
     for damage in figures.damages:
-        rows.append(("not read", damage))
+        table.add_row("not read", damage)
     if figures.log:
-        rows.append(("log", figures.log))
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for row in rows:
-        table.add_row(*row)
+        table.add_row("log", figures.log)
     Console().print(table)
 
 
-def _or_reason(figures: Figures, name: str, text: Callable[[float], str]) -> str:
-    value = getattr(figures, name)
-    return f"— ({figures.reasons.get(name, 'not measured')})" if value is None else text(value)
+def labelled() -> Table:
+    """An empty table of labels and texts."""
+    labels, texts = Column(style="bold", no_wrap=True, min_width=LABELS), Column(overflow="fold")
+    return Table(labels, texts, show_header=False, box=None, pad_edge=False)
+
+
+def p50_p99(spread: Percentiles | None) -> str:
+    """Median and 99th percentile [µs]; a dash without any."""
+    return f"{spread.p50:.0f}/{spread.p99:.0f} µs" if spread else "–"
 
 
 @contextmanager
 def _bar(title: str, total: float | None, hidden: bool, *columns: ProgressColumn) -> Iterator[Callable[..., None]]:
     shown = not hidden and _stderr.is_terminal
-    with Progress(
-        TextColumn(title), BarColumn(), *columns, console=_stderr, transient=True, disable=not shown
-    ) as progress:
+    drawn = (TextColumn(title), BarColumn(), *columns)
+    with Progress(*drawn, console=_stderr, transient=True, disable=not shown) as progress:
         yield partial(progress.update, progress.add_task(title, total=total))
 
 
@@ -122,29 +122,22 @@ def paper_tables(tables: Tables) -> None:
             grid.add_column("cont" if out is None else f"{out} bits", justify="right")
         for i, inp in enumerate(paper.INPUT_BITS):
             spread = table.spread[i] if table.spread else [None] * len(paper.OUTPUT_BITS)
-            cells = [
-                _beside(mine, theirs, deviation, digits)
-                for mine, theirs, deviation in zip(table.ours[i], table.paper[i], spread, strict=True)
-            ]
-            grid.add_row("cont" if inp is None else f"{inp} bits", *cells)
+            cells = zip(table.ours[i], table.paper[i], spread, strict=True)
+            grid.add_row("cont" if inp is None else f"{inp} bits", *(_beside(*cell, digits) for cell in cells))
         console.print(grid)
         console.print(f"mean absolute relative error of the 23 predicted cells: {table.mare:.1%}\n")
     grid = Table("", title="with and without wind, Table C.4: ours (paper's)", title_justify="left", box=None)
     for air in ("calm", "wind"):
         grid.add_column(f"z_track, {air}", justify="right")
         grid.add_column(f"u_total, {air}", justify="right")
-    for case, rows in tables.C4.ours.items():
-        cells = [
-            _beside(
-                rows[air][name],
-                tables.C4.paper[case][air][name],
-                tables.C4.spread[case][air][name] if tables.C4.spread else None,
-                digits,
-            )
+    for case, ours in tables.C4.ours.items():
+        theirs, spreads = tables.C4.paper[case], tables.C4.spread[case] if tables.C4.spread else None
+        shown = [
+            _beside(ours[air][name], theirs[air][name], spreads and spreads[air][name], digits)
             for air in ("calm", "wind")
             for name, digits in (("z_track_1e-4", 1), ("u_total", 0))
         ]
-        grid.add_row(case, *cells)
+        grid.add_row(case, *shown)
     console.print(grid)
     console.print(f"mean absolute relative error of the predicted windy cell: {tables.C4.mare:.1%}")
 
@@ -157,18 +150,10 @@ def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> st
 def calibration_table(fit: Calibration) -> None:
     """Print the fitted values beside independent measurements."""
     table = Table("parameter", "fitted", "elsewhere", "what that is", box=None)
-    table.add_row(
-        "plant.friction.coulomb, yaw",
-        f"{fit.yaw_coulomb:.6f} N·m",
-        f"{fit.yaw_coulomb_measured} N·m",
-        "measured from spin-downs of another Aero",
-    )
-    table.add_row(
-        "plant.aero.centre_of_mass, z",
-        f"{fit.centre_of_mass_height:.6f} m",
-        f"{fit.centre_of_mass_height_paper} m",
-        "Table C.1, the value in the controller's model",
-    )
+    fitted, measured = f"{fit.yaw_coulomb:.6f} N·m", f"{fit.yaw_coulomb_measured} N·m"
+    table.add_row("plant.friction.coulomb, yaw", fitted, measured, "measured from spin-downs of another Aero")
+    fitted, published = f"{fit.centre_of_mass_height:.6f} m", f"{fit.centre_of_mass_height_paper} m"
+    table.add_row("plant.aero.centre_of_mass, z", fitted, published, "Table C.1, the value in the controller's model")
     pitch, yaw = fit.wind_torque
     table.add_row("plant.wind.torque", f"{pitch:.6f}, {yaw:.6f} N·m", "–", "the paper's fan was not measured")
     Console().print(table)
@@ -190,9 +175,8 @@ def diagnosis_table(diagnosis: Diagnosis) -> None:
     for finding in diagnosis.findings:
         table.add_row("✓" if finding.good else "✗", finding.what, finding.found, "" if finding.good else finding.advice)
     Console().print(table)
-    Console().print(
-        f"this machine {'holds' if diagnosis.holds else 'does not hold'} {diagnosis.rate_hz:g} Hz", style="bold"
-    )
+    holds = "holds" if diagnosis.holds else "does not hold"
+    Console().print(f"this machine {holds} {diagnosis.rate_hz:g} Hz", style="bold")
 
 
 def status_table(found: Statuses) -> None:
@@ -200,26 +184,22 @@ def status_table(found: Statuses) -> None:
     table = Table("vehicle", "role", "state", "rate", "skipped", "latency p50/p99", "up", "", box=None)
     for vehicle, roles in sorted(found.items()):
         for role, status in sorted(roles.items()):
-            latency = status.latency_us
-            table.add_row(
-                vehicle,
-                role,
-                status.state,
+            figures = (
                 f"{status.rate_hz:.0f}/s",
                 str(status.skipped),
-                f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
+                p50_p99(status.latency_us),
                 f"{status.uptime_s:.0f} s",
-                "; ".join([*([status.cause] if status.cause else []), *status.notes]),
             )
+            notes = [*([status.cause] if status.cause else []), *status.notes]
+            table.add_row(vehicle, role, status.state, *figures, "; ".join(notes))
     Console().print(table)
 
 
 @contextmanager
 def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
     """The demo's live view on stderr: a bar and a line of figures."""
-    bar = Progress(
-        BarColumn(), TextColumn("{task.completed:5.1f}/{task.total:g} s"), TimeRemainingColumn(), console=_stderr
-    )
+    seconds = TextColumn("{task.completed:5.1f}/{task.total:g} s")
+    bar = Progress(BarColumn(), seconds, TimeRemainingColumn(), console=_stderr)
     task = bar.add_task("", total=total_s)
     with Live(bar, console=_stderr, refresh_per_second=10, transient=True) as live:
 
@@ -241,14 +221,8 @@ def soak_table(soak: Soak) -> None:
     console = Console()
     loop = Table("at", "missed ticks", "unanswered", "latency p50/p99", "wake-up p50/p99", box=None)
     for minute in soak.minutes:
-        latency, wake = minute.latency_us, minute.wake_us
-        loop.add_row(
-            f"{minute.at_s:.0f} s",
-            str(minute.skipped),
-            str(minute.unanswered),
-            f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
-            f"{wake.p50:.0f}/{wake.p99:.0f} µs" if wake else "–",
-        )
+        counts = str(minute.skipped), str(minute.unanswered)
+        loop.add_row(f"{minute.at_s:.0f} s", *counts, p50_p99(minute.latency_us), p50_p99(minute.wake_us))
     console.print(loop)
     console.print()
     growth = Table("process", "memory", "threads", "open files", "CPU", box=None)

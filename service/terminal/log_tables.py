@@ -7,17 +7,14 @@ from math import log2
 from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.service.review.report import Findings, Mark, Spread, TheoremFindings
-from aeroloop.service.terminal.display import figures_table
+from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 
 if TYPE_CHECKING:
     from aeroloop.service.logs.replay import Replay
-
-LABELS: Final = 22
-"""Width of the column of labels, as in the table of figures."""
 
 MARKS_SHOWN: Final = 12
 _TIMINGS: Final = {
@@ -27,7 +24,6 @@ _TIMINGS: Final = {
     "command_delay": "controller to plant",
 }
 _BARS: Final = "▁▂▃▄▅▆▇█"
-_SPARK_WIDTH: Final = 22
 
 
 def review_account(findings: Findings) -> None:
@@ -38,7 +34,7 @@ def review_account(findings: Findings) -> None:
     if findings.timing:
         console.print(_timing_table(findings))
         console.print()
-    table = _labelled()
+    table = labelled()
     for label, text in _rows(findings):
         table.add_row(label, text)
     console.print(table)
@@ -57,20 +53,14 @@ def review_account(findings: Findings) -> None:
         console.print(checks)
 
 
-def _labelled() -> Table:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True, min_width=LABELS)
-    table.add_column(overflow="fold")
-    return table
-
-
 def _timing_table(findings: Findings) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="")
-    table.add_column("", style="bold", no_wrap=True, min_width=LABELS)
-    for name in ("p50", "p99", "p99.9", "max"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    table.add_column("", no_wrap=True)
+    labels, unit, bars = (
+        Column(style="bold", no_wrap=True, min_width=LABELS),
+        Column(no_wrap=True),
+        Column(no_wrap=True),
+    )
+    values = (Column(name, justify="right", no_wrap=True) for name in ("p50", "p99", "p99.9", "max"))
+    table = Table(labels, *values, unit, bars, box=None, pad_edge=False, header_style="")
     for name, spread in findings.timing.items():
         percentiles = (spread.p50, spread.p99, spread.p999, spread.max)
         table.add_row(_TIMINGS[name], *(f"{us:.0f}" for us in percentiles), "µs", sparkline(spread))
@@ -79,7 +69,7 @@ def _timing_table(findings: Findings) -> Table:
     return table
 
 
-def sparkline(spread: Spread, width: int = _SPARK_WIDTH) -> str:
+def sparkline(spread: Spread, width: int = 22) -> str:
     """The distribution as a row of bars: logarithm of the count over logarithm of the duration.
 
     Why logarithms: a single late tick in a million stays visible.
@@ -100,10 +90,8 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "gaps", f"{findings.gap_count}, the longest {ticks} at {longest.time_s:.3f} s"
     else:
         yield "gaps", "none"
-    yield (
-        "at the outermost level",
-        ", ".join(f"{name} {100 * share:.2f} %" for name, share in findings.saturated.items()),
-    )
+    shares = (f"{name} {100 * share:.2f} %" for name, share in findings.saturated.items())
+    yield "at the outermost level", ", ".join(shares)
     for name, count in findings.invalid.items():
         if count:
             yield f"invalid {name}s", str(count)
@@ -125,7 +113,7 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
 
 def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
     """The theorem's bounds beside the run's values."""
-    table = _labelled()
+    table = labelled()
 
     def row(label: str, name: str, form: Callable[[float], str]) -> None:
         value = getattr(found, name)
@@ -163,11 +151,9 @@ def _lemma(findings: Findings, found: TheoremFindings) -> str:
 
 
 def _marks_table(marks: Sequence[Mark]) -> Table:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(justify="right", no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
+    times, texts = Column(justify="right", no_wrap=True), Column(overflow="fold")
+    roles, kinds = Column(no_wrap=True), Column(no_wrap=True)
+    table = Table(times, roles, kinds, texts, show_header=False, box=None, pad_edge=False)
     for mark in marks[:MARKS_SHOWN]:
         style = "bold red" if mark.kind in ("tripped", "fault") else ""
         when = "–" if mark.time_s is None else f"{round(mark.time_s, 3) + 0.0:.3f} s"
@@ -182,15 +168,12 @@ def replay_table(replay: Replay) -> None:
     console = Console()
     table = Table("session", "from tick", "ticks", "differ", "rms", "largest", "u_total", box=None)
     for session in replay.sessions:
-        table.add_row(
-            f"{session.vehicle}/{session.session}",
-            str(session.first_tick) if session.first_tick is not None else "–",
-            str(session.ticks),
-            str(session.differ),
-            f"{session.rms_v:.3f} V" if session.rms_v is not None else "–",
-            f"{session.max_v:.2f} V" if session.max_v is not None else "–",
-            f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s",
-        )
+        first_tick = "–" if session.first_tick is None else str(session.first_tick)
+        rms = "–" if session.rms_v is None else f"{session.rms_v:.3f} V"
+        largest = "–" if session.max_v is None else f"{session.max_v:.2f} V"
+        efforts = f"{session.u_total_logged:.1f} → {session.u_total_computed:.1f} V²·s"
+        counts = str(session.ticks), str(session.differ)
+        table.add_row(f"{session.vehicle}/{session.session}", first_tick, *counts, rms, largest, efforts)
     console.print(table)
     for session in replay.sessions:
         if (first := session.first_difference) is not None:

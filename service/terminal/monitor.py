@@ -25,6 +25,7 @@ from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.protocol.wire.attitude import angle, to_euler
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.host.bandwidth import PayloadRate
+from aeroloop.service.terminal.display import p50_p99
 
 REFRESH_S: Final = 0.2
 SILENT_S: Final = 3.0
@@ -107,17 +108,13 @@ def _roles(vehicle: Vehicle) -> Table:
         "role", "state", "rate", "skipped", "latency", "answers in", "wake-up", "received", "", box=None, pad_edge=False
     )
     for role, (received, status) in sorted(vehicle.statuses.items()):
-        latency, timing = status.latency_us, status.timing
-        age, sample = time.monotonic() - received, status.age_us
-        wake = timing.recent_wake if timing else None
+        age, wake = time.monotonic() - received, status.timing.recent_wake if status.timing else None
         table.add_row(
             role,
             status.state if age < SILENT_S else "silent",
             f"{status.rate_hz:.0f}/s",
             str(status.skipped),
-            f"{latency.p50:.0f}/{latency.p99:.0f} µs" if latency else "–",
-            f"{sample.p50:.0f}/{sample.p99:.0f} µs" if sample else "–",
-            f"{wake.p50:.0f}/{wake.p99:.0f} µs" if wake else "–",
+            *(p50_p99(spread) for spread in (status.latency_us, status.age_us, wake)),
             f"{age:.1f} s ago",
             status.cause or "",
             style="" if age < SILENT_S else "dim",

@@ -5,43 +5,30 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Column, Table
 
-from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
 from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
 from aeroloop.protocol.wire.quantizer import Quantizer, UniformQuantizer
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import WireSpec
 
 
 def wire_table(wire: WireSpec) -> None:
     """Print a wire spec: each signal's quantizer, each frame's size."""
     console = Console()
     table = Table("signal", Column("kind", no_wrap=True), "bits", "limit", "step", "largest error", box=None)
-    signals: dict[str, tuple[SignalSpec, str]] = {
-        "ε attitude": (wire.attitude, ""),
-        "ω rate": (wire.rate, " rad/s"),
-        "u voltage": (wire.voltage, " V"),
-    }
+    signals = (("ε attitude", wire.attitude, ""), ("ω rate", wire.rate, " rad/s"), ("u voltage", wire.voltage, " V"))
     notes = list[str]()
-    for name, (signal, unit) in signals.items():
+    for name, signal, unit in signals:
         quantizer = signal.quantizer()
         step, note = _steps(quantizer, unit)
         if note is not None:
             notes.append(f"{name}: {note}")
-        continuous = signal.bits is None
-        table.add_row(
-            name,
-            "–" if continuous else signal.kind,
-            "cont" if continuous else str(signal.bits),
-            f"±{signal.limit:g}{unit}",
-            step,
-            f"{quantizer.bound:.6g}{unit}",
-        )
+        kind, bits = ("–", "cont") if signal.bits is None else (signal.kind, str(signal.bits))
+        table.add_row(name, kind, bits, f"±{signal.limit:g}{unit}", step, f"{quantizer.bound:.6g}{unit}")
     console.print(table)
     for note in notes:
         console.print(note, highlight=False)
-    frames: tuple[tuple[str, FrameFormat], ...] = (("measurement", wire.measurement), ("command", wire.command))
-    for label, kind in frames:
-        console.print(f"{label}: {kind.bits} bits in {kind.size} bytes, {kind.counter_bits} of them the counter")
+    for label, frame in (("measurement", wire.measurement), ("command", wire.command)):
+        console.print(f"{label}: {frame.bits} bits in {frame.size} bytes, {frame.counter_bits} of them the counter")
 
 
 def _steps(quantizer: Quantizer, unit: str) -> tuple[str, str | None]:

@@ -118,12 +118,7 @@ class ForkServer:
         self._process.wait()
 
     def start(self, arguments: Sequence[str], environment: Mapping[str, str], stderr: int) -> ForkedProcess:
-        """Run `aeroloop` with these arguments, in this folder and in a new process session.
-
-        Args:
-            arguments: Words after `aeroloop`.
-            environment: The child's whole environment.
-            stderr: File descriptor of the child's standard error.
+        """Run `aeroloop` with these arguments and no other environment, in this folder and a new process session.
 
         Raises:
             OSError: The server has died.

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Condition
-from types import TracebackType
 from typing import Any, Final, Literal, Self
 
 import zenoh
@@ -134,9 +133,7 @@ class Hil:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.finish()
 
     def start(
@@ -208,18 +205,14 @@ class Hil:
             plant = self._statuses.get("plant")
             return plant is not None and (plant.ticks >= self._requested_ticks or plant.session is None)
 
-        self.eventually(
-            f"{seconds:g} s in lockstep",
-            over,
-            PATIENCE_S + PATIENCE_PER_STEP_S * self.settings.loop.ticks(seconds),
-        )
+        patience_s = PATIENCE_S + PATIENCE_PER_STEP_S * self.settings.loop.ticks(seconds)
+        self.eventually(f"{seconds:g} s in lockstep", over, patience_s)
         self.processes.check()
 
     def inject(self, fault: str | None) -> None:
-        """Inject a fault into the emulated plant, now or later: `signal:kind[=value][@start[..end]]`.
+        """Inject a fault into the emulated plant, its times in seconds from now: `signal:kind[=value][@start[..end]]`.
 
-        Args:
-            fault: The fault, its times in seconds from now; None clears all faults.
+        None clears all faults.
 
         Raises:
             HilError: The fault is malformed, or the plant is not emulated.
@@ -274,11 +267,7 @@ class Hil:
         return any(event.kind == kind and text in event.text for event in self.events)
 
     def eventually(self, what: str, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
-        """Wait until a condition on the loop holds.
-
-        Raises:
-            HilError: It did not hold in time.
-        """
+        """Wait until a condition on the loop holds. Raises HilError if it does not hold in time."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while not condition():

@@ -16,8 +16,7 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Literal, Self
+from typing import Any, Final, Literal, Self, get_args
 
 import zenoh
 
@@ -26,6 +25,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.transport.network import join
 from aeroloop.service.config import ENV_PREFIX, Settings
+from aeroloop.service.recording.rolling import parts
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
 
 RoleName = Literal["controller", "plant", "can-node", "recorder"]
@@ -57,11 +57,27 @@ def private_bus(can: CanSettings) -> CanSettings:
     return can.model_copy(update={"options": {"hop_limit": 0, "port": port, **can.options}})
 
 
-class ProcessGroup:
-    """Processes of one network on this machine. A context: leaving it stops them all.
+def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
+    """The settings of a loop that arms by itself and records to a new log, on a free rendezvous and bus.
 
-    Args:
-        settings: The configuration of every process.
+    Raises:
+        ProcessGroupError: The log exists.
+    """
+    if parts(log):
+        raise ProcessGroupError(f"{log} exists, and a log is never written over; name another with --log PATH")
+    controller |= {"require_recorder": True, "auto_arm": True}
+    return settings.model_copy(
+        update={
+            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
+            "controller": settings.controller.model_copy(update=controller),
+            "can": private_bus(settings.can),
+            "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
+        }
+    )
+
+
+class ProcessGroup:
+    """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
     Attributes:
         zenoh: A session on their network.
@@ -82,11 +98,8 @@ class ProcessGroup:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        roles: tuple[RoleName, ...] = ("controller", "plant", "can-node", "recorder")
-        for role in roles:
+    def __exit__(self, *exception: object) -> None:
+        for role in get_args(RoleName):  # the controller first, the recorder last
             if role in self._children:
                 self.stop(role)
         self.zenoh.close()
@@ -111,10 +124,9 @@ class ProcessGroup:
         server = None if environment else fork_server()
         parent = server.pid if server else os.getpid()
         words = [role, "--config", str(self._config), f"--with-parent={parent}", "--quiet", *arguments]
-        child: Child
         with self._log(role).open("ab") as stderr:
             if server:
-                child = server.start(words, inherited, stderr.fileno())
+                child: Child = server.start(words, inherited, stderr.fileno())
             else:
                 child = subprocess.Popen(
                     [sys.executable, "-P", "-m", "aeroloop", *words],
@@ -169,17 +181,12 @@ class ProcessGroup:
 
     def replace_log(self, path: Path) -> None:
         """Set the path of the log for recorders started from now on."""
-        self._settings = self._settings.model_copy(
-            update={"recorder": self._settings.recorder.model_copy(update={"path": path})}
-        )
+        recorder = self._settings.recorder.model_copy(update={"path": path})
+        self._settings = self._settings.model_copy(update={"recorder": recorder})
         self._config.write_text(self._settings.toml())
 
     def check(self) -> None:
-        """Raise if any process has failed.
-
-        Raises:
-            ProcessGroupError: With its last log line.
-        """
+        """Raise ProcessGroupError, with its last log line, if any process has failed."""
         for role in self._children:
             self._check(role)
 

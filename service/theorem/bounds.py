@@ -68,17 +68,11 @@ class Known:
     k_theta: Annotated[
         float, Term("k_θ", "Assumption 2", "N·m·s/rad", "assumed: ‖θ‖ ≤ law.damping_bound, as in the law")
     ]
-    k_tau_d: Annotated[
-        float,
-        Term("k_τ_d", "C.78", "N·m", "assumed: ‖τ_d‖ ≤ this, from --disturbance; 0 is Theorem 1"),
-    ]
+    k_tau_d: Annotated[float, Term("k_τ_d", "C.78", "N·m", "assumed: ‖τ_d‖ ≤ this, from --disturbance; 0 is Theorem 1")]
     omega_limit: Annotated[
         float,
         Term(
-            "max |ω_k|",
-            "C.29",
-            "rad/s",
-            "assumed: within wire.rate.limit; max ‖ω‖ below is the guaranteed final bound",
+            "max |ω_k|", "C.29", "rad/s", "assumed: within wire.rate.limit; max ‖ω‖ below is the guaranteed final bound"
         ),
     ]
     u_limit: Annotated[

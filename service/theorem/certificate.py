@@ -245,9 +245,7 @@ def _beyond_range(wire: WireSpec, p: Known) -> tuple[list[str], list[Remedy]]:
         ("wire.attitude", eps, wire.attitude.limit, ""),
     ):
         if reached > limit:
-            enough = ceil(100 * reached) / 100
             reasons.append(f"the reference reaches {reached:.4g}{unit}, beyond {name}.limit = {limit:g}{unit}")
-            ways.append(
-                Remedy(text=f"a range that holds the reference, {name}", overrides=[f"{name}.limit={enough:g}"])
-            )
+            enough = f"{name}.limit={ceil(100 * reached) / 100:g}"
+            ways.append(Remedy(text=f"a range that holds the reference, {name}", overrides=[enough]))
     return reasons, ways

@@ -100,14 +100,7 @@ def coordinates(q: Floats, omega: Floats, q_d: Floats, omega_d: Floats, sign: Fl
 
 
 def lemma_inequalities(samples: Samples, law: LawSettings, p: Known, d: Lemma) -> list[Inequality]:
-    """Both sides of the premises (C.28), (C.29), of (C.26), (C.27) and of every inequality of Lemma 1.
-
-    Args:
-        samples: The states.
-        law: The model and the gains.
-        p: Inputs of the bounds.
-        d: The bounds.
-    """
+    """Both sides of the premises (C.28), (C.29), of (C.26), (C.27) and of every inequality of Lemma 1."""
     C1, J = np.array(law.C1), np.array(law.inertia)
     r_g, f_g = np.array(law.centre_of_mass), np.array([0.0, 0.0, -law.mass * law.gravity])
     x = samples

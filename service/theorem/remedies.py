@@ -39,10 +39,7 @@ class Remedy(BaseModel):
 def remedies(wire: WireSpec, law: LawSettings, holds: Holds) -> list[Remedy]:
     """The least changes that would satisfy the condition: of one signal's bits, of all bits, of C₁, of C₂, of both.
 
-    Args:
-        wire: The quantizers; they do not satisfy it with `law`.
-        law: The gains.
-        holds: Returns whether a configuration satisfies it.
+    The wire does not satisfy it with the law; `holds` returns whether a configuration does.
     """
     return [*_by_bits(wire, law, holds), *_by_gains(wire, law, holds)]
 
@@ -55,7 +52,7 @@ def _by_bits(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]
     choices = [[name] for name in quantized] + ([quantized] if len(quantized) > 1 else [])
     found = False
     for names in choices:
-        fewest = next((bits for bits, tried in _candidates(wire, names) if holds(tried, law)), None)
+        fewest = next((bits for bits, tried in _with_any_bits(wire, names) if holds(tried, law)), None)
         if fewest is not None:
             found = True
             which = f"wire.{names[0]}" if len(names) == 1 else "all of them"
@@ -64,22 +61,17 @@ def _by_bits(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]
         yield Remedy(text=f"no number of bits up to {MAX_BITS} would do", overrides=[])
 
 
-def _candidates(wire: WireSpec, names: list[str]) -> Iterator[tuple[int, WireSpec]]:
+def _with_any_bits(wire: WireSpec, names: list[str]) -> Iterator[tuple[int, WireSpec]]:
     """The wire with every number of bits allowed for the signals named."""
+    tree = wire.model_dump()
     for bits in range(MIN_BITS, MAX_BITS + 1):
+        for name in names:
+            tree[name]["bits"] = bits
         try:
-            tried = with_bits(wire, names, bits)
+            tried = WireSpec.model_validate(tree)
         except ValueError:
             continue  # some kinds of quantizer need more bits
         yield bits, tried
-
-
-def with_bits(wire: WireSpec, names: list[str], bits: int) -> WireSpec:
-    """The wire with this number of bits for the signals named."""
-    tree = wire.model_dump()
-    for name in names:
-        tree[name]["bits"] = bits
-    return WireSpec.model_validate(tree)
 
 
 def _by_gains(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]:

@@ -26,7 +26,6 @@ from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.viewers import views
 from aeroloop.service.viewers.body import WORLD, desired_frame_of, frame_of, scene, timestamp
 from aeroloop.service.viewers.schemas import Decoded, json_shape, protobuf_shape
-from aeroloop.service.viewers.schemas import Shape as Shape
 
 LIMITED: Final = frozenset(topic.name for topic in topics.TOPICS.values() if topic.decoded == "limited")
 """Streaming messages, which are limited to the rate, like the rows of traces."""
@@ -85,7 +84,7 @@ class _Wire:
         self.role = description.role
         self.kind = str(description.config["plant"]["kind"])
         self.period = LoopSettings.model_validate(description.config["loop"]).period
-        self.measurement, self.command = spec.measurement.unpack, spec.command.unpack
+        self.unpack = {"measurement": spec.measurement.unpack, "command": spec.command.unpack}
         self.attitude: Callable[[float], float] = spec.attitude.quantizer().level
         self.rate: Callable[[float], float] = spec.rate.quantizer().level
         self.voltage: Callable[[float], float] = voltage.level
@@ -116,10 +115,6 @@ class Decoder:
             "event": self._event,
             "loss": self._loss,
         }
-        self._frames: dict[str, Callable[[str, _Wire, bytes, int], list[Decoded]]] = {
-            "measurement": self._measurement,
-            "command": self._command,
-        }
 
     def configure(self, description: Description) -> None:
         """Decode a vehicle's frames by this description from now on.
@@ -137,12 +132,9 @@ class Decoder:
                 self.malformed += 1
 
     def take(self, address: topics.Address, payload: bytes, published_ns: int) -> list[Decoded]:
-        """Decode a message or a batch of a trace: nothing if it is not due, malformed, or not shown.
+        """Decode a message or a batch of a trace, published at a time [ns since 1970].
 
-        Args:
-            address: Its parsed key; a frame's gives nothing, as the traces have it.
-            payload: Its bytes.
-            published_ns: When it was published, ns since 1970.
+        Nothing if it is not due, malformed, or not shown; nor of a frame, as the traces have it.
         """
         read = self._readers.get(address.topic.name)
         if read is None:
@@ -151,20 +143,16 @@ class Decoder:
             return []
         try:
             return read(address, payload, published_ns)
-        except (ValidationError, _MalformedError):
+        except ValidationError:
             self.malformed += 1
             return []
 
     def frame(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         """Decode a frame from the network, without a limit of rate; silence in lockstep gives nothing."""
-        wire, show = self._wires.get(address.vehicle), self._frames.get(address.topic.name)
-        if wire is None or show is None or (payload == SILENCE and address.topic.name in wire.silent):
+        wire, name = self._wires.get(address.vehicle), address.topic.name
+        if wire is None or name not in wire.unpack or (payload == SILENCE and name in wire.silent):
             return []
-        try:
-            return show(address.vehicle, wire, payload, at_ns)
-        except _MalformedError:
-            self.malformed += 1
-            return []
+        return self._framed(address.vehicle, name, wire, payload, at_ns)
 
     def rows(self, vehicle: str, batch: Batch) -> list[Decoded]:
         """Decode the rows of a trace: measurements from the plant's, commands from the controller's."""
@@ -172,17 +160,14 @@ class Decoder:
         if wire is None:
             return []
         name = "measurement" if batch.header.end == "plant" else "command"
-        show, frames, found = self._frames[name], columns[name], []
+        frames, found = columns[name], []
         slot_ns, last = self._slot_ns, self._slots.get((name, vehicle), -1)
         for row, (sent_as, sent) in enumerate(zip(columns["sent_as"].tolist(), columns["sent"].tolist(), strict=True)):
             at_ns = base_ns + sent * 1000
             if sent_as != _FRAME or at_ns < 0 or (slot_ns and at_ns // slot_ns == last):
                 continue
             last = at_ns // slot_ns if slot_ns else -1
-            try:
-                found += show(vehicle, wire, frames[row].tobytes(), at_ns)
-            except _MalformedError:
-                self.malformed += 1
+            found += self._framed(vehicle, name, wire, frames[row].tobytes(), at_ns)
         self._slots[name, vehicle] = last
         return found
 
@@ -200,21 +185,24 @@ class Decoder:
         del at_ns  # its rows have their own times
         batch = read_batch(payload)
         if batch is None:
-            raise _MalformedError
+            self.malformed += 1
+            return []
         return self.rows(address.vehicle, batch)
 
-    def _measurement(self, vehicle: str, wire: _Wire, payload: bytes, at_ns: int) -> list[Decoded]:
-        _, codes = _read(wire.measurement(payload))
+    def _framed(self, vehicle: str, name: str, wire: _Wire, payload: bytes, at_ns: int) -> list[Decoded]:
+        unpacked = wire.unpack[name](payload)
+        if unpacked is None:
+            self.malformed += 1
+            return []
+        _, codes = unpacked
+        if name == "command":
+            return [_shown(vehicle, name, views.Voltages.of(codes, wire.voltage, wire.outermost), at_ns)]
         x, y, z = (wire.attitude(code) for code in codes[:3])
         p, q, r = (wire.rate(code) for code in codes[3:])
         known = x + y + z == x + y + z  # not NaN: a valid value
         measured = attitude.received_quaternion(x, y, z, attitude.IDENTITY) if known else None
-        shown = _shown(vehicle, "measurement", views.Attitude.of(measured, (p, q, r)), at_ns)
+        shown = _shown(vehicle, name, views.Attitude.of(measured, (p, q, r)), at_ns)
         return [shown, *_posed(vehicle, "", frame_of(vehicle), measured, at_ns)] if measured else [shown]
-
-    def _command(self, vehicle: str, wire: _Wire, payload: bytes, at_ns: int) -> list[Decoded]:
-        _, codes = _read(wire.command(payload))
-        return [_shown(vehicle, "command", views.Voltages.of(codes, wire.voltage, wire.outermost), at_ns)]
 
     def _telemetry(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         telemetry = Telemetry.model_validate_json(payload)
@@ -236,13 +224,11 @@ class Decoder:
     def _status(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         status = Status.model_validate_json(payload)
         vehicle, wire = address.vehicle, self._wires.get(address.vehicle)
-        shown = Decoded(
-            topic_of(vehicle, f"status/{address.role}"), _STATUS, views.RoleStatus.of(status).encode(), at_ns
-        )
+        shown = _shown(vehicle, f"status/{address.role}", views.RoleStatus.of(status), at_ns)
         if address.role != "plant" or wire is None:
             return [shown]
-        body = scene(vehicle, wire.kind, at_ns)  # again with every status, for a viewer that connects late
-        return [shown, Decoded(topic_of(vehicle, "scene"), SHAPES["scene"], body, at_ns)]
+        # The scene comes with every status, for a viewer that connects late.
+        return [shown, _shown(vehicle, "scene", scene(vehicle, wire.kind, at_ns), at_ns)]
 
     def _event(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         event = Event.model_validate_json(payload)
@@ -255,23 +241,15 @@ class Decoder:
         return [_logged(address.vehicle, LogLevel.Warning, "recorder", text, at_ns)]
 
 
-class _MalformedError(Exception):
-    """A frame cannot be read."""
-
-
-def _read(frame: tuple[int, tuple[float, ...]] | None) -> tuple[int, tuple[float, ...]]:
-    if frame is None:
-        raise _MalformedError
-    return frame
-
-
-def _shown(vehicle: str, name: str, view: views.View, at_ns: int) -> Decoded:
-    return Decoded(topic_of(vehicle, name), SHAPES[name], view.encode(), at_ns)
+def _shown(
+    vehicle: str, name: str, view: views.View | Log | PoseInFrame | FrameTransform | SceneUpdate, at_ns: int
+) -> Decoded:
+    shape = _STATUS if name.startswith("status/") else SHAPES[name]  # any role may publish a status
+    return Decoded(topic_of(vehicle, name), shape, view.encode(), at_ns)
 
 
 def _logged(vehicle: str, level: LogLevel, name: str, text: str, at_ns: int) -> Decoded:
-    line = Log(timestamp=timestamp(at_ns), level=level, message=text, name=name)
-    return Decoded(topic_of(vehicle, "log"), SHAPES["log"], line.encode(), at_ns)
+    return _shown(vehicle, "log", Log(timestamp=timestamp(at_ns), level=level, message=text, name=name), at_ns)
 
 
 def _posed(vehicle: str, prefix: str, frame: str, q: attitude.Quaternion, at_ns: int) -> list[Decoded]:
@@ -281,7 +259,4 @@ def _posed(vehicle: str, prefix: str, frame: str, q: attitude.Quaternion, at_ns:
     transform = FrameTransform(
         timestamp=at, parent_frame_id=WORLD, child_frame_id=frame, translation=_HERE, rotation=turned
     )
-    return [
-        Decoded(topic_of(vehicle, f"{prefix}pose"), _POSE, pose.encode(), at_ns),
-        Decoded(topic_of(vehicle, f"{prefix}tf"), _TRANSFORM, transform.encode(), at_ns),
-    ]
+    return [_shown(vehicle, f"{prefix}pose", pose, at_ns), _shown(vehicle, f"{prefix}tf", transform, at_ns)]

@@ -40,12 +40,7 @@ class FoxgloveServerError(AeroloopError):
 
 
 class LiveDecoder:
-    """Decodes what is published about a vehicle.
-
-    Args:
-        session: An open session; it must outlive the decoder.
-        vehicle: The vehicle.
-    """
+    """Decodes what is published about a vehicle. The session is open, and must outlive the decoder."""
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
         self._decoder = Decoder(None)  # the rate of `take` bounds it
@@ -99,21 +94,16 @@ class FoxgloveServer:
         self._channels: dict[str, foxglove.Channel] = {}
         for name, shape in SHAPES.items():
             self._open(topic_of(vehicle, name), shape)
+        host = f"[{address}]" if ":" in address else address
         try:
             self._server = foxglove.start_server(
-                name=f"aeroloop {vehicle}",
-                host=address,
-                port=port,
-                context=self._context,
-                message_backlog_size=BACKLOG,
+                name=f"aeroloop {vehicle}", host=address, port=port, context=self._context, message_backlog_size=BACKLOG
             )
         except RuntimeError as error:
             reason = str(error).rpartition("Failed to bind port: ")[2].partition(" (os error")[0]
-            where = f"{_host(address)}:{port}"
-            raise FoxgloveServerError(
-                f"cannot listen on {where}: {reason.lower()}; choose by --address and --port"
-            ) from None
-        self.url = f"ws://{_host(address)}:{self._server.port}"
+            text = f"cannot listen on {host}:{port}: {reason.lower()}; choose by --address and --port"
+            raise FoxgloveServerError(text) from None
+        self.url = f"ws://{host}:{self._server.port}"
 
     def __enter__(self) -> FoxgloveServer:
         return self
@@ -147,14 +137,8 @@ def serve(
 ) -> None:
     """Show a vehicle until `stop` is set.
 
-    Args:
-        network: The network to join.
-        vehicle: The vehicle.
-        stop: Set to end it.
-        address: Address to listen on.
-        port: Its port; 0 for any free one.
-        rate_hz: Rate of taking, decoding and sending [Hz].
-        ready: Called with the URL once clients can connect.
+    Messages are taken, decoded and sent at `rate_hz` [Hz]. `ready` is called with the URL once clients can connect;
+    port 0 is any free one.
 
     Raises:
         FoxgloveServerError: The address or port cannot be listened on.
@@ -166,7 +150,3 @@ def serve(
         while not stop.wait(1 / rate_hz):
             for message in feed.take():
                 outlet.send(message)
-
-
-def _host(address: str) -> str:
-    return f"[{address}]" if ":" in address else address

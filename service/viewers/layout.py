@@ -24,12 +24,7 @@ COLOURS: Final = {"roll": ("#2ca02c", "#98df8a"), "pitch": ("#1f77b4", "#aec7e8"
 
 
 def layout(vehicle: str, actuators: int) -> str:
-    """The layout as JSON, to be imported as a file.
-
-    Args:
-        vehicle: The vehicle.
-        actuators: 2 for u₂ and u₃, 3 for all.
-    """
+    """The layout as JSON, to be imported as a file; `actuators` is 2 for u₂ and u₃, 3 for all."""
     motors = range(4 - actuators, 4)
     panels = {
         "3D!body": _body(vehicle),
@@ -148,12 +143,7 @@ def _plot(title: str, unit: str, lines: list[Tree]) -> Tree:
 
 
 def _line(vehicle: str, name: str, field: str, label: str, colour: str | None = None) -> Tree:
-    line = {
-        "value": _path(vehicle, name, field),
-        "label": label,
-        "enabled": True,
-        "timestampMethod": "receiveTime",
-    }
+    line = {"value": _path(vehicle, name, field), "label": label, "enabled": True, "timestampMethod": "receiveTime"}
     return line if colour is None else {**line, "color": colour}
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from math import degrees, sqrt
 from typing import Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import Percentiles, Status, Telemetry
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, angle, to_euler
@@ -19,17 +19,20 @@ ANGLES: Final = "Z–Y–X, body relative to inertial"
 NO_MOTOR: Final = "null: no valid value, or no such motor"
 
 
-class View(BaseModel):
+class View(BaseModel, frozen=True):
     """A message for display."""
 
-    model_config = ConfigDict(frozen=True)
+    @classmethod
+    def in_order(cls, *values: float | None) -> Self:
+        """A message of these values, one for each field."""
+        return cls.model_validate(dict(zip(cls.model_fields, values, strict=True)))
 
     def encode(self) -> bytes:
         """The message as JSON."""
         return self.model_dump_json().encode()
 
 
-class Attitude(View):
+class Attitude(View, frozen=True):
     """Attitude and rates."""
 
     roll_deg: float | None = Field(description=f"{ANGLES} [deg]")
@@ -42,12 +45,11 @@ class Attitude(View):
     @classmethod
     def of(cls, attitude: Quaternion | None, rate: Vector) -> Self:
         """Of an attitude, None if it is not known, and rates in the body frame [rad/s], NaN if they are not."""
-        roll, pitch, yaw = _degrees(to_euler(attitude)) if attitude else (None, None, None)
-        p, q, r = (_degree(part) if part == part else None for part in rate)
-        return cls(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, p_deg_s=p, q_deg_s=q, r_deg_s=r)
+        angles = _degrees(to_euler(attitude)) if attitude else (None, None, None)
+        return cls.in_order(*angles, *(_degree(part) if part == part else None for part in rate))
 
 
-class SetpointView(View):
+class SetpointView(View, frozen=True):
     """An operator's set-point."""
 
     roll_deg: float = Field(description=f"{ANGLES} [deg]")
@@ -57,10 +59,10 @@ class SetpointView(View):
     @classmethod
     def of(cls, attitude: Vector) -> Self:
         """Of roll, pitch and yaw [deg]."""
-        return cls(roll_deg=attitude[0], pitch_deg=attitude[1], yaw_deg=attitude[2])
+        return cls.in_order(*attitude)
 
 
-class Voltages(View):
+class Voltages(View, frozen=True):
     """Voltages as commanded, quantized."""
 
     voltage_1_v: float | None = Field(description=f"u₁; {NO_MOTOR} [V]")
@@ -76,17 +78,10 @@ class Voltages(View):
         levels = [*[float("nan")] * (3 - len(codes)), *map(level, codes)]
         volts = [round(u, 4) if u == u else None for u in levels]
         saturated = [abs(u) >= outermost if u == u else None for u in levels]
-        return cls(
-            voltage_1_v=volts[0],
-            voltage_2_v=volts[1],
-            voltage_3_v=volts[2],
-            saturated_1=saturated[0],
-            saturated_2=saturated[1],
-            saturated_3=saturated[2],
-        )
+        return cls.in_order(*volts, *saturated)
 
 
-class Tracking(View):
+class Tracking(View, frozen=True):
     """How well the body follows its reference, as the controller saw it at one tick."""
 
     time_s: float | None = Field(description="on the law's clock; null if its period is not known [s]")
@@ -111,30 +106,18 @@ class Tracking(View):
         x, y, z = telemetry.attitude_error
         scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
         measured = _product(telemetry.desired, (scalar if telemetry.sign >= 0 else -scalar, x, y, z))
-        roll, pitch, yaw = _degrees(to_euler(measured))
-        desired_roll, desired_pitch, desired_yaw = _degrees(to_euler(telemetry.desired))
-        error_p, error_q, error_r = _degrees(telemetry.rate_error)
-        damping_1, damping_2, damping_3 = (round(theta, 6) for theta in telemetry.damping_estimate)
-        return cls(
-            time_s=None if period is None else round(telemetry.tick * period, 6),
-            error_deg=_degree(angle(x, y, z)),
-            roll_deg=roll,
-            pitch_deg=pitch,
-            yaw_deg=yaw,
-            desired_roll_deg=desired_roll,
-            desired_pitch_deg=desired_pitch,
-            desired_yaw_deg=desired_yaw,
-            error_p_deg_s=error_p,
-            error_q_deg_s=error_q,
-            error_r_deg_s=error_r,
-            damping_1=damping_1,
-            damping_2=damping_2,
-            damping_3=damping_3,
-            sign=telemetry.sign,
+        return cls.in_order(
+            None if period is None else round(telemetry.tick * period, 6),
+            _degree(angle(x, y, z)),
+            *_degrees(to_euler(measured)),
+            *_degrees(to_euler(telemetry.desired)),
+            *_degrees(telemetry.rate_error),
+            *(round(theta, 6) for theta in telemetry.damping_estimate),
+            telemetry.sign,
         )
 
 
-class RoleStatus(View):
+class RoleStatus(View, frozen=True):
     """Status of a role. Percentiles are of the last ten seconds."""
 
     state: str

@@ -13,7 +13,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.messages.operator import Sinusoid

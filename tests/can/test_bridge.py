@@ -21,7 +21,7 @@ from aeroloop.protocol.messages.operator import Answer, Ask
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint, number_of
+from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -46,7 +46,7 @@ class Ends:
         self.node = CanLink(bus, WIRE, "plant")
         self.events: list[Event] = []
         self._session = gathering.join()
-        self._session.declare_subscriber(topics.key("event", "aero"), self._hear)
+        self._session.declare_subscriber(topics.key("event", "aero"), self._on_event)
         self.batches: list[Batch] = []
         self._session.declare_subscriber(topics.key("trace", "aero", role="plant"), self._trace)
         self.measured: list[bytes] = []
@@ -74,7 +74,7 @@ class Ends:
 
     def say(self, state: PlantState, cause: TripCause | None = None, mark: bytes = OURS) -> None:
         """Let the node say this, at once and from now on."""
-        self._says = Heartbeat(state, number_of(cause), mark)
+        self._says = Heartbeat(state, cause.number if cause else 0, mark)
         self.node.beat(self._says)
 
     def fall_silent(self) -> None:
@@ -99,7 +99,7 @@ class Ends:
     def hold(self) -> None:
         """Have the plant, and let the node say so."""
         eventually("the grant", lambda: isinstance(self.claim(), Grant))
-        eventually("granted on the bus", lambda: self.heard_state() is PlantState.GRANTED)
+        eventually("granted on the bus", lambda: self.received_state() is PlantState.GRANTED)
         self.say(PlantState.GRANTED)
         time.sleep(0.15)  # what a node says in the first 0.1 s may be of before the session
 
@@ -112,23 +112,23 @@ class Ends:
         """As `aeroloop op stop`."""
         return Answer.model_validate_json(self._ask("stop", Ask().encode()))
 
-    def heard_state(self) -> PlantState | None:
-        """What the node last heard from the bridge."""
+    def received_state(self) -> PlantState | None:
+        """The state that the node last received from the bridge."""
         return self.node.peer.state if self.node.peer else None
 
     def trip(self) -> str:
-        """Why the bridge tripped, once it has; the node has been told to rest then."""
+        """Why the bridge tripped, once it has; the node has then received idle."""
         eventually("the trip", lambda: any(event.kind == "tripped" for event in self.events))
-        eventually("idle on the bus", lambda: self.heard_state() is PlantState.IDLE)
+        eventually("idle on the bus", lambda: self.received_state() is PlantState.IDLE)
         return next(event.text for event in self.events if event.kind == "tripped")
 
     def _ask(self, topic: str, payload: bytes) -> bytes:
         for reply in self._session.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
-        raise AssertionError(f"nobody answers {topic!r}")
+        raise AssertionError(f"no reply to {topic!r}")
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _on_event(self, sample: zenoh.Sample) -> None:
         self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
 
     def command(self, echo: int) -> None:
@@ -157,18 +157,18 @@ def ends() -> Iterator[Ends]:
             ends.close()
 
 
-def test_it_tells_the_node_of_a_session_its_number_and_its_end(ends: Ends) -> None:
-    eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
+def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:
+    eventually("idle on the bus", lambda: ends.received_state() is PlantState.IDLE)
     for number in (1, 2):
         ends.hold()
         assert ends.node.peer is not None
         assert ends.node.peer[1:3] == (number, OURS)
         assert ends.release()
-        eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
+        eventually("idle on the bus", lambda: ends.received_state() is PlantState.IDLE)
         ends.say(PlantState.IDLE)
     ends.hold()
     ends.role.stop.set()
-    eventually("idle on the bus", lambda: ends.heard_state() is PlantState.IDLE)
+    eventually("idle on the bus", lambda: ends.received_state() is PlantState.IDLE)
 
 
 def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed(ends: Ends) -> None:
@@ -201,7 +201,7 @@ def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
 
 
 @pytest.mark.parametrize("cause", [TripCause.ENVELOPE, None])
-def test_it_trips_when_the_node_has_and_tells_the_nodes_cause(ends: Ends, cause: TripCause | None) -> None:
+def test_it_trips_when_the_node_has_and_reports_the_nodes_cause(ends: Ends, cause: TripCause | None) -> None:
     ends.hold()
     ends.say(PlantState.TRIPPED, cause)
     assert ends.trip() == f"node 1 tripped: {cause or 'no cause reported'}: 0 V"

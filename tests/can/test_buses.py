@@ -60,7 +60,7 @@ BUSES: Final = [
 
 
 class Node:
-    """A node as a process, where it must be told something else than the bridge. A context."""
+    """A node as a process, for settings other than the bridge's. A context."""
 
     def __init__(self, hil: Hil, folder: Path, *overrides: str) -> None:
         config = folder / "node.toml"
@@ -208,11 +208,11 @@ class Said(NamedTuple):
     data: bytes
 
 
-class Ear(can.Listener):
-    """Hears what crosses the bus of a loop, without taking part. A context."""
+class BusMonitor(can.Listener):
+    """Records the frames on the bus of a loop and sends none. A context."""
 
     def __init__(self, bus: CanSettings) -> None:
-        self.heard: list[Said] = []
+        self.received: list[Said] = []
         self._bus = can.Bus(interface=bus.interface, channel=bus.channel, fd=True, **bus.options)
         self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 
@@ -225,15 +225,15 @@ class Ear(can.Listener):
 
     def on_message_received(self, msg: can.Message) -> None:
         """Keep it."""
-        self.heard.append(Said(msg.timestamp, msg.arbitration_id, bytes(msg.data)))
+        self.received.append(Said(msg.timestamp, msg.arbitration_id, bytes(msg.data)))
 
     def last_command(self) -> float:
         """When the last one came [s]."""
-        return max(said.at for said in self.heard if said.identifier == 0x201)
+        return max(said.at for said in self.received if said.identifier == 0x201)
 
     def node(self, *states: PlantState) -> tuple[float, TripCause | None] | None:
-        """The node's first heartbeat that says one of these: when, and the cause that it tells."""
-        for said in self.heard:
+        """The node's first heartbeat with one of these states: its time and its cause."""
+        for said in self.received:
             if said.identifier == 0x301:
                 beat = Heartbeat.unpack(said.data, 0)
                 if beat is not None and beat.state in states:
@@ -242,9 +242,9 @@ class Ear(can.Listener):
 
 
 def when(log: HilLog, kind: str, text: str = "") -> int:
-    """When an event was first told [ns]."""
-    told = [(at, event) for at, event in log.messages("event") if isinstance(event, Event)]
-    return next(at for at, event in told if event.kind == kind and text in event.text)
+    """When an event was first published [ns]."""
+    events = [(at, event) for at, event in log.messages("event") if isinstance(event, Event)]
+    return next(at for at, event in events if event.kind == kind and text in event.text)
 
 
 def test_a_node_that_dies_is_missed_within_half_a_second_and_driven_again_when_it_is_back_and_armed(hil: Hil) -> None:
@@ -268,27 +268,27 @@ def test_a_node_that_dies_is_missed_within_half_a_second_and_driven_again_when_i
 def test_a_controller_that_dies_leaves_the_node_at_rest_in_time(hil: Hil) -> None:
     """Its bridge releases it, or its own watchdog trips it: whichever is first, it is at 0 V then."""
     hil.start()
-    with Ear(hil.settings.can) as ear:
+    with BusMonitor(hil.settings.can) as monitor:
         hil.run(0.3)
         hil.kill("controller")
-        hil.eventually("rest", lambda: ear.node(PlantState.IDLE, PlantState.TRIPPED) is not None)
+        hil.eventually("rest", lambda: monitor.node(PlantState.IDLE, PlantState.TRIPPED) is not None)
         hil.eventually("the trip", lambda: hil.happened("tripped"))
-        rest = ear.node(PlantState.IDLE, PlantState.TRIPPED)
+        rest = monitor.node(PlantState.IDLE, PlantState.TRIPPED)
         assert rest is not None
         assert rest[1] in (None, TripCause.COMMAND_TIMEOUT)
-        assert rest[0] - ear.last_command() < WATCHDOG_S + SLACK_S
+        assert rest[0] - monitor.last_command() < WATCHDOG_S + SLACK_S
 
 
 def test_a_bridge_that_dies_leaves_a_node_whose_own_watchdog_trips_it(hil: Hil) -> None:
     hil.start()
-    with Ear(hil.settings.can) as ear:
+    with BusMonitor(hil.settings.can) as monitor:
         hil.run(0.3)
         hil.kill("plant")
-        hil.eventually("the trip", lambda: ear.node(PlantState.TRIPPED) is not None)
-        trip = ear.node(PlantState.TRIPPED)
+        hil.eventually("the trip", lambda: monitor.node(PlantState.TRIPPED) is not None)
+        trip = monitor.node(PlantState.TRIPPED)
         assert trip is not None
         assert trip[1] is TripCause.COMMAND_TIMEOUT
-        assert trip[0] - ear.last_command() < WATCHDOG_S + SLACK_S
+        assert trip[0] - monitor.last_command() < WATCHDOG_S + SLACK_S
 
 
 def test_a_node_of_another_wire_is_never_driven_and_the_refusal_names_it(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_a_node_of_another_wire_is_never_driven_and_the_refusal_names_it(tmp_pat
         assert not loop.hil.happened("claimed")
 
 
-def test_an_adapter_that_is_unplugged_is_told_and_taken_up_again_where_it_was(tmp_path: Path) -> None:
+def test_an_unplugged_adapter_is_reported_and_reopened_at_the_same_path(tmp_path: Path) -> None:
     with Loop(tmp_path, "slcan") as loop:
         hil, adapter = loop.hil, loop.adapter
         loop.start(PATIENT)

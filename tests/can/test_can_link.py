@@ -27,7 +27,6 @@ from aeroloop.protocol.transport.can_format import (
     Heartbeat,
     check_widths,
     fingerprint,
-    number_of,
 )
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
@@ -73,7 +72,7 @@ LENGTHS = [
 
 @contextmanager
 def both_ends(settings: CanSettings, wire: WireSpec = PAPER) -> Iterator[tuple[CanLink, CanLink, Stranger]]:
-    """The plant's link, the controller's, and somebody who sees the bus as it is."""
+    """The plant's link, the controller's, and a stranger that reads the bus as it is."""
     plant, controller = CanLink(settings, wire, "plant"), CanLink(settings, wire, "controller")
     try:
         with Stranger(settings) as stranger:
@@ -93,7 +92,7 @@ def crosses(sender: CanLink, receiver: CanLink, stranger: Stranger, size: int, l
     @given(payload=st.binary(min_size=size, max_size=size))
     def cross(payload: bytes) -> None:
         sender.send(payload)
-        seen = stranger.hear()
+        seen = stranger.receive()
         assert bytes(seen.data) == payload + bytes(length - size)
         assert seen.dlc == length
         assert (seen.is_fd, seen.bitrate_switch, seen.is_extended_id) == (length > 8, length > 8, False)
@@ -122,7 +121,7 @@ def test_ids_are_those_of_the_specification(node: int) -> None:
         plant.beat(Heartbeat(PlantState.IDLE, 0, MARK))
         controller.send(bytes(3))
         controller.beat(Heartbeat(PlantState.IDLE, 0, MARK))
-        assert [stranger.hear().arbitration_id for _ in range(4)] == [
+        assert [stranger.receive().arbitration_id for _ in range(4)] == [
             0x100 + node,
             0x300 + node,
             0x200 + node,
@@ -136,7 +135,7 @@ def test_a_node_number_that_would_make_another_kind_of_id_is_refused(node: int) 
         CanSettings(node=node)
 
 
-def test_two_nodes_on_one_bus_do_not_hear_each_other() -> None:
+def test_two_nodes_on_one_bus_do_not_receive_each_others_frames() -> None:
     first, second = virtual(node=1), virtual(node=2)
     second = second.model_copy(update={"channel": first.channel})
     with both_ends(first) as (plant_1, controller_1, near_1), both_ends(second) as (plant_2, controller_2, near_2):
@@ -179,7 +178,7 @@ def test_waiting_ends_when_a_frame_comes_and_at_the_timeout() -> None:
         assert controller.wait(PATIENCE_S) is not None
 
 
-def test_who_waits_for_more_than_one_thing_is_told_of_a_frame() -> None:
+def test_a_frame_notifies_a_shared_condition() -> None:
     bus, changed = virtual(), Condition()
     link = CanLink(bus, PAPER, "controller", changed)
     try:
@@ -267,20 +266,21 @@ def test_what_is_not_for_this_end_is_ignored(identifiers: list[int], how: dict[s
 def next_heartbeat(link: CanLink) -> Heartbeat:
     """The one that comes next, taken away so that another can be waited for."""
     eventually("a heartbeat", lambda: link.peer is not None)
-    heard, link.peer = link.peer, None
-    assert heard is not None
-    return heard
+    received, link.peer = link.peer, None
+    assert received is not None
+    return received
 
 
 @pytest.mark.parametrize("state", PlantState)
 def test_a_plants_heartbeat_carries_its_state_and_every_cause(state: PlantState) -> None:
     with both_ends(virtual()) as (plant, controller, _):
         for cause in (None, *TripCause):
-            plant.beat(Heartbeat(state, number_of(cause), MARK))
-            heard = next_heartbeat(controller)
-            assert heard[:3] == (state, number_of(cause), MARK)
-            assert heard.cause is cause
-            assert 0 < heard.at_ns <= time.monotonic_ns()
+            number = cause.number if cause else 0
+            plant.beat(Heartbeat(state, number, MARK))
+            received = next_heartbeat(controller)
+            assert received[:3] == (state, number, MARK)
+            assert received.cause is cause
+            assert 0 < received.at_ns <= time.monotonic_ns()
             assert 0 <= controller.silent_s() < PATIENCE_S
 
 
@@ -318,8 +318,7 @@ def test_causes_are_numbered_as_in_the_specification() -> None:
         "bus lost",
         "node lost",
     ]
-    assert [number_of(TripCause(cause)) for cause in causes] == list(range(1, 11))
-    assert number_of(None) == 0
+    assert [TripCause(cause).number for cause in causes] == list(range(1, 11))
     said = [Heartbeat(PlantState.TRIPPED, number, MARK).cause for number in range(16)]
     assert said == [None, *causes, None, None, None, None, None]
 
@@ -536,7 +535,7 @@ def test_a_link_works_again_once_it_is_reopened(flaws: Flaws, flawed: tuple[CanL
             flaws.full = False
             link.send(b"\x20" + bytes(6))
         assert link.fault is None
-        assert bytes(stranger.hear().data) == b"\x20" + bytes(6)
+        assert bytes(stranger.receive().data) == b"\x20" + bytes(6)
         stranger.say(COMMAND_ID + 1, b"\x50\0\0")
         arrival = link.wait(PATIENCE_S)
         assert arrival is not None
@@ -560,7 +559,7 @@ def test_a_bus_that_is_still_gone_can_be_tried_again_and_the_fault_stands_meanwh
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_closing_twice_does_no_harm_and_nothing_is_sent_or_heard_afterwards(
+def test_closing_twice_does_no_harm_and_nothing_is_sent_or_received_afterwards(
     flaws: Flaws, flawed: tuple[CanLink, CanSettings], lost: bool
 ) -> None:
     link, bus = flawed
@@ -591,14 +590,16 @@ def test_closing_twice_does_no_harm_and_nothing_is_sent_or_heard_afterwards(
         pytest.param("udp_multicast", "239.74.163.2", {"port": "nonsense"}, id="option-of-a-wrong-type"),
     ],
 )
-def test_what_cannot_be_opened_is_told_in_one_line(interface: str, channel: str, options: dict[str, object]) -> None:
+def test_what_cannot_be_opened_is_reported_in_one_line(
+    interface: str, channel: str, options: dict[str, object]
+) -> None:
     with pytest.raises(CanError) as refusal:
         CanLink(CanSettings(interface=interface, channel=channel, options=options), PAPER, "plant")
     assert str(refusal.value).startswith(f"cannot open the CAN bus {interface}:{channel}: ")
     assert "\n" not in str(refusal.value)
 
 
-def test_what_a_library_says_in_many_lines_is_told_in_one(flaws: Flaws) -> None:
+def test_a_librarys_error_of_many_lines_is_reported_in_one(flaws: Flaws) -> None:
     flaws.gone = True
     with pytest.raises(CanError) as refusal:
         CanLink(virtual(channel="x"), PAPER, "plant")

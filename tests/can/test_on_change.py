@@ -60,7 +60,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
     wire: WireSpec, lockstep: bool, end: str
 ) -> None:
     bus = virtual()
-    hears = wire.transmit.command if end == "plant" else wire.transmit.measurement
+    policy = wire.transmit.command if end == "plant" else wire.transmit.measurement
     link = CanLink(bus, wire, end, lockstep=lockstep)  # type: ignore[arg-type]  # is one of both
     try:
         with Stranger(bus) as stranger:
@@ -71,7 +71,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
             stranger.settle(link)
             arrival = link.take()
             assert arrival is not None
-            expected = lockstep and hears == "on_change"
+            expected = lockstep and policy == "on_change"
             assert (arrival.frame, link.refused) == ((SILENCE, 0) if expected else (frame, 1))
     finally:
         link.close()
@@ -82,7 +82,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
 
 @pytest.fixture(params=[False, True], ids=["real time", "lockstep"])
 def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanFront, Stranger, bool]]:
-    """A node's front, somebody who hears what it sends, and whether it is in lockstep."""
+    """A node's front, a stranger that receives what it sends, and whether it is in lockstep."""
     bus = virtual()
     endpoint = Endpoint(Still(), BOTH, PERIOD_NS, lockstep=request.param)
     front = CanFront(bus, LoopSettings(lockstep=request.param), endpoint)
@@ -91,7 +91,7 @@ def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanFront, Stranger, b
         front.leave()
 
 
-def test_a_node_sends_silence_where_it_could_not_be_heard_only(node: tuple[CanFront, Stranger, bool]) -> None:
+def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[CanFront, Stranger, bool]) -> None:
     front, stranger, lockstep = node
     for frame in (measurement(0), SILENCE, SILENCE, measurement(3)):
         front.send(frame)

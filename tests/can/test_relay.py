@@ -59,7 +59,7 @@ def command(echo: int, code: int = 5) -> bytes:
 
 
 def relay(*, lockstep: bool = False, armed: bool = True) -> Relay:
-    """A relay that nobody has claimed."""
+    """A relay that is not claimed."""
     return Relay(WIRE, PERIOD_NS, lockstep=lockstep, watchdog_s=0.1, armed=armed)
 
 
@@ -139,7 +139,7 @@ def test_a_malformed_command_is_counted_and_neither_passes_nor_feeds_the_watchdo
     assert it.trip is TripCause.COMMAND_TIMEOUT
 
 
-def test_the_watchdog_trips_a_nanosecond_after_its_time_and_says_why() -> None:
+def test_the_watchdog_trips_a_nanosecond_after_its_time_and_reports_why() -> None:
     it = driven()
     it.watch(NOW + WATCHDOG_NS)
     assert it.session is not None
@@ -331,7 +331,7 @@ def test_it_may_start_unarmed() -> None:
     assert isinstance(it.claim(claim()), Grant)
 
 
-def test_who_holds_it_or_what_differs_is_told() -> None:
+def test_a_refusal_names_the_holder_or_the_differences() -> None:
     it = granted()
     refusal = it.claim(claim("b"))
     assert isinstance(refusal, Refusal)
@@ -442,8 +442,8 @@ class Bus:
         while time.monotonic() < deadline:
             self.turn()
 
-    def hears(self, state: PlantState, number: int = 0) -> None:
-        """Turn until the controller's side has heard this from the node."""
+    def await_heartbeat(self, state: PlantState, number: int = 0) -> None:
+        """Turn until the controller's side has received this from the node."""
         wanted = (state, number, OURS)
         self.until(f"heartbeat {wanted}", lambda: self.side.peer is not None and self.side.peer[:3] == wanted)
 
@@ -491,31 +491,31 @@ def bus(hasty_bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Bus:
     return hasty_bus
 
 
-def test_a_session_begins_when_the_other_side_says_granted_and_counts_from_0(bus: Bus) -> None:
-    bus.hears(PlantState.IDLE)
+def test_a_session_begins_when_the_other_side_reports_granted_and_counts_from_0(bus: Bus) -> None:
+    bus.await_heartbeat(PlantState.IDLE)
     assert bus.front.link is None
     bus.turn_for(0.05)
     assert bus.side.take() is None, "a measurement without a session"
     bus.begin()
     assert bus.endpoint.state is PlantState.GRANTED
     assert bus.front.link is not None
-    bus.hears(PlantState.GRANTED)
+    bus.await_heartbeat(PlantState.GRANTED)
     seen = bus.counters(40)
     assert seen == [k % COUNTERS for k in range(len(seen))]
 
 
-def test_a_command_drives_it_and_the_heartbeat_says_so_at_once(bus: Bus) -> None:
+def test_a_command_drives_it_and_the_heartbeat_reports_it_at_once(bus: Bus) -> None:
     bus.begin()
     bus.turn_for(0.05)
     assert bus.plant.voltages == OFF
     bus.drive(code=5)
     bus.turn()
     assert bus.plant.voltages == (5 * 48 / 63, -5 * 48 / 63)
-    bus.hears(PlantState.DRIVEN)
+    bus.await_heartbeat(PlantState.DRIVEN)
 
 
 def test_heartbeats_come_ten_times_a_second_and_at_once_on_a_change(bus: Bus) -> None:
-    bus.hears(PlantState.IDLE)
+    bus.await_heartbeat(PlantState.IDLE)
     bus.stranger.everything()
     bus.turn_for(1.0)
     beats = [m for m in bus.stranger.everything() if m.arbitration_id == PLANT_HEARTBEAT_ID + 1]
@@ -545,7 +545,7 @@ def test_another_fingerprint_is_never_followed(bus: Bus, mark: bytes, caplog: py
     assert bus.plant.voltages == OFF
     assert bus.endpoint.state is PlantState.IDLE
     assert bus.side.take() is None
-    assert len(caplog.records) == 1, "it is told now and then, not with every heartbeat"
+    assert len(caplog.records) == 1, "it is reported now and then, not with every heartbeat"
     bus.begin(number=1)  # the same number, with the right one
 
 
@@ -553,7 +553,7 @@ def test_another_fingerprint_ends_a_session_that_runs(bus: Bus) -> None:
     bus.begin()
     bus.drive()
     bus.send_heartbeat(PlantState.GRANTED, 2, bytes(7))
-    bus.hears(PlantState.IDLE)
+    bus.await_heartbeat(PlantState.IDLE)
     bus.turn_for(0.15)
     assert bus.plant.voltages == OFF
     assert bus.endpoint.session is None
@@ -563,7 +563,7 @@ def test_idle_from_the_other_side_releases_it(bus: Bus) -> None:
     bus.begin()
     bus.drive()
     bus.send_heartbeat(PlantState.IDLE)
-    bus.hears(PlantState.IDLE)
+    bus.await_heartbeat(PlantState.IDLE)
     bus.turn()
     assert bus.plant.voltages == OFF
     assert bus.front.link is None
@@ -577,14 +577,14 @@ def test_silence_trips_it_after_half_a_second(hasty_bus: Bus) -> None:
     bus.drive()
     bus.turn_for(0.2)
     bus.say = None
-    bus.hears(PlantState.TRIPPED, 7)
+    bus.await_heartbeat(PlantState.TRIPPED, 7)
     assert 0.5 <= time.monotonic() - bus.said_at < 0.5 + SLACK_S
     assert bus.plant.voltages == OFF
     assert bus.endpoint.trip is TripCause.HOLDER_GONE
 
 
 def test_commands_are_a_sign_of_life_too(hasty_bus: Bus) -> None:
-    """A node hears of its other end by whatever comes from it: heartbeats are for when there is nothing else."""
+    """Every frame counts as a sign of life; heartbeats are for when no other frame is sent."""
     bus = hasty_bus
     bus.begin()
     bus.drive()
@@ -606,7 +606,7 @@ def test_another_number_is_another_session(bus: Bus) -> None:
     assert bus.endpoint.state is PlantState.GRANTED
     bus.turn()
     assert bus.plant.voltages == OFF
-    bus.hears(PlantState.GRANTED)
+    bus.await_heartbeat(PlantState.GRANTED)
     seen = bus.counters(40)
     start = next(i for i in range(len(seen)) if seen[i : i + 16] == list(range(16)))
     assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
@@ -631,11 +631,11 @@ def test_what_came_before_a_session_does_not_drive_it(bus: Bus) -> None:
     assert bus.plant.voltages == OFF
 
 
-def test_a_trip_stands_until_there_is_another_session_and_says_its_cause(bus: Bus) -> None:
+def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus: Bus) -> None:
     bus.begin(number=1)
     bus.drive()
     bus.endpoint.expire(TripCause.ENVELOPE, "tilted too far")
-    bus.hears(PlantState.TRIPPED, 3)
+    bus.await_heartbeat(PlantState.TRIPPED, 3)
     bus.turn_for(0.3)  # heartbeats of the same number go on, and commands too
     bus.side.send(command(1))
     bus.turn_for(0.05)
@@ -645,10 +645,10 @@ def test_a_trip_stands_until_there_is_another_session_and_says_its_cause(bus: Bu
     bus.turn_for(0.05)
     assert bus.endpoint.state is PlantState.TRIPPED, "a release is not an arming"
     bus.begin(number=2)
-    bus.hears(PlantState.GRANTED, 0)
+    bus.await_heartbeat(PlantState.GRANTED, 0)
 
 
-def test_a_node_that_leaves_says_idle_and_is_at_rest(bus: Bus) -> None:
+def test_a_node_that_leaves_reports_idle_and_is_at_rest(bus: Bus) -> None:
     bus.begin()
     bus.drive()
     bus.front.leave()
@@ -674,7 +674,7 @@ def test_a_bus_that_fails_for_a_moment_is_opened_again_and_the_session_goes_on(
     assert flaws.opened == opened + 2
     bus.stranger.everything()
     bus.side.peer = None
-    bus.hears(PlantState.DRIVEN)
+    bus.await_heartbeat(PlantState.DRIVEN)
     assert bus.counters(1)
     bus.turn_for(0.2)
     assert bus.endpoint.session == "can-1"
@@ -699,7 +699,7 @@ def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
     flaws.lost = flaws.gone = False
     assert bus.side.reopen()
     bus.send_heartbeat(PlantState.IDLE)
-    bus.hears(PlantState.TRIPPED, 7)  # mended, it says what happened
+    bus.await_heartbeat(PlantState.TRIPPED, 7)  # mended, it says what happened
     bus.begin(number=2)
-    bus.hears(PlantState.GRANTED)
+    bus.await_heartbeat(PlantState.GRANTED)
     bus.drive()

@@ -26,13 +26,13 @@ AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 WATCHDOG_S = 0.1
 SLACK_S = 0.15
 """For a loop that other work on the machine keeps waiting: it must run to notice anything."""
-TOLD = {"plant.truth_rate_hz": 500}
+FAST_TRUTH = {"plant.truth_rate_hz": 500}
 PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 11}
 """For what does not try the watchdog: a machine that stalls for over 100 ms must not end a session meant to go on."""
 
 
 def seconds_driven_after(log: HilLog, moment_ns: int) -> float:
-    """How long after a moment the motors still had a voltage [s]; the plant must have told at least once after it."""
+    """How long after a moment the motors still had a voltage [s]; the plant must publish at least once after it."""
     truths = [(at, truth) for at, truth in log.messages("truth") if isinstance(truth, Truth)]
     driven = [at for at, truth in truths if any(truth.voltages)]
     assert driven, "the motors never had a voltage, so nothing is shown"
@@ -49,7 +49,7 @@ def last_command_ns(log: HilLog) -> int:
 
 
 def test_the_motors_are_at_rest_in_time_when_the_controller_is_killed_and_a_new_one_takes_over(hil: Hil) -> None:
-    hil.start(settings=TOLD)
+    hil.start(settings=FAST_TRUTH)
     hil.run(0.5)
     hil.kill("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped", "is gone") or hil.happened("tripped", "no fresh"))
@@ -71,15 +71,15 @@ def test_a_restarted_controller_is_back_in_control_within_a_second_of_looking_fo
     hil.kill("controller")
     hil.restart("controller")
     hil.eventually("a second session", lambda: sum(event.kind == "claimed" for event in hil.events) == 4)
-    told = [(at, event) for at, event in hil.log.messages("event") if isinstance(event, Event)]
-    looks = [at for at, event in told if event.role == "controller" and event.kind == "started"][-1]
-    has = [at for at, event in told if event.role == "controller" and event.kind == "claimed"][-1]
+    events = [(at, event) for at, event in hil.log.messages("event") if isinstance(event, Event)]
+    looks = [at for at, event in events if event.role == "controller" and event.kind == "started"][-1]
+    has = [at for at, event in events if event.role == "controller" and event.kind == "claimed"][-1]
     # It claims four times a second, and the plant sees at once that its holder's token is gone.
     assert (has - looks) * 1e-9 < 1.0
 
 
-def test_a_controller_that_stands_still_loses_the_plant_and_what_it_says_afterwards_is_not_heard(hil: Hil) -> None:
-    hil.start(settings=TOLD)
+def test_a_controller_that_stands_still_loses_the_plant_and_its_later_commands_have_no_effect(hil: Hil) -> None:
+    hil.start(settings=FAST_TRUTH)
     hil.run(0.5)
     hil.pause("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped"))
@@ -108,7 +108,7 @@ def test_a_controller_finds_a_plant_that_was_killed_and_came_back(hil: Hil) -> N
 
 def test_a_plant_that_stood_still_ends_the_old_session_before_anything_else(hil: Hil) -> None:
     """Its controller has given up meanwhile; its release is the first thing the plant finds, and it is at 0 V then."""
-    hil.start(settings=TOLD)
+    hil.start(settings=FAST_TRUTH)
     hil.run(0.3)
     old = hil.status("plant").session
     hil.pause("plant")
@@ -168,10 +168,10 @@ def far_apart() -> Iterator[tuple[Cable, list[Event], list[Truth], list[subproce
     ):
         for name, into, model in (("event", events, Event), ("truth", truths, Truth)):
 
-            def hear(sample: zenoh.Sample, into: list = into, model: type = model) -> None:  # type: ignore[type-arg]
+            def receive(sample: zenoh.Sample, into: list = into, model: type = model) -> None:  # type: ignore[type-arg]
                 into.append(model.model_validate_json(sample.payload.to_bytes()))  # type: ignore[attr-defined]
 
-            session.declare_subscriber(topics.key(name, "aero"), hear)
+            session.declare_subscriber(topics.key(name, "aero"), receive)
         near = ["controller", "--auto-arm", "--set", f"network.rendezvous={cable.endpoint}"]
         started.append(subprocess.Popen([*AEROLOOP, *near, *common]))
         yield cable, events, truths, started
@@ -215,8 +215,8 @@ def test_a_cut_cable_brings_the_motors_to_rest_and_a_mended_one_the_controller_b
     eventually(lambda: claims() == 2, "a second session")
 
 
-def test_who_does_not_have_the_session_moves_nothing(hil: Hil) -> None:
-    """A stranger who publishes on every key it can think of; the plant listens on its own session's only."""
+def test_without_the_session_a_stranger_moves_nothing(hil: Hil) -> None:
+    """A stranger that publishes on every likely key; the plant subscribes to its own session's only."""
     hil.start(settings={"controller.require_recorder": True}, drive=False)
     vehicle, wire = hil.settings.vehicle, hil.settings.wire
     full = wire.command.pack(0, [31, 31])
@@ -230,7 +230,7 @@ def test_who_does_not_have_the_session_moves_nothing(hil: Hil) -> None:
 
 
 def test_a_controller_of_another_wire_is_refused_by_field_and_moves_nothing(hil: Hil) -> None:
-    hil.start(settings=TOLD, drive=False)
+    hil.start(settings=FAST_TRUTH, drive=False)
     other = ["--set", "wire.voltage.bits=8", "--set", f"network.rendezvous={hil.settings.network.rendezvous}"]
     stranger = subprocess.Popen([*AEROLOOP, "controller", "--auto-arm", *other])
     try:
@@ -288,7 +288,7 @@ def test_a_command_stream_that_ends_trips_the_watchdog_to_the_tick(lockstep: Hil
     assert log.trips == ["no fresh command for 100 ms: 0 V"]
 
 
-def test_a_command_that_says_the_same_for_ever_trips_the_watchdog(lockstep: Hil) -> None:
+def test_a_command_repeated_for_ever_trips_the_watchdog(lockstep: Hil) -> None:
     """A stuck sender proves nothing about whether it still sees the plant."""
     lockstep.start(settings={"plant.faults": ["command:stuck@1"]})
     lockstep.run(2)
@@ -308,7 +308,7 @@ def test_corrupted_commands_end_in_a_trip_with_its_cause_or_do_no_harm(lockstep:
 
 def test_commands_that_are_late_for_good_are_refused_although_their_echo_looks_fresh(hil: Hil) -> None:
     """300 ms are 150 ticks, of the 256 that the echo tells apart."""
-    hil.start(settings=TOLD)
+    hil.start(settings=FAST_TRUTH)
     hil.run(0.3)
     hil.inject("command:delay=0.3")
     hil.eventually("the trip", lambda: hil.happened("tripped"))

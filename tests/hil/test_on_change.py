@@ -20,7 +20,7 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.hil import Hil, HilLog
-from tests.hil.test_faults import PATIENT, SLACK_S, TOLD, WATCHDOG_S, last_command_ns, seconds_driven_after
+from tests.hil.test_faults import FAST_TRUTH, PATIENT, SLACK_S, WATCHDOG_S, last_command_ns, seconds_driven_after
 from tests.hil.test_operate import done
 from tests.hil.test_processes import FIGURES, aeroloop
 
@@ -46,8 +46,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         done(hil, "goto", "0", "-5", "8", "--in", "0.5")
         done(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
         hil.run(1.0)
-        told = hil.status("plant").ticks
-        hil.eventually("a status", lambda: hil.status("plant").ticks > told)
+        reported = hil.status("plant").ticks
+        hil.eventually("a status", lambda: hil.status("plant").ticks > reported)
         plant, controller = hil.status("plant"), hil.status("controller")
         log = hil.log
         yield Run(log, log.figures, plant, controller)
@@ -107,7 +107,7 @@ def test_status_counts_the_frames_and_the_ticks_apart(run: Run) -> None:
     assert 0 < run.plant.sent < 0.7 * run.plant.ticks
     assert 0 < run.controller.sent < 0.7 * run.controller.ticks
     assert run.controller.rate_hz > 0.5 * RATE
-    assert run.plant.received <= run.controller.sent + RATE  # told up to a second apart
+    assert run.plant.received <= run.controller.sent + RATE  # reported up to a second apart
     assert run.plant.refused == run.controller.refused == 0
 
 
@@ -134,12 +134,12 @@ def test_what_is_whole_of_a_log_that_was_cut_is_still_computed_again(run: Run, t
 
 
 def moments(log: HilLog, kind: str) -> list[int]:
-    """When events of a kind were told [ns]."""
+    """When events of a kind were published [ns]."""
     return [at for at, event in log.messages("event") if isinstance(event, Event) and event.kind == kind]
 
 
 def test_the_motors_are_at_rest_in_time_when_a_controller_dies_that_was_silent_anyway(hil: Hil) -> None:
-    hil.start(settings={**TOLD, **ON_CHANGE})
+    hil.start(settings={**FAST_TRUTH, **ON_CHANGE})
     hil.run(0.5)
     hil.kill("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped", "is gone") or hil.happened("tripped", "no fresh"))

@@ -61,7 +61,7 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
     last = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)][-1]
     roll, pitch, yaw = (degrees(angle) for angle in to_euler(last.desired))
     assert (roll, pitch, yaw) == pytest.approx((0.0, -10.0, 20.0), abs=1e-6)  # quintics and quaternions, rounded
-    # The review computes the errors again from frames and changes; the controller told what it had computed.
+    # The review computes the errors again from frames and changes; the controller published what it had computed.
     blocks: list[Ticks] = []
     read(log.path, watch=blocks.append)
     computed = {
@@ -69,8 +69,8 @@ def test_an_operator_turns_the_body_and_changes_gains_and_the_log_is_computed_ag
         for block in blocks
         for k, error in zip(block.k.tolist(), block.attitude_error.tolist(), strict=True)
     }
-    told = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
-    compared = [(message.attitude_error, computed[message.tick]) for message in told if message.tick in computed]
+    published = [message for _, message in log.messages("telemetry") if isinstance(message, Telemetry)]
+    compared = [(message.attitude_error, computed[message.tick]) for message in published if message.tick in computed]
     assert len(compared) > 500
     assert all(mine == theirs for mine, theirs in compared)
 

@@ -278,6 +278,6 @@ def test_a_full_disk_stops_neither_the_loop_nor_for_good_the_recorder_and_costs_
         small.kill()
     (log,) = small.out.glob("*.mcap")
     assert_whole(log, 4 * RATE)
-    told = [event.text for event in events(log) if event.role == "recorder"]
-    assert [text for text in told if "No space left on device" in text and "kept in memory" in text]
-    assert [text for text in told if text.startswith("recording again to ")]
+    texts = [event.text for event in events(log) if event.role == "recorder"]
+    assert [text for text in texts if "No space left on device" in text and "kept in memory" in text]
+    assert [text for text in texts if text.startswith("recording again to ")]

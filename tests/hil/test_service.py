@@ -16,7 +16,7 @@ from aeroloop.service.host.units import UNITS
 from aeroloop.service.testing.process_group import free_rendezvous
 
 
-def test_a_daemon_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(tmp_path: Path) -> None:
+def test_a_daemon_notifies_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(path))
@@ -28,13 +28,13 @@ def test_a_daemon_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops
             stderr=subprocess.PIPE,
             text=True,
         )
-        told = [manager.recv(64).decode() for _ in range(3)]
+        received = [manager.recv(64).decode() for _ in range(3)]
         daemon.terminate()
         _, stderr = daemon.communicate(timeout=30)
-        while "STOPPING=1" not in told:
-            told.append(manager.recv(64).decode())
-    assert told[0] == "READY=1"
-    assert set(told[1:-1]) == {"WATCHDOG=1"}
+        while "STOPPING=1" not in received:
+            received.append(manager.recv(64).decode())
+    assert received[0] == "READY=1"
+    assert set(received[1:-1]) == {"WATCHDOG=1"}
     assert daemon.returncode == 0
     lines = [json.loads(line) for line in stderr.splitlines()]
     assert [line["message"] for line in lines] == ["plant: aero waits for a claim", "plant: aero stopped at 0 V"]

@@ -169,13 +169,13 @@ def test_frames_are_sent_as_their_golden_vectors_say(row: Row) -> None:
 
 
 def test_the_table_of_topics_is_that_of_the_code() -> None:
-    told = [
+    documented = [
         cells(line)[:2]
         for line in SPEC.read_text(encoding="utf-8").splitlines()
         if line.startswith("|") and len(cells(line)) == 5
     ]
-    start = next(i for i, row in enumerate(told) if row[0] == "topic")
-    table = {name: key for name, key in told[start + 1 :] if not set(name) <= set("-: ")}
+    start = next(i for i, row in enumerate(documented) if row[0] == "topic")
+    table = {name: key for name, key in documented[start + 1 :] if not set(name) <= set("-: ")}
     assert table == {topic.name: topic.key for topic in TOPICS.values()}
 
 
@@ -183,8 +183,8 @@ def test_the_table_of_topics_is_that_of_the_code() -> None:
 def test_the_tables_of_states_are_those_of_the_code(end: str, table: Mapping[tuple[StrEnum, StrEnum], StrEnum]) -> None:
     lines = SPEC.read_text(encoding="utf-8").splitlines()
     start = lines.index(f"| {end} is | what happens | {end} is then |") + 2
-    told = list(takewhile(lambda line: line.startswith("|"), lines[start:]))
-    assert [tuple(cells(line)) for line in told] == [(str(a), str(b), str(c)) for (a, b), c in table.items()]
+    documented = list(takewhile(lambda line: line.startswith("|"), lines[start:]))
+    assert [tuple(cells(line)) for line in documented] == [(str(a), str(b), str(c)) for (a, b), c in table.items()]
 
 
 def test_the_text_is_of_the_version_that_a_claim_carries() -> None:
@@ -193,5 +193,5 @@ def test_the_text_is_of_the_version_that_a_claim_carries() -> None:
 
 def test_the_causes_of_a_trip_are_numbered_as_the_text_says() -> None:
     text = " ".join(SPEC.read_text(encoding="utf-8").split())
-    told = text.split("Causes: ")[1].split(". >")[0]
-    assert told == ", ".join(f"{number} {cause}" for number, cause in enumerate(TripCause, start=1))
+    documented = text.split("Causes: ")[1].split(". >")[0]
+    assert documented == ", ".join(f"{number} {cause}" for number, cause in enumerate(TripCause, start=1))

@@ -18,7 +18,7 @@ from aeroloop.service.config import ConfigError, load
     watchdog=st.sampled_from([0.01, 0.1, 0.128, 0.256, 1, 2, 10]),
     stale=st.sampled_from([0.01, 0.1, 0.128, 0.256, 1, 2, 10]),
 )
-def test_a_counter_counts_twice_the_watchdog_and_the_stale_time_or_the_refusal_says_how_many_bits_would(
+def test_a_counter_counts_twice_the_watchdog_and_the_stale_time_or_the_refusal_states_how_many_bits_would(
     bits: int, rate: int, watchdog: float, stale: float
 ) -> None:
     loop = (f"loop.rate_hz={rate}", f"plant.watchdog_s={watchdog}", f"controller.stale_s={stale}")
@@ -28,24 +28,24 @@ def test_a_counter_counts_twice_the_watchdog_and_the_stale_time_or_the_refusal_s
         return
     with pytest.raises(ConfigError, match=rf"^the configuration: wire\.counter_bits = {bits} counts ") as refused:
         load(overrides=[*loop, f"wire.counter_bits={bits}"])
-    told = str(refused.value)
-    assert "\n" not in told
-    assert ("plant.watchdog_s" if watchdog >= stale else "controller.stale_s") in told
-    assert "can." not in told
-    if found := re.search(r"set it to (\d+)$", told):
+    reason = str(refused.value)
+    assert "\n" not in reason
+    assert ("plant.watchdog_s" if watchdog >= stale else "controller.stale_s") in reason
+    assert "can." not in reason
+    if found := re.search(r"set it to (\d+)$", reason):
         least = int(found[1])
         assert 2 ** (least - 1) < needed <= 2**least
         assert load(overrides=[*loop, f"wire.counter_bits={least}"]).wire.counter_bits == least
     else:
         assert needed > 2**16
-        assert re.search(r"16 bits are too few; shorten \S+, or lower loop\.rate_hz$", told)
+        assert re.search(r"16 bits are too few; shorten \S+, or lower loop\.rate_hz$", reason)
 
 
 def test_in_lockstep_any_counter_will_do() -> None:
     assert load(overrides=["wire.counter_bits=4", "loop.lockstep=true"]).wire.counter_bits == 4
 
 
-def test_a_short_counter_is_accepted_on_a_can_bus_that_says_so_and_nowhere_else() -> None:
+def test_a_short_counter_is_accepted_on_a_can_bus_that_allows_it_and_nowhere_else() -> None:
     short = ("wire.counter_bits=4", "can.short_counter=true")
     assert load(overrides=["plant.via=can", *short]).wire.counter_bits == 4
     with pytest.raises(ConfigError, match=r"set it to 7$"):

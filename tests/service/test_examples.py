@@ -12,6 +12,8 @@ import aeroloop
 from aeroloop.service import examples
 from tests.support.made_log import make_log
 
+pytestmark = pytest.mark.processes
+
 EXAMPLES = Path(examples.__path__[0])
 PATIENCE_S = 120
 """For what takes up to 10 s here; CI may have other work."""

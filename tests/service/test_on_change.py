@@ -86,13 +86,13 @@ def measurement(k: int, yaw: float = 0.1) -> bytes:
 
 
 def test_silence_is_computed_as_the_frame_that_was_not_sent_would_be() -> None:
-    told, heard = controller(), controller()
+    periodic, sparse = controller(), controller()
     for k in range(60):
         changed = k in (0, 7, 30)
         yaw = 0.1 if k < 7 else 0.3 if k < 30 else -0.2
-        assert heard.tick(measurement(k, yaw) if changed else SILENCE, k) == told.tick(measurement(k, yaw), k)
-        assert (heard.voltages, heard.damping_estimate) == (told.voltages, told.damping_estimate)
-        assert (heard.tick_index, heard.counter) == (k, k % COUNTERS)
+        assert sparse.tick(measurement(k, yaw) if changed else SILENCE, k) == periodic.tick(measurement(k, yaw), k)
+        assert (sparse.voltages, sparse.damping_estimate) == (periodic.voltages, periodic.damping_estimate)
+        assert (sparse.tick_index, sparse.counter) == (k, k % COUNTERS)
 
 
 def test_a_command_is_sent_when_its_codes_change_or_the_heartbeat_is_due() -> None:
@@ -123,8 +123,8 @@ def test_an_empty_frame_is_refused_where_it_can_stand_for_nothing(wire: WireSpec
 
 
 def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_hold_nothing() -> None:
-    late, told = controller(), controller()
-    for law in (late, told):
+    late, in_time = controller(), controller()
+    for law in (late, in_time):
         law.tick(measurement(0), 0)
         law.tick(SILENCE, 1)
     assert late.hold(measurement(1, 0.3))
@@ -132,7 +132,7 @@ def test_a_late_measurement_is_held_from_the_next_tick_on_and_malformed_bytes_ho
     assert not late.hold(measurement(1)[:-1])
     assert late.refused == 2
     assert late.tick_index == 1  # nothing was computed
-    assert late.tick(SILENCE, 2) == told.tick(measurement(2, 0.3), 2)
+    assert late.tick(SILENCE, 2) == in_time.tick(measurement(2, 0.3), 2)
 
 
 @pytest.mark.parametrize("at", [0, 1, 5, 9, 23])

@@ -183,7 +183,7 @@ def test_where_it_fails_the_remedies_are_bits_that_the_kind_can_have_and_cure_it
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "expected"),
     [
         (["wire.rate.kind=loud"], "wire.rate.kind: input should be 'uniform', 'hysteresis-uniform' or"),
         (["wire.rate.hysteresis=0.1"], "wire.rate: hysteresis belongs to kind"),
@@ -191,12 +191,12 @@ def test_where_it_fails_the_remedies_are_bits_that_the_kind_can_have_and_cure_it
         (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.threshold=13"], "wire.voltage: a threshold is"),
     ],
 )
-def test_what_a_kind_does_not_take_is_told_in_one_line_that_names_the_signal(
-    overrides: list[str], told: str, capfd: pytest.CaptureFixture[str]
+def test_what_a_kind_does_not_take_is_reported_in_one_line_that_names_the_signal(
+    overrides: list[str], expected: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ConfigError) as caught:
         load(overrides=overrides)
-    assert str(caught.value).startswith(told)
+    assert str(caught.value).startswith(expected)
     assert run(["show", "spec", *(word for change in overrides for word in ("--set", change))]) == 2
     captured = capfd.readouterr()
     assert captured.err == f"aeroloop: {caught.value}\n"
@@ -211,7 +211,7 @@ def test_bits_on_the_command_line_are_refused_as_those_in_the_configuration(capf
     )
 
 
-def test_show_spec_tells_the_kind_and_what_it_does(capfd: pytest.CaptureFixture[str]) -> None:
+def test_show_spec_prints_the_kind_and_what_it_does(capfd: pytest.CaptureFixture[str]) -> None:
     kinds = ["wire.attitude.kind=hysteresis-uniform", "wire.voltage.kind=logarithmic-uniform"]
     assert run(["show", "spec", *(word for change in kinds for word in ("--set", change))]) == 0
     shown = " ".join(capfd.readouterr().out.split())

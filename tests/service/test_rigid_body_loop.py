@@ -71,7 +71,7 @@ def _desired(k: int) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Run:
-    """A run; rows are ticks. q and ω are true, q_seen and omega_seen as the controller tells them.
+    """A run; rows are ticks. q and ω are true, q_seen and omega_seen as the controller reports them.
 
     θ is θ̂ as it was when the tick's voltages were computed.
     """
@@ -383,7 +383,7 @@ def test_a_start_with_negative_eta_of_the_error_goes_the_short_way_and_stays_the
 
 
 @pytest.mark.parametrize("bits", BITS)
-def test_the_loop_cannot_tell_q_from_minus_q_in_the_plant(bits: str) -> None:
+def test_the_loop_cannot_distinguish_q_from_minus_q_in_the_plant(bits: str) -> None:
     one, other = _from_behind(bits, 10.0), _from_behind(bits, 10.0, -1.0)
     assert (one.q == -other.q).all()
     assert one.frames == other.frames

@@ -40,7 +40,7 @@ class Cable:
         self._server.close()
 
     def cut(self) -> None:
-        """No byte passes any more, and nobody is told."""
+        """No byte passes any more, and neither end is notified."""
         self._whole.clear()
 
     def mend(self) -> None:

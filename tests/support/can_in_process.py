@@ -21,7 +21,7 @@ from tests.support.zenoh_network import PATIENCE_S, eventually
 
 
 def virtual(*, fd: bool = False, node: int = 1, channel: str | None = None) -> CanSettings:
-    """A bus of this process, on a channel that nobody else has unless it is given."""
+    """A bus of this process, on a channel of its own unless one is given."""
     return CanSettings(interface="virtual", channel=channel or uuid.uuid4().hex, fd=fd, node=node)
 
 
@@ -50,7 +50,7 @@ class Stranger:
         kind: dict[str, Any] = {"is_extended_id": False, "is_fd": len(data) > 8, **how}
         self._bus.send(can.Message(arbitration_id=identifier, data=data, **kind))
 
-    def hear(self, wanted: Callable[[can.Message], bool] = lambda _: True) -> can.Message:
+    def receive(self, wanted: Callable[[can.Message], bool] = lambda _: True) -> can.Message:
         """The next frame that is wanted; the others are thrown away."""
         while True:
             message = self._bus.recv(PATIENCE_S)
@@ -69,16 +69,16 @@ class Stranger:
             beat = Heartbeat.unpack(bytes(message.data), 0)
             return beat is not None and beat.state is state
 
-        self.hear(says)
+        self.receive(says)
         assert beat is not None
         return beat
 
     def everything(self) -> list[can.Message]:
-        """What has come and was not yet heard."""
+        """What has come and was not yet received."""
         return list(iter(lambda: self._bus.recv(0), None))
 
     def settle(self, *links: CanLink) -> None:
-        """Wait until links have heard all that was sent before, by a heartbeat that comes after it."""
+        """Wait until links have received all that was sent before, by a heartbeat that comes after it."""
         mark = Heartbeat(PlantState.IDLE, 0, next(self._marks).to_bytes(7, "big"))
         for base in (PLANT_HEARTBEAT_ID, CONTROLLER_HEARTBEAT_ID):
             self.say(base + self._node, mark.pack())

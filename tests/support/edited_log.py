@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.trace import HEADER_BYTES, STEPS, End, read_batc
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
 from aeroloop.service.config import load
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.certificate_cache import CertificateCache
+from aeroloop.service.review.certified_bounds import certified_bounds
 from aeroloop.service.review.observe import Observer
 from aeroloop.service.review.theorem_check import TheoremCheck
 from tests.support.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
@@ -43,7 +43,7 @@ class Said(NamedTuple):
         return address.topic.name if address else ""
 
 
-def told(
+def message_of(
     name: str, message: Model | bytes, published_ns: int, role: str = "controller", session: str = SESSION
 ) -> Said:
     """A message of the made log's vehicle."""
@@ -51,7 +51,7 @@ def told(
     return Said(key, published_ns, message if isinstance(message, bytes) else message.encode())
 
 
-def retell(
+def rewrite(
     log: Path,
     out: Path,
     change: Callable[[Said], Said | None] = lambda one: one,
@@ -72,10 +72,10 @@ def retell(
         messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
         known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
     kept = [one for message in messages if (one := change(message)) is not None]
-    return tell(out, sorted([*kept, *more], key=lambda one: one.published_ns), [*known, *metadata])
+    return write_messages(out, sorted([*kept, *more], key=lambda one: one.published_ns), [*known, *metadata])
 
 
-def tell(out: Path, messages: Iterable[Said], metadata: Iterable[tuple[str, dict[str, str]]] = ()) -> Path:
+def write_messages(out: Path, messages: Iterable[Said], metadata: Iterable[tuple[str, dict[str, str]]] = ()) -> Path:
     """Write messages in this order."""
     with out.open("wb") as stream:
         writer = Writer(stream)
@@ -112,7 +112,7 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
 def observer_of(*overrides: str) -> Observer:
     """An observer of the default configuration."""
     settings = load(overrides=overrides)
-    return Observer(settings, TheoremCheck(CertificateCache(settings).of(()), settings.loop.period, None))
+    return Observer(settings, TheoremCheck(certified_bounds(settings, ()), settings.loop.period, None))
 
 
 def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:

@@ -320,7 +320,7 @@ def _become_in_namespace(command: Sequence[str]) -> None:
 
 
 def _be_init(exchange: Path) -> None:
-    """Be process 1 of user-mode Linux: make ready, run the command, tell its outcome, halt."""
+    """Be process 1 of user-mode Linux: make ready, run the command, report its outcome, halt."""
     result: dict[str, Any] = {}
     try:
         request = json.loads((exchange / "request.json").read_text())

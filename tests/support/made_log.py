@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
 
-from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
 from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
+from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Grant
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
@@ -189,7 +189,7 @@ def make_log(
 def made(
     settings: Settings,
     ticks: int,
-    changes: Changes = {},  # noqa: B006  # nobody changes it
+    changes: Changes = {},  # noqa: B006  # never changed
     spoil: int | None = None,
     truth_every: int = 0,
     lost: Container[int] = (),
@@ -207,7 +207,7 @@ def made(
     plant_clock, clock = Clock("plant"), Clock("controller")
     emulator = Emulator(loop, wire, settings.plant, threading.Event())
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
-    with patch("aeroloop.plant_emulator.endpoint.trace_rows.time", plant_clock):
+    with patch("aeroloop.plant_emulator.hosts.trace_rows.time", plant_clock):
         plant_clock.now_ns = at_ns
         trace = PlantTrace(
             loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n

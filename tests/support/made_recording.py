@@ -55,7 +55,7 @@ class Clock:
 
 
 class Disk:
-    """Where files are written, which fails when told to.
+    """Where files are written, which fails on request.
 
     Attributes:
         room: Bytes that a file can hold.
@@ -99,14 +99,16 @@ class Recording:
     """A RollingLog, fed as the recorder feeds it: what the disk refuses waits, and a message takes a millisecond.
 
     Attributes:
-        told: What it told, and whether it was bad news.
+        reported: What it reported, and whether it was bad news.
     """
 
     def __init__(self, clock: Clock, story: EventLog, **settings: object) -> None:
-        self.told: list[tuple[str, bool]] = []
+        self.reported: list[tuple[str, bool]] = []
         self._clock = clock
         self.waiting: list[Arrived] = []
-        self.log = RollingLog(RecorderSettings.model_validate(settings), lambda *told: self.told.append(told))
+        self.log = RollingLog(
+            RecorderSettings.model_validate(settings), lambda *reported: self.reported.append(reported)
+        )
         clock.logs.append(self.log)
         self.log.add_description(story.key, story.description)
         self._decoder = Decoder(25.0)
@@ -138,8 +140,8 @@ class Recording:
         while self.waiting and self.log.writable:
             self._add(self.waiting.pop(0))
 
-    def told_bad(self) -> list[str]:
-        return [text for text, bad in self.told if bad]
+    def reported_bad(self) -> list[str]:
+        return [text for text, bad in self.reported if bad]
 
 
 def in_order(folder: Path) -> list[Path]:

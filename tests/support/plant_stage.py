@@ -13,9 +13,9 @@ from collections.abc import Callable
 from unittest.mock import patch
 
 from aeroloop.plant_emulator.endpoint.front import Front
-from aeroloop.plant_emulator.endpoint.trace_rows import PlantTrace
 from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal
 from aeroloop.protocol.messages.trace import Batch, read_batch
@@ -188,10 +188,10 @@ class Stage(Front):
             self.wires.close()
 
     def publish_when_due(self) -> None:
-        """Nothing to tell."""
+        """Nothing to publish."""
 
     def publish_status(self) -> None:
-        """Nothing to tell."""
+        """Nothing to publish."""
 
     def leave(self) -> None:
         """As a ZenohFront does."""

@@ -34,7 +34,7 @@ ERROR: Final = b"\a"
 
 class _Port:
     def __init__(self, path: Path) -> None:
-        self.near, self.far = pty.openpty()  # we hold both ends: one that nobody has opened must not look hung up
+        self.near, self.far = pty.openpty()  # we hold both ends: one that is not opened must not look hung up
         tty.setraw(self.far)
         os.set_blocking(self.near, False)
         self.path = path
@@ -114,7 +114,7 @@ class SlcanAdapter:
         os.write(self._wake_writer, b"x")
 
     def unplug(self, name: str) -> None:
-        """Pull a port out: whoever has it open gets an error, and the path is gone."""
+        """Pull a port out: a process that has it open gets an error, and the path is gone."""
         with self._lock:
             self._ports.pop(name).close()
 

@@ -113,13 +113,13 @@ class Viewer:
     def await_topics(self, *topics: str) -> None:
         """Listen until all of these have been advertised."""
         while not set(topics) <= set(self.channels):
-            self._hear()
+            self._read()
 
     def await_closed(self) -> None:
         """Listen until the server has closed the connection."""
         with suppress(ConnectionClosed):
             while True:
-                self._hear()
+                self._read()
 
     def subscribe(self, *topics: str) -> None:
         """Ask for what has been advertised; ids of subscriptions are those of channels and 1000."""
@@ -130,9 +130,9 @@ class Viewer:
 
     def receive(self) -> tuple[str, Shown]:
         """The next message, and its topic."""
-        while (heard := self._hear()) is None:
+        while (message := self._read()) is None:
             pass
-        return heard
+        return message
 
     def first(self, topic: str) -> Shown:
         """The next message of a topic."""
@@ -141,13 +141,13 @@ class Viewer:
             if found == topic:
                 return shown
 
-    def _hear(self) -> tuple[str, Shown] | None:
-        heard = self._socket.recv(PATIENCE_S)
-        if isinstance(heard, bytes):
-            opcode, subscription, at_ns = struct.unpack_from("<BIQ", heard)
+    def _read(self) -> tuple[str, Shown] | None:
+        message = self._socket.recv(PATIENCE_S)
+        if isinstance(message, bytes):
+            opcode, subscription, at_ns = struct.unpack_from("<BIQ", message)
             assert opcode == 1
-            return self._topics[subscription - 1000], Shown(at_ns, heard[13:])
-        said = json.loads(heard)
+            return self._topics[subscription - 1000], Shown(at_ns, message[13:])
+        said = json.loads(message)
         if said["op"] == "advertise":
             for channel in said["channels"]:
                 self.channels[channel["topic"]] = channel

@@ -17,13 +17,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 
 
 class BoardDriver(Driver):
-    """Drives the Aero on Quanser's board, or on the fake board with `via = "quanser-fake"`.
-
-    Args:
-        loop: Loop settings; the board's clock keeps the period.
-        wire: Format of the frames.
-        settings: The board, watchdog and limits.
-        stop: Set to end the loop.
+    """Drives the Aero on Quanser's board, or on the fake board with `via = "quanser-fake"`, by the board's clock.
 
     Raises:
         QuanserError: The interface is missing, or the board cannot be opened.

@@ -264,11 +264,7 @@ class FakeQuanser:
 
 
 class FakeHIL:
-    """Handle of the board: checks every call and passes it to the board. `interface.Board` describes the calls.
-
-    Args:
-        device: The board.
-    """
+    """Handle of the board: checks every call and passes it to the board. `interface.Board` describes the calls."""
 
     def __init__(self, device: FakeQuanser) -> None:
         self._device = device

@@ -21,6 +21,11 @@ Doubles: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int32]
 Lines: TypeAlias = NDArray[np.int8]
 
+Inputs: TypeAlias = tuple[Channels | None, int, Channels | None, int, Channels | None, int, Channels | None, int]
+"""Channels to read and how many, of analog, encoder, digital and other inputs."""
+Buffers: TypeAlias = tuple[Doubles | None, Counts | None, Lines | None, Doubles | None]
+"""Arrays to read these inputs into."""
+
 
 class QuanserError(AeroloopError):
     """Quanser's board cannot be used; the message is one line with the reason."""
@@ -47,37 +52,10 @@ class Board(Protocol):
     def set_encoder_counts(self, channels: Channels, n: int, counts: Counts, /) -> None:
         """Set the encoders' present counts."""
 
-    def read(
-        self,
-        analog: Channels | None,
-        n_analog: int,
-        encoders: Channels | None,
-        n_encoders: int,
-        digital: Channels | None,
-        n_digital: int,
-        other: Channels | None,
-        n_other: int,
-        analog_buffer: Doubles | None,
-        encoder_buffer: Counts | None,
-        digital_buffer: Lines | None,
-        other_buffer: Doubles | None,
-        /,
-    ) -> None:
+    def read(self, *inputs_and_buffers: *tuple[*Inputs, *Buffers]) -> None:
         """Read inputs at once."""
 
-    def task_create_reader(
-        self,
-        samples_in_buffer: int,
-        analog: Channels | None,
-        n_analog: int,
-        encoders: Channels | None,
-        n_encoders: int,
-        digital: Channels | None,
-        n_digital: int,
-        other: Channels | None,
-        n_other: int,
-        /,
-    ) -> object:
+    def task_create_reader(self, samples_in_buffer: int, /, *inputs: *Inputs) -> object:
         """Create a task that samples inputs by a clock of the board."""
 
     def task_set_buffer_overflow_mode(self, task: Any, mode: int, /) -> None:
@@ -89,16 +67,7 @@ class Board(Protocol):
     def task_start(self, task: Any, clock: int, frequency: float, samples: int, /) -> None:
         """Start sampling at a frequency [Hz]."""
 
-    def task_read(
-        self,
-        task: Any,
-        samples: int,
-        analog_buffer: Doubles | None,
-        encoder_buffer: Counts | None,
-        digital_buffer: Lines | None,
-        other_buffer: Doubles | None,
-        /,
-    ) -> int:
+    def task_read(self, task: Any, samples: int, /, *buffers: *Buffers) -> int:
         """Wait for samples and read them. Returns how many were read; only these are in the buffers."""
 
     def task_stop(self, task: Any, /) -> None:

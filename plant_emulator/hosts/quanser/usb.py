@@ -22,6 +22,7 @@ from aeroloop.plant_emulator.hosts.quanser.interface import (
     Counts,
     Doubles,
     Hardware,
+    Inputs,
     Lines,
     QuanserError,
     quanser,
@@ -63,12 +64,8 @@ class QuanserPlant(Plant):
 
     Each `advance` is one period. After a late call the newest sample is measured and `passed` is the number of periods
     that passed; the next `passed` − 1 calls return at once and measure NaN. A caller that raises its tick index by
-    `passed` stays on the board's clock.
-
-    Args:
-        settings: The board and its channels.
-        period: Time between samples [s].
-        hardware: Replacement of the module `quanser.hardware`; the module itself if None.
+    `passed` stays on the board's clock. `period` is the time between samples [s]; `hardware` replaces the module
+    `quanser.hardware`.
 
     Raises:
         QuanserError: The interface is missing, or the board cannot be opened and prepared.
@@ -155,7 +152,9 @@ class QuanserPlant(Plant):
         else:
             self._measurement, self._filters = NO_MEASUREMENT, None
         if not passed:
-            self._wait_out_the_period()
+            ahead = self._advanced_ns + self._period * 1e9 - time.monotonic_ns()
+            if ahead > 0:  # sleep to the end of the period, so that the loop does not spin
+                time.sleep(ahead * 1e-9)
             self._index += 1
         self.passed = max(1, passed)
         self._owed = self.passed - 1
@@ -235,7 +234,7 @@ class QuanserPlant(Plant):
         board.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(2, dtype=np.int32))
 
         gyro = None if self._gyro is None else GYRO
-        inputs = None, 0, ENCODERS, len(ENCODERS), None, 0, gyro, 0 if gyro is None else len(gyro)
+        inputs: Inputs = None, 0, ENCODERS, len(ENCODERS), None, 0, gyro, 0 if gyro is None else len(gyro)
         board.read(*inputs, None, self._counts, None, self._gyro)
         self._measurement = self._seen(1)
         self._task = board.task_create_reader(_SAMPLES_IN_BUFFER, *inputs)
@@ -285,10 +284,8 @@ class QuanserPlant(Plant):
         pitch, yaw = (step * count for step, count in zip(self._steps, self._counts.tolist(), strict=True))
         attitude = attitude_of(pitch, yaw)
         if self._gyro is not None:
-            x, y, z = (
-                sign * settings.gyro_scale * self._gyro.item(axis)
-                for axis, sign in zip(settings.gyro_axes, settings.gyro_signs, strict=True)
-            )
+            axes = zip(settings.gyro_axes, settings.gyro_signs, strict=True)
+            x, y, z = (sign * settings.gyro_scale * self._gyro.item(axis) for axis, sign in axes)
             return Measurement(attitude, (x, y, z))
         if self._filters is None:
             self._filters = [
@@ -299,12 +296,6 @@ class QuanserPlant(Plant):
             pitch_rate, yaw_rate = of_pitch.update(pitch), of_yaw.update(yaw)
         rate: Vector = rate_of(pitch, pitch_rate, yaw_rate)
         return Measurement(attitude, rate)
-
-    def _wait_out_the_period(self) -> None:
-        """After a failed read, sleep to the end of the period, so that the loop does not spin."""
-        ahead = self._advanced_ns + self._period * 1e9 - time.monotonic_ns()
-        if ahead > 0:
-            time.sleep(ahead * 1e-9)
 
     # ── outputs and watchdog ──
 

@@ -33,15 +33,9 @@ Json = dict[str, Any]
 
 def page_data(reports: Sequence[Report]) -> str:
     """Everything that is drawn, as JSON that may stand in a script element."""
-    data = {
-        "span": _span(reports),
-        "runs": [_run(report) for report in reports],
-        "groups": list(_groups(reports)),
-        "spreads": [
-            {"id": name, "runs": [_spread(report, name) for report in reports]}
-            for name in spread_names(reports)
-        ],
-    }  # fmt: skip
+    spreads = [{"id": name, "runs": [_spread(report, name) for report in reports]} for name in spread_names(reports)]
+    runs, groups = [_run(report) for report in reports], list(_groups(reports))
+    data = {"span": _span(reports), "runs": runs, "groups": groups, "spreads": spreads}
     # These occur inside JSON strings only; without them, no text can end the script or start a comment.
     return dumps(data, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -157,9 +151,8 @@ def _sparse(values: Array) -> bool:
 
 
 def _extent(values: Sequence[Array]) -> tuple[float, float]:
-    finite = [v[np.isfinite(v)] for v in values]
-    finite = [v for v in finite if len(v)]
-    return (min(float(v.min()) for v in finite), max(float(v.max()) for v in finite)) if finite else (0.0, 0.0)
+    finite = np.concatenate([v[np.isfinite(v)] for v in values])
+    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
 
 
 def _decimals(largest: float) -> int:

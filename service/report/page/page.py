@@ -16,7 +16,7 @@ from typing import Final
 
 from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.report.page import happenings, setup, theorem, verdict
-from aeroloop.service.report.page.data import group_titles, page_data, spread_names
+from aeroloop.service.report.page.data import SPREADS, group_titles, page_data, spread_names
 from aeroloop.service.report.page.markup import Html, joined, tag
 from aeroloop.service.review.report import Report
 
@@ -30,27 +30,20 @@ TIME_UNITS: Final = frozenset({"s", "ms", "µs"})
 
 
 def page(reports: Sequence[Report]) -> str:
-    """The page of one run, or of several overlaid.
-
-    Args:
-        reports: At least one.
-
-    Raises:
-        ValueError: There is none.
-    """
+    """The page of one run, or of several overlaid. Raises ValueError if there is none."""
     if not reports:
         raise ValueError("a page needs a run")
     from plotly.offline import get_plotlyjs
 
     library = _script(get_plotlyjs())
     ours = _script('"use strict";\n' + "\n".join(_read(name) for name in SCRIPTS))
-    title = reports[0].name if len(reports) == 1 else " – ".join(report.name for report in reports)
+    title, sections = " – ".join(report.name for report in reports), _sections(reports)
     return Template(_read("page.html")).substitute(
         policy=_policy([library, ours]),
         title=tag("title", f"{title} · aeroloop"),
         style=tag("style", Html("\n" + _read("page.css"))),
         masthead=verdict.masthead(reports),
-        navigation=_navigation(sections := _sections(reports)),
+        navigation=joined(tag("a", title, href=f"#{name}") for name, title, _ in sections),
         runs="several" if len(reports) > 1 else "one",
         verdict=tag("div", verdict.verdict(reports), class_="verdicts"),
         sections=joined(_section(*section) for section in sections),
@@ -81,11 +74,14 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
     several = len(reports) > 1
     drawn = _groups(reports, {group: title for group, title in titles.items() if group not in in_time})
     timing = joined([
-        tag("div", [_drawing("spread", name, happenings.spread_title(name)) for name in spread_names(reports)],
+        tag("div", [_drawing("spread", name, SPREADS.get(name, name)) for name in spread_names(reports)],
             class_="drawings"),
         happenings.timing(reports),
         _groups(reports, {group: title for group, title in titles.items() if group in in_time}),
     ])  # fmt: skip
+    configurations = [report.settings for report in reports]
+    search = tag("input", type="search", id="search", placeholder="Search keys and values", autocomplete="off",
+                 aria_label="Search the configuration and the facts")  # fmt: skip
     return [
         ("figures", "Figures of merit", verdict.figures(reports)),
         *([("differences", "What differs in the configurations", setup.differing(reports))] if several else []),
@@ -96,8 +92,8 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
         ("timing", "Timing", timing),
         ("gaps", "Gaps", happenings.gaps(reports)),
         ("wire", "On the wire", happenings.wire(reports)),
-        ("configuration", "Configuration", joined([_search(), setup.configuration(reports)])),
-        ("facts", "Software and host", setup.facts(reports)),
+        ("configuration", "Configuration", joined([search, setup.sections(reports, configurations)])),
+        ("facts", "Software and host", setup.sections(reports, [report.facts for report in reports])),
     ]
 
 
@@ -105,19 +101,12 @@ def _section(name: str, title: str, contents: Html) -> Html:
     return tag("section", tag("h2", title, id=f"{name}-title"), contents, id=name, aria_labelledby=f"{name}-title")
 
 
-def _navigation(sections: Sequence[tuple[str, str, Html]]) -> Html:
-    return joined(tag("a", title, href=f"#{name}") for name, title, _ in sections)
-
-
 def _groups(reports: Sequence[Report], titles: dict[str, str]) -> Html:
-    heights = {
-        group: max(sum(panel.group == group for panel in report.panels) for report in reports) for group in titles
-    }
-    return tag(
-        "div",
-        [_drawing("group", group, title, panels=heights[group]) for group, title in titles.items()],
-        class_="drawings",
-    )
+    drawings = []
+    for group, title in titles.items():
+        panels = max(sum(panel.group == group for panel in report.panels) for report in reports)
+        drawings.append(_drawing("group", group, title, panels))
+    return tag("div", drawings, class_="drawings")
 
 
 def _drawing(kind: str, name: str, title: str, panels: int = 1) -> Html:
@@ -136,24 +125,16 @@ def _thinned(reports: Sequence[Report]) -> Html:
     return tag("p", text, class_="quiet", id="thinned")
 
 
-def _search() -> Html:
-    return tag("input", type="search", id="search", placeholder="Search keys and values", autocomplete="off",
-               aria_label="Search the configuration and the facts")  # fmt: skip
-
-
 def _script(code: str) -> Html:
     return tag("script", Html(f"\n{code}\n"))
 
 
 def _policy(scripts: Sequence[Html]) -> Html:
     """Content security policy: nothing from outside of this file, and only these scripts."""
-    hashes = [_hash(script.removeprefix("<script>").removesuffix("</script>")) for script in scripts]
-    rules = f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:"
+    codes = [script.removeprefix("<script>").removesuffix("</script>") for script in scripts]
+    hashes = " ".join(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'" for code in codes)
+    rules = f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
     return tag("meta", http_equiv="Content-Security-Policy", content=rules)
-
-
-def _hash(code: str) -> str:
-    return f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'"
 
 
 def _read(name: str) -> str:

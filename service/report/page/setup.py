@@ -13,20 +13,9 @@ from aeroloop.service.review.report import Report, differences, flat
 
 def differing(reports: Sequence[Report]) -> Html:
     """Keys whose value is not the same in every run."""
-    rows = differences(reports)
-    if not rows:
-        return tag("p", "Nothing: the configurations are the same.", class_="quiet")
-    return _keys(reports, rows, "")
-
-
-def configuration(reports: Sequence[Report]) -> Html:
-    """Every key, in a searchable table per section."""
-    return _sections(reports, [report.settings for report in reports])
-
-
-def facts(reports: Sequence[Report]) -> Html:
-    """Software and host of each role."""
-    return _sections(reports, [report.facts for report in reports])
+    if rows := differences(reports):
+        return _keys(reports, rows, "")
+    return tag("p", "Nothing: the configurations are the same.", class_="quiet")
 
 
 def shown(value: Any) -> str:
@@ -36,22 +25,22 @@ def shown(value: Any) -> str:
     return value if isinstance(value, str) else dumps(value, ensure_ascii=False, default=str)
 
 
-def _sections(reports: Sequence[Report], tables: Sequence[dict[str, Any]]) -> Html:
-    sections: dict[str, dict[str, None]] = {}
+def sections(reports: Sequence[Report], tables: Sequence[dict[str, Any]]) -> Html:
+    """Every key of each run's nested tables, in a searchable table per section."""
+    keys_of: dict[str, dict[str, None]] = {}
     flattened = [flat(table) for table in tables]
     for keys in flattened:
         for key in keys:
             section, dot, _ = key.partition(".")
-            sections.setdefault(section if dot else "", {})[key] = None
-    if not sections:
+            keys_of.setdefault(section if dot else "", {})[key] = None
+    if not keys_of:
         return tag("p", "Not in the log.", class_="quiet")
     parts = []
-    for section, found in sorted(sections.items()):
+    for section, found in sorted(keys_of.items()):
         rows = [(key, [keys.get(key) for keys in flattened]) for key in found]
         prefix = f"{section}." if section else ""
-        title = tag(
-            "summary", section or "general", tag("span", f"{len(rows)} key{'s' * (len(rows) > 1)}", class_="quiet")
-        )
+        count = tag("span", f"{len(rows)} key{'s' * (len(rows) > 1)}", class_="quiet")
+        title = tag("summary", section or "general", count)
         parts.append(tag("details", title, _keys(reports, rows, prefix), class_="keys"))
     return joined(parts)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from aeroloop.service.report.page.happenings import Column, jump, run_cell, run_column, table
+from aeroloop.service.report.page.happenings import Column, jump, table
 from aeroloop.service.report.page.markup import Html, joined, tag
 from aeroloop.service.report.page.verdict import figures_table, run_name
 from aeroloop.service.report.rows import THEOREM, figure_rows, percent
@@ -48,15 +48,14 @@ def judged(found: TheoremFindings) -> str:
 
 
 def _verdict(reports: Sequence[Report], index: int) -> Html:
-    report = reports[index]
-    found = report.findings.theorem
+    found = reports[index].findings.theorem
     assert found is not None
     until = f" Judged until {found.until_s:g} s, where gains or reference changed." if found.until_s is not None else ""
     since = f" Judged from {found.since_s:g} s, when the reference had been reached." if found.since_s else ""
     mood = "good" if found.holds else "bad"
     return tag(
         "div",
-        tag("p", run_name(report, index, len(reports))) if len(reports) > 1 else None,
+        tag("p", run_name(reports[index], index, len(reports))) if len(reports) > 1 else None,
         tag("p", tag("span", "✓" if found.holds else "✗", class_="sign", aria_hidden="true"), " ", found.verdict,
             class_=mood),
         tag("p", f"The transient is taken to last {found.transient_s:.3g} s, three times the law's slower "
@@ -77,5 +76,5 @@ def _lemma(reports: Sequence[Report]) -> Html:
             at = "–" if check.closest_s is None else jump(check.closest_s, index, f"{what} closest to its bound")
             broken = tag("b", f"{check.broken:,}", class_="kind grave") if check.broken else "0"
             cells = [f"({check.equation})", check.what, f"{check.samples:,}", broken, first, most, at]
-            rows.append([*run_cell(reports, index), *cells])
-    return table([*run_column(reports), *COLUMNS], rows) if rows else Html("")
+            rows.append((index, cells))
+    return table(reports, COLUMNS, rows) if rows else Html("")

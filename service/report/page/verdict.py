@@ -28,7 +28,8 @@ def judgement(run: Findings) -> Judgement:
     if run.z_track is None:
         return Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
     if run.trips:
-        return Judgement("Tripped", False, f"The plant went to 0 V by itself {_times(len(run.trips))}.")
+        times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
+        return Judgement("Tripped", False, f"The plant went to 0 V by itself {times}.")
     return Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was asked for.")
 
 
@@ -53,17 +54,14 @@ def verdict(reports: Sequence[Report]) -> Html:
 
 def _verdict(report: Report, index: int, of: int) -> Html:
     found = judgement(report.findings)
-    mood = {True: "good", False: "bad", None: "neutral"}[found.good]
-    sign = {True: "✓", False: "✗", None: "●"}[found.good]
-    facts = [*report.findings.trips, *_facts(report.findings)]
+    mood, sign = {True: ("good", "✓"), False: ("bad", "✗"), None: ("neutral", "●")}[found.good]
+    checks, facts = report.findings.checks, [*report.findings.trips, *_facts(report.findings)]
     return tag(
         "div",
         run_name(report, index, of) if of > 1 else None,
         tag("p", tag("span", sign, aria_hidden="true"), f" {found.word}", class_="word"),
         tag("p", found.because),
-        tag("ul", [_check(check) for check in report.findings.checks], class_="checks")
-        if report.findings.checks
-        else None,
+        tag("ul", [_check(check) for check in checks], class_="checks") if checks else None,
         tag("ul", [tag("li", fact) for fact in facts], class_="facts") if facts else None,
         class_=f"verdict {mood}",
     )
@@ -106,11 +104,7 @@ def _card(row: Row) -> Html:
     value = row.values[0]
     unit = None if value.text == "–" else row.unit if row.unit == "°" else f" {row.unit}"
     return tag(
-        "div",
-        tag("dt", row.name),
-        tag("dd", tag("b", value.text), unit, _why(value)),
-        class_="card",
-        title=row.key,
+        "div", tag("dt", row.name), tag("dd", tag("b", value.text), unit, _why(value)), class_="card", title=row.key
     )
 
 
@@ -159,7 +153,3 @@ def _when(report: Report) -> Html:
 
 def _count(n: int, what: str) -> str:
     return f"{n:,} {what}" + ("" if n == 1 else "s")
-
-
-def _times(n: int) -> str:
-    return "once" if n == 1 else f"{n} times"

@@ -81,7 +81,7 @@ def _read(frame: bytes | None, wire: WireSpec = WIRE) -> tuple[int, tuple[float,
     return read
 
 
-def _told(endpoint: Endpoint) -> list[str]:
+def _kinds(endpoint: Endpoint) -> list[str]:
     return [notice.kind for notice in endpoint.notices]
 
 
@@ -101,13 +101,13 @@ def test_a_claim_is_granted_and_the_next_tick_measures_with_counter_0() -> None:
     plant = Notebook()
     endpoint = Endpoint(plant, WIRE, PERIOD_NS)
     for k in range(4):
-        assert endpoint.tick(None, k) is None  # nobody listens
+        assert endpoint.tick(None, k) is None  # no session
     assert endpoint.claim(_claim()) == Grant(session="of-a")
     assert (endpoint.state, endpoint.session, endpoint.holder) == (PlantState.GRANTED, "of-a", "a")
     for k in range(4, 4 + 2 * COUNTERS):
         command = None if k == 4 else _command(k - 5)
         assert _read(endpoint.tick(command, k))[0] == (k - 4) % COUNTERS == endpoint.counter
-    assert _told(endpoint) == ["claimed"]
+    assert _kinds(endpoint) == ["claimed"]
     assert "a" in endpoint.notices[0].text
     assert endpoint.notices[0].session == "of-a"
 
@@ -205,7 +205,7 @@ def test_malformed_commands_do_not_feed_the_watchdog() -> None:
     for k in range(2, 80):
         endpoint.tick(b"junk!", k)
     assert _is_off(plant, WATCHDOG_TICKS)
-    assert endpoint.refused == WATCHDOG_TICKS  # until the session ended; then nobody is expected to command
+    assert endpoint.refused == WATCHDOG_TICKS  # until the session ended; then no command is expected
 
 
 @pytest.mark.parametrize("older", [0, 1, 2, 8])
@@ -264,7 +264,7 @@ def test_the_watchdog_gives_0_v_exactly_when_its_time_is_over() -> None:
     assert plant.held[: 9 + WATCHDOG_TICKS] == [_volts()] * (9 + WATCHDOG_TICKS)
     assert plant.held[9 + WATCHDOG_TICKS :] == [OFF] * (99 - 9 - WATCHDOG_TICKS)
     assert _state(endpoint) is PlantState.TRIPPED
-    assert _told(endpoint) == ["claimed", "tripped"]
+    assert _kinds(endpoint) == ["claimed", "tripped"]
     assert "100 ms" in endpoint.notices[-1].text
 
 
@@ -379,7 +379,7 @@ def test_each_axis_holds_its_own_level() -> None:
 
 def test_the_holder_of_a_tripped_session_can_claim_again() -> None:
     endpoint, _ = _claimed()
-    endpoint.expire(TripCause.NO_ANSWER, "nobody answers")
+    endpoint.expire(TripCause.NO_ANSWER, "no reply")
     assert _state(endpoint) is PlantState.TRIPPED
     assert isinstance(endpoint.claim(_claim(changed={"session": "second"})), Grant)
     assert (endpoint.state, endpoint.session) == (PlantState.GRANTED, "second")
@@ -395,7 +395,7 @@ def test_a_release_ends_the_session_with_0_v() -> None:
     assert (endpoint.state, endpoint.session, endpoint.holder) == (PlantState.IDLE, None, None)
     assert endpoint.tick(_command(1), 2) is None
     assert plant.held == [_volts(), OFF]
-    assert _told(endpoint) == ["claimed", "released"]
+    assert _kinds(endpoint) == ["claimed", "released"]
     assert isinstance(endpoint.claim(_claim("b")), Grant)
 
 
@@ -418,18 +418,18 @@ def test_a_holder_that_is_gone_means_0_v() -> None:
     assert _state(endpoint) is PlantState.TRIPPED
     assert endpoint.tick(_command(2), 3) is None
     assert plant.held == [_volts(), _volts(), OFF]
-    assert _told(endpoint) == ["claimed", "tripped"]
+    assert _kinds(endpoint) == ["claimed", "tripped"]
     assert "a is gone" in endpoint.notices[-1].text
 
 
-def test_the_owner_can_end_a_session_and_ending_none_is_not_told() -> None:
+def test_the_owner_can_end_a_session_and_ending_none_is_not_reported() -> None:
     endpoint, plant = _claimed()
     endpoint.tick(_command(0), 1)
     endpoint.expire(TripCause.NO_ANSWER, "no answer in lockstep")
     endpoint.expire(TripCause.NO_ANSWER, "no answer in lockstep")
     endpoint.tick(_command(1), 2)
     assert plant.held == [_volts(), OFF]
-    assert _told(endpoint) == ["claimed", "tripped"]
+    assert _kinds(endpoint) == ["claimed", "tripped"]
     assert "no answer in lockstep" in endpoint.notices[-1].text
 
 

@@ -27,7 +27,7 @@ REST = Measurement(IDENTITY, (0.0, 0.0, 0.0))
 
 
 class Stand(Plant):
-    """A plant that shows the voltages it has and reports what it is told to."""
+    """A plant that shows the voltages it has and reports a preset measurement."""
 
     actuators = 2
 
@@ -76,7 +76,7 @@ def driven(limits: LimitSettings) -> tuple[Endpoint, Stand]:
         (Measurement(IDENTITY, (0.0, 3.0, 3.9)), Measurement(IDENTITY, (0.0, 3.0, 4.1)), "max_rate"),
     ],
 )
-def test_beyond_an_envelope_it_trips_within_the_tick_and_says_which(
+def test_beyond_an_envelope_it_trips_within_the_tick_and_names_it(
     within: Measurement, beyond: Measurement, why: str
 ) -> None:
     endpoint, plant = driven(LimitSettings(max_tilt_deg=30.0, max_rate=5.0))
@@ -120,7 +120,7 @@ def test_a_voltage_that_leaves_its_limit_in_between_does_not_trip() -> None:
     assert endpoint.state is PlantState.DRIVEN
 
 
-def test_an_unarmed_plant_refuses_and_says_how_to_arm_it() -> None:
+def test_an_unarmed_plant_refuses_and_states_how_to_arm_it() -> None:
     endpoint = Endpoint(Stand(), WIRE, PERIOD_NS)
     answer = endpoint.claim(claim())
     assert isinstance(answer, Refusal)

@@ -58,7 +58,7 @@ class Model:
 
 
 late = st.one_of(st.integers(0, WATCHDOG + 2), st.integers(0, COUNTERS - 1), st.none())
-"""By how many ticks a command is late; None: it is lost. A whole round of the counter cannot be told."""
+"""By how many ticks a command is late; None: it is lost. A whole round of the counter cannot be detected."""
 
 
 @settings(max_examples=300)
@@ -94,7 +94,7 @@ def test_a_stream_that_is_late_for_good_drives_within_the_watchdogs_time_and_nev
     assert (endpoint.trip is TripCause.COMMAND_TIMEOUT) == (delay > WATCHDOG)
 
 
-def test_a_counter_that_is_short_by_configuration_tells_no_such_stream() -> None:
+def test_a_counter_that_is_short_by_configuration_detects_no_such_stream() -> None:
     endpoint = claimed(watchdog=50)
     endpoint.tick(None, 0)
     for now in range(COUNTERS + 10):

@@ -92,7 +92,7 @@ def test_a_plant_at_rest_sends_heartbeats_only_and_a_change_at_once(lockstep: bo
     }
 
 
-def test_silence_is_told_from_no_session() -> None:
+def test_silence_is_distinguished_from_no_session() -> None:
     endpoint, _ = claimed()
     assert endpoint.tick(command(0), 1) == SILENCE
     endpoint.release("first")
@@ -195,7 +195,7 @@ def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_th
     assert endpoint.trip is TripCause.INVALID_COMMAND
 
 
-# Who hears silence on a clock may learn late that values are valid again
+# In real time, the end of silence may show late that values are valid again
 
 
 def after_a_failure(policy: Policy, *, lockstep: bool = False) -> tuple[Endpoint, Notebook, int]:

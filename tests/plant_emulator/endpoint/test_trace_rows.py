@@ -79,7 +79,7 @@ def test_every_tick_of_a_session_has_a_row_and_no_other_tick() -> None:
     ]
 
 
-def test_a_row_says_what_came_what_was_made_of_it_and_what_was_measured() -> None:
+def test_a_row_holds_what_came_what_was_made_of_it_and_what_was_measured() -> None:
     stage = Stage(LOOP, WIRE, PLANT, between=at({0: Stage.claim}), answer=answer).run(50)
     batches = stage.batches
     assert b"".join(stage.sent) == b"".join(batch.columns["measurement"].tobytes() for batch in batches)
@@ -176,7 +176,7 @@ def test_what_is_done_without_a_session_is_published_at_once_without_rows() -> N
     assert [operation.kind for operation in operations(batches)] == ["stop", "arm"]
 
 
-def test_what_changes_limits_and_watchdog_says_so_in_full() -> None:
+def test_a_change_of_limits_or_watchdog_is_recorded_in_full() -> None:
     other = PLANT.model_copy(update={"watchdog_s": 0.04})
     stage = Stage(LOOP, WIRE, PLANT, between=at({3: lambda stage: stage.driver.reconfigure(other)})).run(5)
     assert operations(stage.batches) == [

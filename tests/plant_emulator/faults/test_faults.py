@@ -224,7 +224,7 @@ def test_what_is_written_reads_back_the_same(fault: Fault) -> None:
 
 
 @given(text=st.text() | st.from_regex(r"(attitude|motor1|command):[a-z]*=?[-.0-9einf]*@?[-.0-9]*"))
-def test_any_text_is_a_fault_or_one_line_that_says_why_not(text: str) -> None:
+def test_any_text_is_a_fault_or_one_line_that_states_why_not(text: str) -> None:
     reason = ""
     try:
         fault = Fault.parse(text)
@@ -276,13 +276,13 @@ def test_a_fault_begins_and_ends_at_the_tick_that_its_decimals_mean(k: int) -> N
     assert [not tick for tick in ticks] == [False] * k + [True, False]
 
 
-def test_a_stuck_sensor_says_its_last_value_before_the_fault() -> None:
+def test_a_stuck_sensor_reports_its_last_value_before_the_fault() -> None:
     seen = sensed("rate.y:stuck@0.3..0.6", "attitude:stuck@0.5")
     assert [m.rate for m in seen] == [(1.0 * k, 20.0 if 3 <= k < 6 else 10.0 * k, 100.0 * k) for k in range(9)]
     assert [m.attitude for m in seen] == [sample(min(k, 4)).attitude for k in range(9)]
 
 
-def test_a_sensor_that_is_stuck_at_once_says_its_first_value() -> None:
+def test_a_sensor_that_is_stuck_at_once_reports_its_first_value() -> None:
     assert [m.rate for m in sensed("rate:stuck")] == [sample(0).rate] * 9
 
 
@@ -344,7 +344,7 @@ def test_noise_on_an_attitude_turns_it_by_a_random_angle() -> None:
     assert all(q[1] and q[2] for q, _ in sensed("attitude:noise=0.5"))
 
 
-def test_a_delayed_sensor_says_what_was_true_then_even_from_before_the_fault() -> None:
+def test_a_delayed_sensor_reports_what_was_true_then_even_from_before_the_fault() -> None:
     seen = sensed("rate.x:delay=0.2@0.4..0.7", "attitude:delay=0.3@0.1")
     assert [m.rate[0] for m in seen] == [0.0, 1.0, 2.0, 3.0, 2.0, 3.0, 4.0, 7.0, 8.0]
     assert [m.rate[1:] for m in seen] == [sample(k).rate[1:] for k in range(9)]
@@ -355,7 +355,7 @@ def test_a_delay_of_nothing_changes_nothing() -> None:
     assert sensed("rate:delay=0", "attitude:delay=0") == sensed()
 
 
-def test_a_delay_within_a_period_says_what_was_true_at_its_beginning() -> None:
+def test_a_delay_within_a_period_reports_what_was_true_at_its_beginning() -> None:
     assert [m.rate[0] for m in sensed("rate:delay=0.05", ticks=3)] == [0.0, 0.0, 1.0, 2.0]
 
 
@@ -367,7 +367,7 @@ def test_history_that_is_asked_for_rarely_is_kept_all_the_same() -> None:
 
 
 @pytest.mark.parametrize("signal", ["attitude", "attitude.y", "rate", "rate.z"])
-def test_a_fifth_of_the_samples_is_missing_when_it_is_told_to_be(signal: str) -> None:
+def test_a_fifth_of_the_samples_is_missing_when_configured_so(signal: str) -> None:
     """Of n = 10,000 with p = 0.2 the deviation is √(np(1 − p)) = 40; 5 of them fail one seed in 1.7 million."""
     seen = sensed(f"{signal}:drop=0.2", ticks=MANY - 1)
     values = [m.attitude if signal.startswith("attitude") else m.rate for m in seen]
@@ -395,7 +395,7 @@ def test_garbled_rates_are_anywhere_within_ten_radians_a_second() -> None:
         assert 0.98 * GARBLED_RATE < max(component) <= GARBLED_RATE, i
 
 
-def test_garbling_acts_on_its_axis_and_as_often_as_it_is_told() -> None:
+def test_garbling_acts_on_its_axis_and_as_often_as_configured() -> None:
     seen = sensed("rate.y:garble=0.2", ticks=MANY - 1)
     changed = sum(m.rate[1] != sample(k).rate[1] for k, m in enumerate(seen))
     assert abs(changed - 2000) <= 200  # 5 deviations, as above
@@ -573,7 +573,7 @@ def test_what_is_late_from_now_on_is_what_it_is_now_until_the_delay_is_over() ->
 
 @pytest.mark.parametrize("text", ["motor1:bias=1@0..0.2", "rate:bias=1@0..0.2", "attitude:bias=1@0..0.2"])
 def test_a_fault_that_is_over_is_forgotten(text: str) -> None:
-    """A plant that is told of faults for days must not look through all of them at every tick."""
+    """A plant that receives faults for days must not look through all of them at every tick."""
     fault = Fault.parse(text)
     plant = FaultyPlant(Stand(), [fault], PERIOD, voltage_limit=LIMIT)
     kept = ref(fault)
@@ -586,7 +586,7 @@ def test_a_fault_that_is_over_is_forgotten(text: str) -> None:
     assert kept() is None
 
 
-def test_once_cleared_everything_is_as_it_is_and_as_it_is_told() -> None:
+def test_once_cleared_sensors_and_motors_act_as_without_faults() -> None:
     plant, stand = faulty("rate:off", "attitude:off", "motors:off")
     plant.actuate((5.0, 5.0))
     plant.advance()

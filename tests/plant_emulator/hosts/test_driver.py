@@ -80,7 +80,7 @@ class Granting(Front):
 def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_took(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The controller tells from it where the grid is; one sent late would put it ticks back."""
+    """The controller derives the grid from it; one sent late would put it ticks back."""
     stop, grid = threading.Event(), Grid(LOOP.period_ns)
     monkeypatch.setattr(driver, "TickGrid", lambda _period_ns: grid)
     front = Granting(grid, stop)

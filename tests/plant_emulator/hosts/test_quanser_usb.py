@@ -149,7 +149,7 @@ def test_a_board_that_was_left_under_an_expired_watchdog_is_had_again_at_0_v() -
     assert board.analog == [0.0, 0.0]  # not only behind a switch
 
 
-def test_a_board_that_is_not_there_is_told_in_one_line() -> None:
+def test_a_board_that_is_not_there_is_reported_in_one_line() -> None:
     with pytest.raises(QuanserError, match=r"cannot open quanser_aero_usb '0': there is no quanser_aero_usb '0'; .*\?"):
         QuanserPlant(QuanserSettings(card_type="quanser_aero_usb"), PERIOD, hardware=_board())
     with pytest.raises(QuanserError, match="there is no quanser_aero2_usb '1'"):
@@ -179,7 +179,7 @@ def test_a_board_that_cannot_be_made_ready_is_given_back(call: str) -> None:
 
 
 @pytest.mark.parametrize("call", ["watchdog_start", "task_start"])
-def test_a_board_that_cannot_be_started_is_told_in_one_line(call: str) -> None:
+def test_a_board_that_cannot_be_started_is_reported_in_one_line(call: str) -> None:
     plant, board = _made()
     board.fail_next(call)
     with pytest.raises(QuanserError, match=f"cannot start quanser_aero2_usb: {call} was told to fail"):
@@ -211,17 +211,17 @@ def test_a_virtual_board_waits_for_its_reader() -> None:
 # The interface itself
 
 
-def test_without_quansers_package_it_says_what_to_install() -> None:
-    with pytest.raises(QuanserError) as told:
+def test_without_quansers_package_the_error_names_what_to_install() -> None:
+    with pytest.raises(QuanserError) as refused:
         QuanserPlant(QuanserSettings(), PERIOD)
-    text = str(told.value)
+    text = str(refused.value)
     assert "No module named 'quanser'" in text
     assert "Quanser SDK" in text
     assert "quanser_api" in text
     assert "\n" not in text
 
 
-def test_a_package_whose_libraries_are_missing_is_told_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_whose_libraries_are_missing_is_reported_too(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(name: str) -> ModuleType:
         raise OSError(f"libhil.so not found for {name}")
 
@@ -396,7 +396,7 @@ def test_where_reads_fail_for_long_the_board_goes_to_0_v_by_itself() -> None:
     for k in range(WATCHDOG + 5):
         before = board.truth().voltages
         assert (before == OFF) == (k > WATCHDOG)  # of the period that is over
-        _drive(plant, 1)  # whoever drives it goes on
+        _drive(plant, 1)  # the loop that drives it goes on
     assert plant.expiries == 1
 
 
@@ -415,7 +415,7 @@ def test_reads_that_fail_take_their_time(clock: HandClock) -> None:
     assert clock.slept == pytest.approx([PERIOD, PERIOD - 0.0005], abs=1e-9)
 
 
-# Samples that nobody read in time
+# Samples that were not read in time
 
 
 def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_are_counted() -> None:
@@ -622,7 +622,7 @@ def test_a_command_that_could_not_be_written_does_not_reload_the_watchdog() -> N
 
 
 @pytest.mark.parametrize("call", ["write_analog", "write_digital"])
-def test_a_plant_that_does_not_do_as_it_is_told_has_0_v_before_long(call: str) -> None:
+def test_a_plant_that_ignores_its_calls_has_0_v_before_long(call: str) -> None:
     plant, board = _driven()
     board.fail_next(call, 1000)
     if call == "write_digital":
@@ -700,7 +700,7 @@ def test_the_amplifier_has_no_voltage_yet_when_it_is_switched_on() -> None:
     assert written[-2:] == ["write_digital", "write_analog"]
 
 
-def test_who_says_when_it_is_driven_has_the_amplifier_to_himself() -> None:
+def test_with_explicit_enable_only_its_caller_switches_the_amplifier() -> None:
     plant, board = _made()
     plant.enable(False)
     _drive(plant, 3)
@@ -925,7 +925,7 @@ def test_a_board_that_is_unplugged_trips_the_endpoint_in_the_time_of_its_guard()
         ticks += 1
     assert ticks == 51  # limits.max_invalid_s = 0.1 s of samples without a value, and the one that makes it more
     assert "no valid value" in endpoint.notices[-1].text
-    assert board.analog == [0.0, 0.0]  # nobody could write it any more: the board's watchdog did
+    assert board.analog == [0.0, 0.0]  # no write reaches it any more: the board's watchdog did
     assert board.expired
 
 
@@ -1081,7 +1081,7 @@ def test_the_stand_ins_task_is_read_one_sample_at_a_time_into_buffers_that_fit()
         handle.task_set_buffer_overflow_mode(task, BufferOverflowMode.OVERWRITE_ON_OVERFLOW)
 
 
-def test_the_stand_in_tells_overflows_as_the_mode_says() -> None:
+def test_the_stand_in_handles_overflows_as_the_mode_states() -> None:
     counts = np.zeros(2, dtype=np.int32)
     for mode, expected in [
         (BufferOverflowMode.OVERWRITE_ON_OVERFLOW, [3, 4, 5, 6]),
@@ -1110,7 +1110,7 @@ def test_the_stand_in_tells_overflows_as_the_mode_says() -> None:
 
 
 def test_the_stand_in_leaves_buffers_as_they_were_when_a_read_fails() -> None:
-    """So whoever takes them for new has old data, as with the usual class for this board."""
+    """So code that takes them for new has old data, as with the usual class for this board."""
     handle, task = _started()
     board, began = SHARED, SHARED.time
     counts = np.array([123, 456], dtype=np.int32)
@@ -1124,7 +1124,7 @@ def test_the_stand_in_leaves_buffers_as_they_were_when_a_read_fails() -> None:
 
 
 def test_the_stand_in_gives_outputs_back_as_they_were() -> None:
-    """The worst that can be read into the documentation: whoever clears a watchdog must write 0 V at once."""
+    """The worst that can be read into the documentation: after a watchdog is cleared, 0 V must be written at once."""
     board = _board()
     plant = QuanserPlant(QuanserSettings(), PERIOD, hardware=board)
     _drive(plant, 1)

@@ -218,7 +218,7 @@ def test_batches_that_come_again_are_passed_over() -> None:
     assert replayed(loop, wire, plant, again) == replayed(loop, wire, plant, batches)
 
 
-def test_it_stops_where_rows_are_missing_and_says_where() -> None:
+def test_it_stops_where_rows_are_missing_and_reports_where() -> None:
     loop, wire, batches = undisturbed()
     with_rows = [i for i, batch in enumerate(batches) if batch.header.rows]
     del batches[with_rows[1]]

@@ -86,7 +86,7 @@ def test_thrust_lags_behind_the_voltage() -> None:
             expected = 0.001 * 20.0 / WEIGHTLESS.inertia[1] * (t - UP * (1 - exp(-t / UP)))
             # as above, (h/τ)⁵/120 a step; the first period's rate is itself only (t/τ)/2 of what it would be at once
             assert plant.truth().rate[1] == pytest.approx(expected, rel=1e-8)
-    assert plant.truth().voltages == (20.0, 0.0)  # what is told is the voltage at the motor, not the thrust
+    assert plant.truth().voltages == (20.0, 0.0)  # the truth holds the voltage at the motor, not the thrust
 
 
 def test_lags_of_zero_leave_the_rotors_out() -> None:
@@ -246,7 +246,7 @@ def test_gusts_repeat_with_their_seed_and_only_with_it() -> None:
 
 @pytest.mark.parametrize("period", [0.02, 0.1])
 @pytest.mark.parametrize("axes", [2, 3])
-def test_gusts_have_the_mean_deviation_and_memory_they_are_told_whatever_the_period(axes: int, period: float) -> None:
+def test_gusts_have_the_configured_mean_deviation_and_memory_whatever_the_period(axes: int, period: float) -> None:
     """`gust` is the deviation of the whole torque as a part of the whole steady torque, spread evenly over the axes.
 
     For a process with autocorrelation ρ^|k| and n samples, the mean has the variance σ²/n (1 + ρ)/(1 − ρ), the variance
@@ -498,8 +498,8 @@ def test_encoders_on_a_free_body_are_refused_with_what_to_set(attitude: str, rat
     free = {"kind": "rigid_body", "sensors": {"attitude": attitude, "rate": rate}}
     with pytest.raises(ValidationError) as refused:
         PlantSettings.model_validate(free)
-    for told in ("sensors.attitude", "sensors.rate", "'perfect'", "'gyro'", "ideal"):
-        assert told in str(refused.value)
+    for word in ("sensors.attitude", "sensors.rate", "'perfect'", "'gyro'", "ideal"):
+        assert word in str(refused.value)
     assert PlantSettings.model_validate(free | {"kind": "aero"}).sensors.attitude == attitude
     assert PlantSettings.model_validate(free | {"ideal": True}).build(PERIOD).actuators == 3
 

@@ -27,7 +27,7 @@ SUBSTEPS = 2
 
 
 def _plant(body: RigidBodySettings, **changed: object) -> EmulatedPlant:
-    """The bare body unless told otherwise."""
+    """The bare body unless stated otherwise."""
     bare = PlantSettings(
         kind="rigid_body",
         rigid_body=body,

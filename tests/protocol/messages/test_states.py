@@ -93,7 +93,7 @@ def test_a_plant_is_driven_only_by_a_command_and_only_once_granted() -> None:
     assert granted == [(PlantState.IDLE, PlantTrigger.GRANT)]
 
 
-def test_a_controller_told_to_stand_down_does_so_from_any_state() -> None:
+def test_a_controller_stands_down_from_any_state() -> None:
     for state in ControllerState:
         assert CONTROLLER_TABLE[state, ControllerTrigger.STAND_DOWN] is ControllerState.HOLDING
 
@@ -134,7 +134,7 @@ NO_VALID_VALUE = (-128,) * 6
 
 
 class Notebook(Plant):
-    """A plant that reports what it is told to and writes down the voltages of every period."""
+    """A plant that reports a preset measurement and records the voltages of every period."""
 
     actuators = 2
 
@@ -191,7 +191,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         self.voltages: tuple[float, ...] = OFF
         self.accepted = self.refused = self.stale = 0
         self.held: list[tuple[float, ...]] = []
-        self.told: list[str] = []
+        self.reported: list[str] = []
 
     # The model
 
@@ -202,7 +202,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
     def ended(self, trigger: PlantTrigger, kind: str) -> None:
         self.fire(trigger)
-        self.told.append(kind)
+        self.reported.append(kind)
         self.holder = self.session = None
         self.voltages, self.sent = OFF, {}
 
@@ -276,7 +276,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
             return
         assert answer == Grant(session=session)
         self.fire(PlantTrigger.GRANT)
-        self.told.append("claimed")
+        self.reported.append("claimed")
         self.holder, self.session = name, session
         self.voltages = OFF
         self.first, self.answered, self.age = self.k + 1, -1, -1
@@ -325,7 +325,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         if self.session is None:
             self.armed()
             self.stopped = False
-            self.told.append("armed")
+            self.reported.append("armed")
 
     def stop(self, _: str) -> None:
         """An operator stops."""
@@ -334,7 +334,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         self.stopped = True
 
     def release(self, name: str) -> None:
-        """The holder gives its session back; who is not the holder gives back one that is over."""
+        """The holder releases its session; any other controller releases one that is over."""
         mine = name == self.holder
         session = self.session if mine and self.session is not None else f"{name}-{self.sessions + 1}"
         assert self.endpoint.release(session) == mine
@@ -360,7 +360,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         assert answer.differences
 
     def command(self, _: str) -> None:
-        """A command comes to a plant that nobody holds."""
+        """A command comes to a plant without a holder."""
         if self.session is None:
             self.tick(WIRE.command.pack(self.k % COUNTERS, (31, 31)), 1)
 
@@ -369,7 +369,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
     @invariant()
     def it_is_where_the_table_led(self) -> None:
         assert (self.endpoint.state, self.endpoint.trip) == (self.state, self.trip)
-        assert [notice.kind for notice in self.endpoint.notices] == self.told
+        assert [notice.kind for notice in self.endpoint.notices] == self.reported
 
     @invariant()
     def a_session_runs_just_while_it_is_granted_or_driven(self) -> None:
@@ -382,7 +382,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         assert counted == (self.accepted, self.refused, self.stale)
 
     @invariant()
-    def nobody_who_may_not_drive_it_can(self) -> None:
+    def without_permission_it_cannot_be_driven(self) -> None:
         """Tried on a copy: the next tick is at 0 V, and a claim is granted just when there is no cause against it."""
         assert (self.endpoint.cause is not None) == self.latched
         if self.endpoint.session is not None:
@@ -415,7 +415,7 @@ def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive() 
 
 
 class FakeTime:
-    """A clock that moves only when told."""
+    """A clock that moves only when set."""
 
     def __init__(self) -> None:
         self.now = 5.0

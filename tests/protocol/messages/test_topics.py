@@ -17,7 +17,7 @@ every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS)
 LETTERS = string.ascii_letters + string.digits
 vehicles = st.builds(str.__add__, st.sampled_from(LETTERS), st.text(LETTERS + "_.-", max_size=63))
 chunks = st.text("0123456789abcdef", min_size=8, max_size=32)
-"""Sessions and roles. A session called like a topic ("status") would be read as one; nobody makes such."""
+"""Sessions and roles. A session called like a topic ("status") would be read as one; none is made."""
 
 
 @every_topic
@@ -95,7 +95,7 @@ def test_an_unknown_topic_has_no_key() -> None:
         "other/aero/claim",
     ],
 )
-def test_a_key_that_is_not_in_the_table_is_nobody_s(text: str) -> None:
+def test_a_key_that_is_not_in_the_table_is_rejected(text: str) -> None:
     assert read_key(text) is None
 
 

@@ -28,7 +28,7 @@ PERIOD = 2_000_000
 
 
 class FakeTime:
-    """A clock that moves only when told, or by a sleep, which may take longer than asked for."""
+    """A clock that moves only when set, or by a sleep, which may take longer than asked for."""
 
     def __init__(self) -> None:
         self.now = START
@@ -193,7 +193,7 @@ def test_an_empty_histogram_knows_no_percentile() -> None:
     assert (histogram.count, histogram.max_us) == (0, 0.0)
 
 
-def test_one_duration_is_told_exactly_where_the_bin_lies_above_it() -> None:
+def test_one_duration_is_reported_exactly_where_the_bin_lies_above_it() -> None:
     histogram = Histogram()
     histogram.add(1001)
     assert histogram.percentile(50) == pytest.approx(1.001, rel=2.0**-50) == histogram.max_us
@@ -237,16 +237,16 @@ print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, os.sche
 """
 
 
-def test_a_prepared_process_is_as_it_says() -> None:
+def test_a_prepared_process_is_as_it_reports() -> None:
     # In a process of its own: collector and scheduler are the process's, and pytest needs its own as they are.
     done = subprocess.run([sys.executable, "-c", PREPARED], capture_output=True, text=True, timeout=60, check=True)
     refused, collects, frozen, slack, realtime = json.loads(done.stdout)
     assert not collects
     assert frozen > 0
-    told = "\n".join(refused)
-    assert ("timer slack" in told) == (slack > 1)  # a real-time process may be shown 0
-    assert ("SCHED_FIFO" in told) == (not realtime)
-    assert len(refused) == (slack > 1) + (not realtime) + ("memory lock" in told)
+    reported = "\n".join(refused)
+    assert ("timer slack" in reported) == (slack > 1)  # a real-time process may be shown 0
+    assert ("SCHED_FIFO" in reported) == (not realtime)
+    assert len(refused) == (slack > 1) + (not realtime) + ("memory lock" in reported)
 
 
 def test_a_rolling_histogram_keeps_all_and_forgets_what_is_ten_windows_old() -> None:

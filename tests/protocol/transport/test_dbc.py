@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import Heartbeat, number_of
+from aeroloop.protocol.transport.can_format import Heartbeat
 from aeroloop.protocol.transport.dbc import dbc
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
@@ -149,19 +149,19 @@ def bare(spec: SignalSpec) -> bool:
     )
 
 
-def assert_tells(signal: Signal, spec: SignalSpec, code: float, told: Any) -> None:
+def assert_signal(signal: Signal, spec: SignalSpec, code: float, decoded: Any) -> None:
     """What cantools decoded is what this code is to the quantizer."""
     value = quantizer_of(spec).decode(code)
     if spec.bits is None:
         assert signal.is_float
-        assert repr(told) == repr(value)  # repr: NaN equals itself, and −0 is not 0
+        assert repr(decoded) == repr(value)  # repr: NaN equals itself, and −0 is not 0
     elif code == -(2 ** (spec.bits - 1)):
         assert isnan(value)
-        assert told == "no_valid_value"
+        assert decoded == "no_valid_value"
     elif not bare(spec):
-        assert abs(told - value) <= ROUNDING * abs(value)
+        assert abs(decoded - value) <= ROUNDING * abs(value)
     else:
-        assert told == code
+        assert decoded == code
         assert signal.comment is not None
         if spec.kind == "logarithmic-uniform":
             assert by_logarithmic_formula(signal.comment, int(code)) == pytest.approx(value, rel=ROUNDING, abs=0)
@@ -178,11 +178,11 @@ def assert_decodes(message: Message, layout: FrameFormat, of: Sequence[SignalSpe
     assert isinstance(raw, dict)
     assert list(raw) == names
     assert [repr(value) for value in raw.values()] == [repr(value) for value in (counter, *codes)]
-    told = message.decode(payload)
-    assert isinstance(told, dict)
-    assert told[names[0]] == counter
+    decoded = message.decode(payload)
+    assert isinstance(decoded, dict)
+    assert decoded[names[0]] == counter
     for signal, spec, code in zip(message.signals[1:], of, codes, strict=True):
-        assert_tells(signal, spec, code, told[signal.name])
+        assert_signal(signal, spec, code, decoded[signal.name])
 
 
 def top(spec: SignalSpec) -> float:
@@ -212,16 +212,16 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
     half = 2 ** (bits - 1)
     quantizer = spec.voltage.quantizer()
     for code in range(-half, half):
-        told = message.decode(layout.pack(code % layout.counters, (code, -1 - code)).ljust(message.length, b"\0"))
-        assert isinstance(told, dict)
+        decoded = message.decode(layout.pack(code % layout.counters, (code, -1 - code)).ljust(message.length, b"\0"))
+        assert isinstance(decoded, dict)
         for name, one in (("u2", code), ("u3", -1 - code)):
             if one == -half:
-                assert told[name] == "no_valid_value"
+                assert decoded[name] == "no_valid_value"
             else:
-                value, level = told[name], quantizer.decode(one)
+                value, level = decoded[name], quantizer.decode(one)
                 assert isinstance(value, (int, float))  # an int where the step is
                 assert abs(value - level) <= ROUNDING * abs(level)
-        assert told["echo"] == code % layout.counters
+        assert decoded["echo"] == code % layout.counters
 
 
 @settings(max_examples=60)
@@ -298,7 +298,7 @@ def test_signals_have_names_units_bounds_and_comments(spec: WireSpec) -> None:
 
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
-def test_the_counters_comment_says_modulo_what_it_counts(bits: int) -> None:
+def test_the_counters_comment_states_its_modulus(bits: int) -> None:
     measurement = read(wire(8, 6, counter_bits=bits)).get_message_by_name("Measurement")
     assert f"modulo {2**bits};" in (measurement.signals[0].comment or "")
 
@@ -356,7 +356,7 @@ def test_payloads_have_these_lengths(name: str, lengths: tuple[int, int]) -> Non
 
 
 @every_wire
-def test_a_payload_is_the_frame_s_or_the_next_of_can_fd_and_the_bus_says_so(spec: WireSpec) -> None:
+def test_a_payload_is_the_frame_s_or_the_next_of_can_fd_and_the_bus_states_it(spec: WireSpec) -> None:
     database = read(spec)
     for message, layout, _ in frames(spec):
         assert message.is_fd == (layout.size > 8)
@@ -394,15 +394,16 @@ FINGERPRINT: Final = bytes.fromhex("fedcba98765432")
 
 
 @pytest.mark.parametrize("state", PlantState)
-def test_heartbeats_tell_state_fingerprint_and_cause_or_session(state: PlantState) -> None:
+def test_heartbeats_carry_state_fingerprint_and_cause_or_session(state: PlantState) -> None:
     database = read(WireSpec())
     both = {"state": state.value, "fingerprint": 0xFEDCBA98765432}
     for cause in (None, *TripCause):
-        told = database.decode_message(0x300 + NODE, Heartbeat(state, number_of(cause), FINGERPRINT).pack())
-        assert told == {**both, "cause": cause.value if cause else "none"}
+        number = cause.number if cause else 0
+        decoded = database.decode_message(0x300 + NODE, Heartbeat(state, number, FINGERPRINT).pack())
+        assert decoded == {**both, "cause": cause.value if cause else "none"}
     for session in range(16):
-        told = database.decode_message(0x380 + NODE, Heartbeat(state, session, FINGERPRINT).pack())
-        assert told == {**both, "session": session}
+        decoded = database.decode_message(0x380 + NODE, Heartbeat(state, session, FINGERPRINT).pack())
+        assert decoded == {**both, "session": session}
 
 
 @pytest.mark.parametrize(("name", "highest"), [("PlantHeartbeat", len(TripCause)), ("ControllerHeartbeat", 15)])

@@ -49,7 +49,7 @@ def test_waiting_for_nothing_ends_at_the_timeout(timeout_s: float) -> None:
     assert timeout_s <= time.monotonic() - started < timeout_s + PATIENCE_S
 
 
-def test_a_frame_put_by_another_thread_wakes_who_waits() -> None:
+def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
     # Two threads wait for each other in turn, so that each is asleep when its frame comes; one wake-up that is missed
     # would take the whole timeout.
     there, back = Mailbox(), Mailbox()
@@ -87,14 +87,14 @@ def connect(sender: Link, receiver: Link) -> None:
     """Send until the first frame arrives: a put right after a subscription may be lost. Then nothing is under way."""
     seen: list[Arrival] = []
 
-    def heard() -> bool:
+    def received() -> bool:
         sender.send(b"hello")
         arrival = receiver.wait(0.05)
         if arrival is not None:
             seen.append(arrival)
         return bool(seen)
 
-    eventually("the first frame", heard)
+    eventually("the first frame", received)
     sender.send(b"ready")
     eventually("the last of the greetings", lambda: (got := receiver.take()) is not None and got.frame == b"ready")
 
@@ -155,7 +155,7 @@ SETTLE_S = 0.1
 """What should not arrive would have arrived by then: a frame takes less than a millisecond."""
 
 
-def test_a_link_hears_only_its_own_session(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_a_link_receives_only_its_own_session(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
     plant, controller = links(pair)
     other_plant, other_controller = links(pair, "s2")
     other_plant.send(b"theirs")

@@ -16,29 +16,29 @@ from tests.support.zenoh_network import Gathering, accepts, eventually, free_por
 
 
 class Listener:
-    """What a session hears on a key."""
+    """What a session receives on a key."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
-        self.heard: set[bytes] = set()
+        self.received: set[bytes] = set()
         self.stamped: list[bool] = []
-        self._subscriber = session.declare_subscriber(key, self._hear)
+        self._subscriber = session.declare_subscriber(key, self._receive)
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
         self.stamped.append(sample.timestamp is not None)
-        self.heard.add(sample.payload.to_bytes())
+        self.received.add(sample.payload.to_bytes())
 
 
-def hears(listener: Listener, speaker: zenoh.Session, word: bytes) -> None:
-    """Say a word until it is heard: the first may go before the subscription is known."""
+def receives(listener: Listener, speaker: zenoh.Session, word: bytes) -> None:
+    """Publish a word until it is received: the first may go before the subscription is known."""
 
     def said() -> bool:
         speaker.put("t/word", word)
-        return word in listener.heard
+        return word in listener.received
 
-    eventually(f"hearing {word!r}", said)
+    eventually(f"receiving {word!r}", said)
 
 
-def test_who_comes_first_listens_at_the_rendezvous_and_the_others_join() -> None:
+def test_the_first_to_start_listens_at_the_rendezvous_and_the_others_join() -> None:
     with Gathering() as gathering:
         assert not accepts(gathering.port)
         first = gathering.join()
@@ -48,32 +48,32 @@ def test_who_comes_first_listens_at_the_rendezvous_and_the_others_join() -> None
         for member in everyone:
             others = {str(other.zid()) for other in everyone - {member}}
             eventually("meeting", lambda m=member, o=others: {str(zid) for zid in m.info.peers_zid()} == o)  # type: ignore[misc]  # bound now
-        ear = Listener(third, "t/word")
-        hears(ear, first, b"from the first")
-        hears(ear, second, b"from the second")
+        listener = Listener(third, "t/word")
+        receives(listener, first, b"from the first")
+        receives(listener, second, b"from the second")
 
 
 def test_when_the_holder_goes_the_rest_stay_together_and_the_next_takes_the_rendezvous() -> None:
     with Gathering() as gathering:
         holder, b, c = gathering.join(), gathering.join(), gathering.join()
-        ears = {name: Listener(member, "t/word") for name, member in (("b", b), ("c", c))}
-        hears(ears["b"], c, b"before")
+        listeners = {name: Listener(member, "t/word") for name, member in (("b", b), ("c", c))}
+        receives(listeners["b"], c, b"before")
         holder.close()
         eventually("the holder's leaving", lambda: not accepts(gathering.port))
-        hears(ears["b"], c, b"c to b, without a holder")
-        hears(ears["c"], b, b"b to c, without a holder")
+        receives(listeners["b"], c, b"c to b, without a holder")
+        receives(listeners["c"], b, b"b to c, without a holder")
         newcomer = gathering.join()
         assert accepts(gathering.port)
-        ear = Listener(newcomer, "t/word")
-        for name, ear_of in ears.items():
-            hears(ear_of, newcomer, f"the newcomer to {name}".encode())
-        hears(ear, b, b"b to the newcomer")
-        hears(ear, c, b"c to the newcomer")
+        listener = Listener(newcomer, "t/word")
+        for name, each in listeners.items():
+            receives(each, newcomer, f"the newcomer to {name}".encode())
+        receives(listener, b, b"b to the newcomer")
+        receives(listener, c, b"c to the newcomer")
 
 
 @contextmanager
 def rude_program() -> Iterator[int]:
-    """A port held by a program that is not Zenoh and hangs up on whoever calls."""
+    """A port held by a program that is not Zenoh and hangs up on every caller."""
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         server.listen()
@@ -103,7 +103,7 @@ def one_line(error: BaseException) -> str:
     return text
 
 
-def test_a_rendezvous_held_by_another_program_is_told_in_one_line() -> None:
+def test_a_rendezvous_held_by_another_program_is_reported_in_one_line() -> None:
     with Gathering() as gathering, rude_program() as port:
         with pytest.raises(NetworkError) as caught:
             gathering.join(NetworkSettings(rendezvous=f"tcp/127.0.0.1:{port}"))
@@ -112,7 +112,7 @@ def test_a_rendezvous_held_by_another_program_is_told_in_one_line() -> None:
         assert "--set network.rendezvous=" in text
 
 
-def test_a_listen_endpoint_in_use_is_told_in_one_line() -> None:
+def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
     with Gathering() as gathering, rude_program() as port:
         for rendezvous in ("", gathering.settings.rendezvous):
             with pytest.raises(NetworkError) as caught:
@@ -120,7 +120,7 @@ def test_a_listen_endpoint_in_use_is_told_in_one_line() -> None:
             text = one_line(caught.value)
             assert f"cannot listen on tcp/127.0.0.1:{port}" in text
             assert "--set network.listen=" in text
-            assert ".rs" not in text  # Zenoh's own source locations help nobody
+            assert ".rs" not in text  # Zenoh's own source locations are of no use to the user
         assert not accepts(gathering.port)  # what failed to join holds nothing
 
 
@@ -131,15 +131,15 @@ def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:
         assert not accepts(gathering.port)
         assert list(alone.info.peers_zid()) == []
         caller = gathering.join(NetworkSettings(rendezvous="", connect=[place]))
-        hears(Listener(alone, "t/word"), caller, b"found")
+        receives(Listener(alone, "t/word"), caller, b"found")
 
 
 def test_messages_bear_no_time_of_zenohs() -> None:
     """A frame carries what the loop needs and no more; a log's times are in attachments."""
     with Gathering() as gathering:
-        speaker, ear = gathering.join(gathering.settings), Listener(gathering.join(gathering.settings), "t/word")
-        hears(ear, speaker, b"now")
-        assert set(ear.stamped) == {False}
+        speaker, listener = gathering.join(gathering.settings), Listener(gathering.join(gathering.settings), "t/word")
+        receives(listener, speaker, b"now")
+        assert set(listener.stamped) == {False}
 
 
 @pytest.mark.parametrize("broken", [{"lease_ms": 99}, {"lease_ms": 60_001}, {"listen": "tcp/127.0.0.1:0"}, {"port": 1}])

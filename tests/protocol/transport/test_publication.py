@@ -93,7 +93,7 @@ def test_what_finds_no_room_to_wait_shows_as_a_gap_in_the_sequence(network: Gath
     assert [each.sequence for each in found] == list(range(40 - len(found), 40))
 
 
-def test_a_plain_publisher_is_received_too_and_says_no_time(network: Gathering) -> None:
+def test_a_plain_publisher_is_received_too_and_carries_no_time(network: Gathering) -> None:
     session = network.join(network.settings)
     subscriber = RecoveringSubscriber(network.join(network.settings), ANY)
     found: list[Delivery] = []

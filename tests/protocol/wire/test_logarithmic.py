@@ -72,7 +72,7 @@ def test_a_value_gets_the_level_whose_interval_holds_it_and_a_tie_goes_towards_z
     assert quantizer.encode(edge / past) == i
     assert quantizer.encode(-edge * past) == -min(i + 1, quantizer.top)
     y = data.draw(within) * quantizer.limit
-    # Within 16 units in the last place of an edge a tie may be told.
+    # Within 16 units in the last place of an edge a tie may be detected.
     codes = {bisect_left(quantizer.edges, abs(y) * (1 + side * 16 * EPS)) for side in (-1, 1)}
     assert abs(quantizer.encode(y)) in codes
     assert quantizer.encode(y) * y >= 0

@@ -333,7 +333,7 @@ def test_without_quantization_what_lies_beyond_the_limit_is_the_limit_and_is_cou
         assert quantizer.saturated == n
 
 
-def test_without_quantization_nan_says_no_valid_value() -> None:
+def test_without_quantization_nan_means_no_valid_value() -> None:
     quantizer = Continuous(1.0)
     assert isnan(quantizer.invalid)
     assert isnan(quantizer.decode(quantizer.invalid))

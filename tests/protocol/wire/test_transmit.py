@@ -22,7 +22,7 @@ STEPS = st.lists(
 
 
 @given(RUN, HEARTBEATS)
-def test_whoever_hears_the_frames_knows_the_codes_of_every_tick(run: list[tuple[int, int]], heartbeat: int) -> None:
+def test_the_frames_sent_give_the_codes_of_every_tick(run: list[tuple[int, int]], heartbeat: int) -> None:
     sender, held = Sender("on_change", heartbeat, COUNTERS), None
     for k, codes in enumerate(run):
         if sender.due(k, codes):
@@ -44,7 +44,7 @@ def test_without_a_change_a_frame_is_sent_exactly_a_heartbeat_after_the_last(
 
 
 @given(STEPS, HEARTBEATS)
-def test_where_ticks_are_missed_a_change_still_reaches_who_takes_a_repeated_counter_for_a_repetition(
+def test_where_ticks_are_missed_a_change_still_reaches_a_receiver_that_drops_repeated_counters(
     steps: list[tuple[int, tuple[int, int]]], heartbeat: int
 ) -> None:
     sender, k = Sender("on_change", heartbeat, COUNTERS), -1
@@ -76,7 +76,7 @@ def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None
 @pytest.mark.parametrize(
     ("before", "now", "sent"),
     [
-        ((0.0, 1.5), (-0.0, 1.5), True),  # two frames, and a law may tell them apart
+        ((0.0, 1.5), (-0.0, 1.5), True),  # two frames, and a law may distinguish them
         ((-0.0, 1.5), (-0.0, 1.5), False),
         ((1, 0), (1, 0), False),
         ((1, 0), (0, 1), True),
@@ -150,7 +150,7 @@ def test_two_wires_that_send_otherwise_differ_and_say_how() -> None:
     ]
 
 
-def test_a_wire_that_sends_as_ever_tells_nothing_of_it() -> None:
+def test_a_periodic_wire_leaves_transmit_out_of_the_agreement() -> None:
     assert "transmit" not in WireSpec().agreed()
     sparse = WireSpec(transmit=Transmit(measurement="on_change"))
     assert WireSpec.model_validate(sparse.agreed()) == sparse

@@ -63,10 +63,10 @@ def test_two_wires_differ_in_kind_and_its_parameters() -> None:
     assert uniform.differences(held) == ["rate.kind: uniform, not hysteresis-uniform", "rate.hysteresis: None, not 0.1"]
 
 
-def test_what_is_told_of_a_uniform_signal_is_what_it_was_before_there_were_other_kinds() -> None:
-    told = WireSpec(rate=SignalSpec(bits=8, limit=1.0, kind="logarithmic-uniform")).agreed()
-    assert told["attitude"] == {"bits": 8, "limit": 1.0, "deadzone": None}
-    assert told["rate"] == {
+def test_a_uniform_signal_is_published_as_it_was_before_there_were_other_kinds() -> None:
+    published = WireSpec(rate=SignalSpec(bits=8, limit=1.0, kind="logarithmic-uniform")).agreed()
+    assert published["attitude"] == {"bits": 8, "limit": 1.0, "deadzone": None}
+    assert published["rate"] == {
         "bits": 8, "limit": 1.0, "deadzone": None, "kind": "logarithmic-uniform", "hysteresis": None, "threshold": None
     }  # fmt: skip
-    assert WireSpec.model_validate(told).rate.kind == "logarithmic-uniform"
+    assert WireSpec.model_validate(published).rate.kind == "logarithmic-uniform"

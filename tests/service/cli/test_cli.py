@@ -68,7 +68,7 @@ def test_a_log_that_is_not_one_exits_with_1(capfd: pytest.CaptureFixture[str], t
     assert "none.mcap" in line
 
 
-def test_a_port_in_use_exits_with_1_and_says_which(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_port_in_use_exits_with_1_and_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -126,7 +126,7 @@ def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixtur
         assert figures["reasons"][name]
 
 
-def test_every_verb_says_what_it_does_in_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_states_what_it_does_in_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
     verbs = ("demo", "controller", "emulator", "recorder", "lab experiment", "log review", "show config", "show spec")
     for verb in verbs:
         assert run([*verb.split(), "--help"]) == 0

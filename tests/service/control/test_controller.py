@@ -172,10 +172,10 @@ def test_a_law_without_inverse_is_refused() -> None:
         _controller(law=law)
 
 
-# What it tells of itself
+# What it reports of itself
 
 
-def test_what_it_tells_is_what_the_law_computed() -> None:
+def test_what_it_reports_is_what_the_law_computed() -> None:
     controller, loop = _controller(), TwinLoop(PAPER)
     attitude, rate = _yawed(0.2), (0.02, -0.03, 0.05)
     controller.tick(_frame(CONTINUOUS, 3, attitude, rate), 250)

@@ -38,7 +38,7 @@ from tests.support.numpy_twin import Array, Sinusoids
 EPS: Final = 2.0**-52
 NO_LIMITS = Limits(rate=1e9, tilt=pi, rolls=True)
 BENCH = Limits(rate=1.0, tilt=radians(60), rolls=False)
-"""A 2-DOF bench as configured unless told otherwise."""
+"""A 2-DOF bench as configured unless stated otherwise."""
 BODY = BENCH._replace(rolls=True)
 
 # What can be asked
@@ -591,7 +591,7 @@ MILLISECOND = "Points: times must rise by at least a millisecond"
 
 
 @pytest.mark.parametrize(
-    ("model", "fields", "told"),
+    ("model", "fields", "expected"),
     [
         (Gains, {"C1": (0.3, 0.0, 0.3)}, f"C1: {GAIN_RANGE}"),
         (Gains, {"C2": (0.3, 0.3, -1e-9)}, f"C2: {GAIN_RANGE}"),
@@ -634,10 +634,10 @@ MILLISECOND = "Points: times must rise by at least a millisecond"
     ],
 )
 def test_a_verb_that_makes_no_sense_is_refused_with_one_clear_message(
-    model: type[Message], fields: dict[str, Any], told: str
+    model: type[Message], fields: dict[str, Any], expected: str
 ) -> None:
     said = complaint(model, **fields)
-    assert said == told or said.startswith(told)
+    assert said == expected or said.startswith(expected)
 
 
 @pytest.mark.parametrize(

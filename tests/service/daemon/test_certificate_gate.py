@@ -31,7 +31,7 @@ class Certified(Loop):
 
     @property
     def verdicts(self) -> list[tuple[str, str]]:
-        """What was told of the theorem: kind, text."""
+        """What was reported of the theorem: kind, text."""
         words = ("Theorem 1", "nothing is certified")
         kinds = ("started", "changed", "fault")
         return [(kind, text) for kind in kinds for text in self.events(kind) if any(word in text for word in words)]
@@ -54,7 +54,7 @@ def wait_for_threads() -> None:
             thread.join(30)
 
 
-def test_the_verdict_is_told_once_and_again_when_it_changes(certified: Certified) -> None:
+def test_the_verdict_is_reported_once_and_again_when_it_changes(certified: Certified) -> None:
     certified.assurance.publish()
     ((kind, text),) = certified.verdicts
     assert kind == "started"
@@ -104,7 +104,7 @@ def test_two_changes_that_hold_by_themselves_are_not_both_taken_if_together_they
     assert certified.controller.gains == gains_of(of(less))
 
 
-def test_where_nothing_is_required_all_is_taken_and_told() -> None:
+def test_where_nothing_is_required_all_is_accepted_and_reported() -> None:
     loop = Certified(required=False)
     loop.begin()
     asked = [loop.ask("set_gains", FAILING), loop.ask("track", Track(reference=Stream()))]

@@ -93,7 +93,7 @@ class Query:
 
 
 class Network:
-    """A Zenoh session with nobody else on it: it keeps what is declared and what is put."""
+    """A Zenoh session without any other: it keeps what is declared and what is put."""
 
     def __init__(self) -> None:
         self.put: list[tuple[str, bytes]] = []
@@ -138,7 +138,7 @@ class LonelyRole(Role):
 
 
 class FakeTime:
-    """A clock that moves only when told."""
+    """A clock that moves only when set."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -231,9 +231,9 @@ class Loop:
         """Bytes come where set-points should."""
         self.network.subscribers[topics.key("reference", "aero")](Sample(payload))
 
-    # What was told
+    # What was published
 
-    def told(self, topic: str, model: type[M]) -> list[M]:
+    def published(self, topic: str, model: type[M]) -> list[M]:
         """Every message on a topic."""
         key = topics.key(topic, "aero", role="controller")
         return [model.model_validate_json(payload) for at, payload in self.network.put if at == key]
@@ -243,8 +243,8 @@ class Loop:
         return [change for change in self.trace.changes if change.session == self.session]
 
     def events(self, kind: str) -> list[str]:
-        """What was told of a kind."""
-        return [event.text for event in self.told("event", Event) if event.kind == kind]
+        """The texts of a kind that were published."""
+        return [event.text for event in self.published("event", Event) if event.kind == kind]
 
     def yaw(self) -> float:
         """Of q_d at the last tick, level [deg]."""
@@ -288,7 +288,7 @@ LATER_TOO_FAST = Points(
 # Gains
 
 
-def test_gains_hold_from_the_very_tick_that_is_told(loop: Loop) -> None:
+def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     alone = loop.fresh()
     tilted = [0.0, 0.1, 0.0, 0.0, 0.3, -0.2]
     frames = [WIRE.measurement.pack(k, tilted) for k in range(10)]
@@ -311,7 +311,7 @@ def test_gains_hold_from_the_very_tick_that_is_told(loop: Loop) -> None:
     assert loop.controller.gains == Gains(C1=(1.0, 1.0, 1.0), C2=LAW.C2, Gamma=(0.5, 0.5, 0.5))
 
 
-def test_no_gain_changes_none_and_says_so(loop: Loop) -> None:
+def test_no_gain_changes_none_and_the_reply_states_it(loop: Loop) -> None:
     asked = loop.ask("set_gains", Gains())
     loop.tick()
     assert "none has changed" in asked.answers[0].text
@@ -379,7 +379,7 @@ THREE_POINTS = Points(times=[0.0, 1.0, 2.0], attitudes=[(0.0, 0.0, 1.0), (0.0, 5
         (THREE_POINTS, (0.0, 0.0, 9.0), "follows 3 points over 2 s"),
     ],
 )
-def test_a_reference_holds_from_the_tick_that_is_told_and_arrives(
+def test_a_reference_holds_from_the_tick_that_is_published_and_arrives(
     loop: Loop, reference: Reference, ends_at: tuple[float, float, float], words: str
 ) -> None:
     loop.run(0.1)
@@ -401,13 +401,13 @@ def test_a_sinusoid_begins_where_it_is_reached(loop: Loop) -> None:
     loop.ask("track", Track(reference=SWING, within_s=1.0))
     loop.run(1.0 + 0.5)
     reached = Controller(WIRE, LAW, SWING, PERIOD)
-    k = loop.k - 1 - 550  # told at tick 50, reached 500 later
+    k = loop.k - 1 - 550  # asked for at tick 50, reached 500 later
     reached.tick(WIRE.measurement.pack(0, [0.0] * 6), k)
     assert loop.controller.desired == pytest.approx(reached.desired, abs=1e-14)  # times of a few s, rounded
 
 
 @pytest.mark.parametrize("reference", [Hold(attitude=None), Stream()])
-def test_coming_to_rest_is_told_as_the_attitude_at_which_it_does(loop: Loop, reference: Reference) -> None:
+def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop, reference: Reference) -> None:
     loop.ask("track", Track(reference=Sinusoid(amplitude=(0.0, 0.0, 20.0), frequency=(0.0, 0.0, 0.4)), within_s=0.5))
     loop.run(1.0)
     before = loop.yaw()
@@ -440,8 +440,8 @@ def test_set_points_are_followed(streaming: Loop) -> None:
         streaming.stream(yaw)
         streaming.run(0.204)
         assert streaming.yaw() == pytest.approx(yaw, abs=1e-12)
-    told = [(c.tick, c.reference, c.within_s) for c in streaming.changes()[2:]]
-    assert told == [(50 + 102 * i, Hold(attitude=(0.0, 0.0, yaw)), 0.2) for i, yaw in enumerate((2.0, 3.0, -1.0))]
+    changes = [(c.tick, c.reference, c.within_s) for c in streaming.changes()[2:]]
+    assert changes == [(50 + 102 * i, Hold(attitude=(0.0, 0.0, yaw)), 0.2) for i, yaw in enumerate((2.0, 3.0, -1.0))]
 
 
 def test_of_set_points_between_two_ticks_the_newest_counts(streaming: Loop) -> None:
@@ -497,7 +497,7 @@ def test_a_set_point_that_is_refused_is_counted_and_changes_nothing(streaming: L
     assert streaming.yaw() == pytest.approx(3.0, abs=1e-12)
 
 
-def test_refused_set_points_are_told_at_most_once_in_ten_seconds(streaming: Loop, time: FakeTime) -> None:
+def test_refused_set_points_are_reported_at_most_once_in_ten_seconds(streaming: Loop, time: FakeTime) -> None:
     start = time.now
     while time.now < start + 25.0:
         streaming.raw(b"junk")
@@ -507,7 +507,7 @@ def test_refused_set_points_are_told_at_most_once_in_ten_seconds(streaming: Loop
     assert "39 more like it" in streaming.events("fault")[1]
 
 
-def test_silence_is_told_once_and_the_last_set_point_held_until_there_is_another(
+def test_silence_is_reported_once_and_the_last_set_point_held_until_there_is_another(
     streaming: Loop, time: FakeTime
 ) -> None:
     streaming.stream(2.0)
@@ -536,7 +536,7 @@ def test_a_stream_that_never_begins_is_silent_too(streaming: Loop, time: FakeTim
     assert len(streaming.events("lost")) == 1
 
 
-def test_set_points_that_nobody_follows_are_no_matter(loop: Loop, time: FakeTime) -> None:
+def test_set_points_without_a_stream_reference_are_ignored(loop: Loop, time: FakeTime) -> None:
     loop.stream(5.0)
     loop.raw(b"junk")
     time.now += 5.0
@@ -663,7 +663,7 @@ def test_limits_that_are_read_again_hold_for_what_is_asked_next(loop: Loop) -> N
     assert "max_reference_tilt_deg = 10" in asked.answers[0].text
 
 
-def test_a_configured_reference_beyond_the_limits_is_told_and_ends_nothing(loop: Loop) -> None:
+def test_a_configured_reference_beyond_the_limits_is_reported_and_ends_nothing(loop: Loop) -> None:
     loop.role.later(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 70.0, 0.0))))  # as reload.py's SIGHUP does
     loop.tick()
 

@@ -24,7 +24,7 @@ def changed(role: str, *overrides: str, before: tuple[str, ...] = ()) -> list[st
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_configuration_that_is_the_same_says_nothing(role: str) -> None:
+def test_a_configuration_that_is_the_same_reports_nothing(role: str) -> None:
     assert changed(role) == []
     assert changed(role, "law.C1=[0.3, 0.3, 0.3]", "loop.rate_hz=500") == []
 
@@ -56,7 +56,7 @@ def test_a_configuration_that_is_the_same_says_nothing(role: str) -> None:
         ("recorder", "recorder.chunk_s=2", "recorder.chunk_s: 1.0 → 2.0"),
     ],
 )
-def test_what_takes_effect_at_once_is_told_from_what_to_what(role: str, override: str, line: str) -> None:
+def test_what_takes_effect_at_once_is_reported_with_old_and_new_value(role: str, override: str, line: str) -> None:
     assert changed(role, override) == [line]
 
 
@@ -75,11 +75,11 @@ def test_what_takes_effect_at_once_is_told_from_what_to_what(role: str, override
         ("recorder", "recorder.directory=elsewhere", "recorder.directory: logs → elsewhere, after a restart"),
     ],
 )
-def test_what_does_not_is_told_to_need_a_restart(role: str, override: str, line: str) -> None:
-    (told,) = changed(role, override)
+def test_what_does_not_is_reported_to_need_a_restart(role: str, override: str, line: str) -> None:
+    (reported,) = changed(role, override)
     start, _, end = line.partition("{}")
-    assert told.startswith(start)
-    assert told.endswith(end)
+    assert reported.startswith(start)
+    assert reported.endswith(end)
 
 
 @pytest.mark.parametrize(
@@ -96,11 +96,11 @@ def test_what_does_not_is_told_to_need_a_restart(role: str, override: str, line:
         ("recorder.chunk_s=2", {"recorder"}),
     ],
 )
-def test_a_role_hears_only_of_what_concerns_it(override: str, concerns: set[str]) -> None:
+def test_a_role_reports_only_what_concerns_it(override: str, concerns: set[str]) -> None:
     assert {role for role in ROLES if changed(role, override)} == concerns
 
 
-def test_another_kind_of_reference_is_told_key_by_key_and_takes_effect_at_once() -> None:
+def test_another_kind_of_reference_is_reported_key_by_key_and_takes_effect_at_once() -> None:
     lines = changed("controller", "reference.kind=hold", "reference.attitude=[0.0, 1.0, 2.0]")
     assert "reference.kind: sinusoid → hold" in lines
     assert "reference.attitude: None → [0.0, 1.0, 2.0]" in lines
@@ -113,7 +113,7 @@ def test_another_kind_of_reference_is_told_key_by_key_and_takes_effect_at_once()
     assert not any("restart" in line for line in lines)
 
 
-def test_several_differences_are_told_a_line_each_in_order_and_each_for_itself() -> None:
+def test_several_differences_are_reported_a_line_each_in_order_and_each_for_itself() -> None:
     lines = changed("controller", "law.mass=2", "law.C1=[1.0, 1.0, 1.0]", "controller.stale_s=0.2")
     assert lines == [
         "controller.stale_s: 0.1 → 0.2",
@@ -132,7 +132,7 @@ def test_every_key_that_is_said_to_take_effect_at_once_is_there(role: str) -> No
 
 
 class Hangup:
-    """A role that is told to hang up by the test."""
+    """A role whose SIGHUP the test triggers."""
 
     role = "controller"
 
@@ -140,7 +140,7 @@ class Hangup:
         self.reload: Callable[[], Action] | None = None
         self.description: dict[str, Any] = {}
         self.certificate: dict[str, Any] | None = None
-        self.told: list[tuple[str, str]] = []
+        self.reported: list[tuple[str, str]] = []
 
     def on_hangup(self, reload: Callable[[], Action]) -> None:
         """Keep it."""
@@ -152,7 +152,7 @@ class Hangup:
 
     def event(self, kind: str, text: str) -> None:
         """Keep it."""
-        self.told.append((kind, text))
+        self.reported.append((kind, text))
 
     def hang_up(self) -> None:
         """SIGHUP, and the time between two ticks after it."""
@@ -160,17 +160,17 @@ class Hangup:
         self.reload()()
 
 
-def test_what_was_read_again_is_taken_over_between_ticks_and_told() -> None:
+def test_what_was_read_again_takes_effect_between_ticks_and_is_reported() -> None:
     role, taken = Hangup(), list[Settings]()
     reload_on_hangup(cast(Role, role), load(), lambda: load(overrides=["law.C1=[1.0, 1.0, 1.0]"]), taken.append)
     assert role.reload is not None
     act = role.reload()
-    assert (taken, role.told) == ([], [])  # reading takes time, so it is done elsewhere
+    assert (taken, role.reported) == ([], [])  # reading takes time, so it is done elsewhere
     act()
     assert [settings.law.C1 for settings in taken] == [(1.0, 1.0, 1.0)]
     assert role.description["law"]["C1"] == [1.0, 1.0, 1.0]
     role.hang_up()
-    assert role.told == [
+    assert role.reported == [
         ("changed", "configuration read again: law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]"),
         ("changed", "configuration read again: nothing has changed"),
     ]
@@ -180,11 +180,11 @@ def test_what_needs_a_restart_is_not_in_the_description_before_it() -> None:
     role = Hangup()
     reload_on_hangup(cast(Role, role), load(), lambda: load(overrides=["law.mass=2"]), lambda _: None)
     role.hang_up()
-    assert role.told == [("changed", "configuration read again: law.mass: 1.075 → 2.0, after a restart")]
+    assert role.reported == [("changed", "configuration read again: law.mass: 1.075 → 2.0, after a restart")]
     assert role.description["law"]["mass"] == 1.075
 
 
-def test_what_the_theorem_promises_is_told_of_the_new_gains_and_computed_before_the_tick() -> None:
+def test_the_certificate_is_of_the_new_gains_and_computed_before_the_tick() -> None:
     role = Hangup()
     promised: list[float] = []
 
@@ -215,7 +215,7 @@ def test_what_the_promise_refuses_changes_nothing_and_may_be_read_again() -> Non
         role.hang_up()
     role.hang_up()
     assert [settings.law.C1[0] for settings in taken] == [1.0]
-    assert role.told == [("changed", "configuration read again: law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]")]
+    assert role.reported == [("changed", "configuration read again: law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]")]
 
 
 # Points out of a file
@@ -271,7 +271,7 @@ def test_a_table_of_points_is_read_with_or_without_a_heading(file: File, content
         ("0,0,0,0\n1,0,0,1'234\n", 2),
     ],
 )
-def test_a_row_that_is_none_is_told_with_file_and_line(file: File, content: str, line: int) -> None:
+def test_a_row_that_is_none_is_reported_with_file_and_line(file: File, content: str, line: int) -> None:
     path = file(content)
     with pytest.raises(OperatorError) as refused:
         read_points(path)
@@ -294,7 +294,7 @@ BAD_TABLES = [
 
 
 @pytest.mark.parametrize(("content", "why", "_line"), BAD_TABLES)
-def test_a_table_that_makes_no_sense_is_told_with_file_and_reason(
+def test_a_table_that_makes_no_sense_is_reported_with_file_and_reason(
     file: File, content: str, why: str, _line: int | None
 ) -> None:
     path = file(content)
@@ -305,7 +305,7 @@ def test_a_table_that_makes_no_sense_is_told_with_file_and_reason(
 
 
 @pytest.mark.parametrize(("content", "why", "line"), [case for case in BAD_TABLES if case.values[2] is not None])
-def test_a_table_that_makes_no_sense_is_told_with_its_line(file: File, content: str, why: str, line: int) -> None:
+def test_a_table_that_makes_no_sense_is_reported_with_its_line(file: File, content: str, why: str, line: int) -> None:
     with pytest.raises(OperatorError, match=f"line {line}: .*{why}"):
         read_points(file(content))
 
@@ -319,7 +319,7 @@ def test_a_file_that_is_not_there_or_cannot_be_read_is_named(tmp_path: Path, fil
         assert len(str(refused.value).splitlines()) == 1
 
 
-def test_a_cell_without_end_is_told(file: File) -> None:
+def test_a_cell_without_end_is_reported(file: File) -> None:
     with pytest.raises(OperatorError, match="line 2"):
         read_points(file("0,0,0,0\n1,0,0," + "1" * 200_000 + "\n"))
 

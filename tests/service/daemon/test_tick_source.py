@@ -150,7 +150,7 @@ def test_a_frame_whose_tick_is_long_over_is_not_answered_but_held(monkeypatch: p
 
 
 def test_the_levels_of_a_frame_are_used_for_no_tick_before_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its counter, which is all that tells, one may be of a tick that is still to come."""
+    """By its counter, the only evidence, one may be of a tick that is still to come."""
     early = arrival(8, 9)._replace(at_ns=arrival(5).at_ns)
     nonsense = arrival(5, content=b"\0")  # waits behind it, so that it is taken in passing
     source = Source([arrival(0), early, nonsense], monkeypatch)
@@ -212,7 +212,7 @@ def test_a_frame_that_comes_twice_is_one_tick(monkeypatch: pytest.MonkeyPatch) -
     assert not any(in_passing(each) for each, _ in source.taken)
 
 
-def test_in_lockstep_an_empty_frame_is_the_next_tick_and_time_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     contents = [frame(0), *[SILENCE] * 14, frame(15), *[SILENCE] * 3]
     arrivals = [Arrival(content, 7 * PERIOD_NS * i) for i, content in enumerate(contents)]
     source = Source(arrivals, monkeypatch, loop=LOOP.model_copy(update={"lockstep": True}))

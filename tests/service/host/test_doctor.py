@@ -13,8 +13,10 @@ from aeroloop.protocol.runtime import tick_grid
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.service.host import doctor
 
+pytestmark = pytest.mark.processes
 
-def test_the_trial_runs_at_the_configured_rate_and_every_finding_is_told() -> None:
+
+def test_the_trial_runs_at_the_configured_rate_and_every_finding_is_reported() -> None:
     """In a process of its own, which becomes real-time. The verdict is this machine's: only its reasons are checked."""
     command = [
         sys.executable,

@@ -140,12 +140,12 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     return printed.getvalue(), figure
 
 
-def test_the_command_tells_every_point_beside_float64(document: tuple[str, Path]) -> None:
-    told = json.loads(document[0])
-    assert [told[name] for name in ("duration_s", "rate_hz", "heartbeat_s", "counter_bits")] == [4.0, 500.0, 0.03, 8]
-    assert list(told["sensors"]) == ["encoders"]
-    points = {(point["bits_out"], point["transmit"]): point for point in told["points"]}
-    assert len(points) == len(told["points"]) == 6
+def test_the_command_prints_every_point_beside_float64(document: tuple[str, Path]) -> None:
+    output = json.loads(document[0])
+    assert [output[name] for name in ("duration_s", "rate_hz", "heartbeat_s", "counter_bits")] == [4.0, 500.0, 0.03, 8]
+    assert list(output["sensors"]) == ["encoders"]
+    points = {(point["bits_out"], point["transmit"]): point for point in output["points"]}
+    assert len(points) == len(output["points"]) == 6
 
     always, changed = points[8, "periodic"], points[8, "on_change"]
     baseline = points[None, "periodic"]
@@ -163,7 +163,7 @@ def test_the_command_tells_every_point_beside_float64(document: tuple[str, Path]
         assert most > least > changed[direction]["frames_per_s"] * size
 
 
-def test_a_loop_that_ends_early_has_no_figures_and_says_why(document: tuple[str, Path]) -> None:
+def test_a_loop_that_ends_early_has_no_figures_and_the_reason_is_reported(document: tuple[str, Path]) -> None:
     for point in json.loads(document[0])["points"]:
         ended = point["bits_out"] == 2
         assert (point["z_track"] is None) == (point["against_float64"] is None) == ended
@@ -193,7 +193,7 @@ def test_the_markdown_is_a_table_with_a_row_for_each_experiment(document: tuple[
     assert any(line.startswith("Counted on a Zenoh link") for line in lines)
 
 
-def test_the_table_says_what_the_counter_costs_and_what_a_bare_frame_saves(document: tuple[str, Path]) -> None:
+def test_the_table_states_what_the_counter_costs_and_what_a_bare_frame_saves(document: tuple[str, Path]) -> None:
     burden = Burden.model_validate_json(document[0])
     for bits, line in (
         (8, "500 + 500 frames/s carry 8 kbit/s of it; 4 bits would carry 4, padding apart."),

@@ -84,10 +84,10 @@ def test_every_tick_is_judged_and_traffic_is_that_of_the_frames() -> None:
     assert (quantized.latency_us, quantized.log) == (None, None)
 
 
-def test_progress_is_told_every_second() -> None:
-    told: list[float] = []
-    run_experiment(Settings(), 3.0, told.append)
-    assert told == pytest.approx([0.0, 1.0, 2.0])
+def test_progress_is_reported_every_second() -> None:
+    reported: list[float] = []
+    run_experiment(Settings(), 3.0, reported.append)
+    assert reported == pytest.approx([0.0, 1.0, 2.0])
 
 
 def test_three_actuators_on_a_plant_with_two_do_not_make_a_loop() -> None:

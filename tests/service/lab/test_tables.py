@@ -14,6 +14,8 @@ from aeroloop.service.lab.calibrate import TOLERANCE
 from aeroloop.service.lab.cells import Cell, Pool, Result, run_cell
 from aeroloop.service.lab.tables import Tables, markdown, predict
 
+pytestmark = pytest.mark.processes
+
 BENCH = load()
 
 
@@ -81,7 +83,7 @@ def test_the_pool_keeps_the_order_of_its_jobs_and_seeds_make_a_spread() -> None:
 
 
 def test_the_papers_numbers_are_those_of_its_tables() -> None:
-    """A few, by their place in the paper: enough to tell rows from columns."""
+    """A few, by their place in the paper: enough to distinguish rows from columns."""
     assert paper.Z_TRACK[0][1] == 51  # 6 bits in, 9 out
     assert paper.Z_TRACK[-1][0] == 43  # input unquantized, 8 bits out
     assert paper.U_TOTAL[2][3] == 8017  # 8 bits in, output unquantized

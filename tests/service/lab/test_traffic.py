@@ -74,8 +74,8 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
     settings = load(overrides=overrides)
     said: list[tuple[bytes, bytes]] = []
     run_experiment(settings, 3.0, watch=lambda _k, *frames: said.append(frames))
-    heard: list[tuple[bytes, bytes]] = []
-    figures = run_experiment(_on_change(settings), 3.0, watch=lambda _k, *frames: heard.append(frames))
+    received: list[tuple[bytes, bytes]] = []
+    figures = run_experiment(_on_change(settings), 3.0, watch=lambda _k, *frames: received.append(frames))
 
     seen = observe(settings.description(), 3.0, counted=False)
     assert seen.figures is not None
@@ -84,12 +84,12 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
     wire = settings.wire
     counters = wire.measurement.counters
     heartbeat = wire.transmit.heartbeat_ticks(settings.loop.period_ns, counters)
-    for i, (kind, told) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
+    for i, (kind, measured) in enumerate(((wire.measurement, figures.measurement), (wire.command, figures.command))):
         sent = sent_ticks(codes_of([frames[i] for frames in said], kind), "on_change", heartbeat, counters)
-        assert [k for k, frames in enumerate(heard) if frames[i] != SILENCE] == sent
-        assert [heard[k][i] for k in sent] == [said[k][i] for k in sent]
+        assert [k for k, frames in enumerate(received) if frames[i] != SILENCE] == sent
+        assert [received[k][i] for k in sent] == [said[k][i] for k in sent]
         reckoned = seen.traffic["on_change"][i]
-        assert (reckoned.frames_per_s, reckoned.bits_per_s) == (told.frames_per_s, told.bits_per_s)
+        assert (reckoned.frames_per_s, reckoned.bits_per_s) == (measured.frames_per_s, measured.bits_per_s)
         assert 0 < len(sent) < len(said)
 
 

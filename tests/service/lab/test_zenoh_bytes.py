@@ -40,7 +40,7 @@ def test_a_relay_passes_every_byte_on_and_counts_each_direction() -> None:
             assert (relay.there, relay.back) == (len(there), len(back))
 
 
-def test_a_relay_that_nobody_uses_ends() -> None:
+def test_an_unused_relay_ends() -> None:
     with CountingRelay(1) as relay:
         pass
     with pytest.raises(OSError, match="refused"):

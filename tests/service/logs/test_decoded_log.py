@@ -18,7 +18,7 @@ from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.logs.table_files import ExportError
 from aeroloop.service.review.review import review
 from aeroloop.service.viewers.channels import Decoder
-from tests.support.edited_log import Said, tell
+from tests.support.edited_log import Said, write_messages
 from tests.support.made_log import SESSION, VEHICLE, make_log
 
 TICKS = 400
@@ -62,7 +62,7 @@ def test_a_log_with_everything_decoded_has_every_raw_message_and_each_row_decode
         (DESCRIPTION_METADATA, {"key": topics.key("description", VEHICLE, role=role), "json": one.model_dump_json()})
         for (_, role), one in files.descriptions.items()
     ]
-    tell(tmp_path / "recorded.mcap", recorded, descriptions)
+    write_messages(tmp_path / "recorded.mcap", recorded, descriptions)
     exported = export([tmp_path / "recorded.mcap"], "mcap", tmp_path / "out.mcap")
     found = read(tmp_path / "out.mcap")
     assert exported.rows == len(found)

@@ -114,11 +114,11 @@ def test_truth_is_the_last_that_was_published_by_then(parquet: Table, settings: 
 
 def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Table) -> None:
     """And is what telemetry said of it: θ̂ before the tick is that after the one before."""
-    told = {}
+    published = {}
     for found in LogFiles([log]).routed(lambda address: address if address.topic.name == "telemetry" else None):
         telemetry = Telemetry.model_validate_json(found.data)
         if telemetry.session == SESSION:
-            told[telemetry.tick] = telemetry
+            published[telemetry.tick] = telemetry
     before: Telemetry | None = None
     for row in rows(parquet):
         theta = tuple(row[f"damping_estimate_{axis}_Nms_rad"] for axis in "xyz")
@@ -128,11 +128,11 @@ def test_what_was_computed_stands_at_every_tick_that_was(log: Path, parquet: Tab
             continue
         if before is not None and before.tick == row["tick"] - 1:
             assert theta == before.damping_estimate
-        before = told.get(row["tick"])
+        before = published.get(row["tick"])
         if before is not None:
             assert (volts, row["sign"]) == (before.voltages, before.sign)
             assert tuple(row[f"attitude_error_{axis}"] for axis in "xyz") == before.attitude_error
-    assert len(told) > 30
+    assert len(published) > 30
 
 
 def test_saturated_is_what_has_the_outermost_code(log: Path, parquet: Table, settings: Settings) -> None:
@@ -188,7 +188,7 @@ def test_saturated_counts_on_either_side_and_is_not_known_of_what_was_scaled_or_
     )
 
 
-def test_every_kind_of_file_says_the_same(log: Path, tmp_path: Path, parquet: Table) -> None:
+def test_every_kind_of_file_holds_the_same(log: Path, tmp_path: Path, parquet: Table) -> None:
     """To the last bit, nulls included."""
     export([log], "csv", tmp_path / "table.csv")
     export([log], "mat", tmp_path / "table.mat")
@@ -217,7 +217,7 @@ def test_every_kind_of_file_says_the_same(log: Path, tmp_path: Path, parquet: Ta
         np.testing.assert_array_equal(matlab[name], np.array(numbers, dtype=matlab[name].dtype))
 
 
-def test_every_column_tells_its_unit_and_the_file_its_configuration(
+def test_every_column_names_its_unit_and_the_file_its_configuration(
     log: Path, tmp_path: Path, settings: Settings
 ) -> None:
     export([log], "parquet", tmp_path / "a.parquet")
@@ -288,7 +288,7 @@ def test_the_table_does_not_depend_on_how_it_is_cut_into_blocks(
         }
 
 
-def test_what_stands_in_the_way_is_told_in_one_line_and_nothing_is_left_behind(
+def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behind(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "there.csv").write_text("mine")
@@ -302,10 +302,10 @@ def test_what_stands_in_the_way_is_told_in_one_line_and_nothing_is_left_behind(
         (tmp_path / "text.mcap", "mcap", tmp_path / "a.mcap", "text.mcap"),
     ):
         assert execute(["log", "export", str(source), "--to", to, "--out", str(out)]) == 1
-        told = capfd.readouterr()
-        assert told.out == ""
-        assert len(told.err.splitlines()) == 1
-        assert says in told.err
+        captured = capfd.readouterr()
+        assert captured.out == ""
+        assert len(captured.err.splitlines()) == 1
+        assert says in captured.err
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -320,7 +320,7 @@ def test_what_stands_in_the_way_is_told_in_one_line_and_nothing_is_left_behind(
 def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for to, name in (("csv", "log.csv"), ("mcap", "log-decoded.mcap")):
         assert execute(["log", "export", str(log), "--to", to, "--json"]) == 0
-        told = json.loads(capfd.readouterr().out)
-        out = Path(told["out"])
-        assert (out, told["bytes"]) == (log.with_name(name), out.stat().st_size)
+        result = json.loads(capfd.readouterr().out)
+        out = Path(result["out"])
+        assert (out, result["bytes"]) == (log.with_name(name), out.stat().st_size)
         out.unlink()

@@ -90,22 +90,22 @@ def ours(path: Path) -> Counts:
     return counts
 
 
-def theirs(told: dict[str, Any]) -> Counts:
+def theirs(counts: dict[str, Any]) -> Counts:
     return {
         topic: Count(count["count"], count["bytes"], int(count["first"]), int(count["last"]))
-        for topic, count in told.items()
+        for topic, count in counts.items()
     }
 
 
 def assert_all_read(reader: Reader, *paths: Path) -> None:
     done = reader(*paths)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
+    output = json.loads(done.stdout)
     for path in paths:
         mine = ours(path)
         assert mine
-        assert theirs(told[str(path)]["stream"]) == mine
-        assert theirs(told[str(path)]["index"]) == mine
+        assert theirs(output[str(path)]["stream"]) == mine
+        assert theirs(output[str(path)]["index"]) == mine
 
 
 def with_a_damaged_chunk(whole: Path, out: Path) -> Path:

@@ -15,7 +15,7 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Missing
 from aeroloop.service.review.review import read, review
-from tests.support.edited_log import Said, edited, retell, told
+from tests.support.edited_log import Said, edited, message_of, rewrite
 from tests.support.made_log import SESSION, VEHICLE, Logged, made, make_log, write
 from tests.support.rough_log import Known, rough_loop
 
@@ -176,7 +176,7 @@ def test_one_end_alone_is_read_for_what_it_has(tmp_path: Path) -> None:
 
 def test_a_log_of_the_first_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 100)
-    path = retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=[old_description()])
+    path = rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=[old_description()])
     says = "is a log of protocol version 1; read it with aeroloop 0.1, which wrote it"
     for reader in (review, lambda path: replay([path])):
         with pytest.raises(ReviewError, match=says) as refused:
@@ -200,15 +200,15 @@ def test_frames_from_the_wire_are_compared_with_the_traces(tmp_path: Path) -> No
         sent += [("command", k, frame) for k, frame in known.commands.items() if frame]
         sent.sort(key=lambda one: one[1])
         return [
-            told(name, frame[:-1] + bytes([frame[-1] ^ 0x10]) if i == change else frame, at + k * 2_000_000)
+            message_of(name, frame[:-1] + bytes([frame[-1] ^ 0x10]) if i == change else frame, at + k * 2_000_000)
             for i, (name, k, frame) in enumerate(sent)
         ]
 
     made_frames = frames()
-    findings = read(retell(path, tmp_path / "b.mcap", more=made_frames)).findings
+    findings = read(rewrite(path, tmp_path / "b.mcap", more=made_frames)).findings
     recorded = {name: sum(one.topic == name for one in made_frames) for name in ("measurement", "command")}
     assert findings.frames == {name: {"recorded": n, "differ": 0} for name, n in recorded.items()}
-    findings = read(retell(path, tmp_path / "c.mcap", more=frames(change=100))).findings
+    findings = read(rewrite(path, tmp_path / "c.mcap", more=frames(change=100))).findings
     assert findings.frames is not None
     assert sum(count["differ"] for count in findings.frames.values()) == 1
 
@@ -222,13 +222,13 @@ def test_a_row_that_is_not_what_was_done_is_found_at_either_end(tmp_path: Path) 
     def weaker(columns: np.void) -> None:
         columns["voltages"][columns["session_tick"] == 77] *= 0.5
 
-    one = replay([retell(tmp_path / "a.mcap", tmp_path / "b.mcap", edited("controller", quiet))])
+    one = replay([rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", edited("controller", quiet))])
     assert one.controller is not None
     assert one.controller.differ == 1
     first = one.sessions[0].first_difference
     assert first is not None
     assert (first.tick, first.logged) == (123, "silent")
-    other = replay([retell(tmp_path / "a.mcap", tmp_path / "c.mcap", edited("plant", weaker))])
+    other = replay([rewrite(tmp_path / "a.mcap", tmp_path / "c.mcap", edited("plant", weaker))])
     assert other.plant is not None
     assert other.plant.differ == 1
     difference = other.plants[0].first_difference

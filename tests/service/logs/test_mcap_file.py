@@ -319,7 +319,7 @@ def is_telemetry(key: str) -> bool:
     return key.endswith("/telemetry")
 
 
-def told(path: Path) -> tuple[object, object]:
+def metadata_of(path: Path) -> tuple[object, object]:
     files = LogFiles([path])
     return files.descriptions, files.metadata
 
@@ -329,7 +329,7 @@ def test_what_the_index_leads_to_is_what_the_whole_file_holds(whole: Path, tmp_p
     endless = tmp_path / "endless.mcap"
     endless.write_bytes(whole.read_bytes()[:-END])
     assert skim(endless, is_telemetry) is None
-    assert told(endless) == told(whole)
+    assert metadata_of(endless) == metadata_of(whole)
     assert len(LogFiles([whole]).descriptions) == 2
 
 
@@ -348,7 +348,7 @@ def test_the_record_behind_the_header_opens_the_file(whole: Path, tmp_path: Path
         assert opening(tmp_path / "a.mcap") is None
 
 
-def test_a_damaged_chunk_that_the_index_steps_over_is_still_named_by_who_reads_the_messages(
+def test_a_damaged_chunk_that_the_index_steps_over_is_still_named_when_messages_are_read(
     whole: Path, tmp_path: Path
 ) -> None:
     data = bytearray(whole.read_bytes())
@@ -394,12 +394,12 @@ def test_an_index_that_is_wrong_is_not_believed(whole: Path, tmp_path: Path, wro
     path.write_bytes(with_index(whole.read_bytes(), WRONG[wrong]))
     wanted = (lambda _: True) if wrong == "a chunk is elsewhere" else is_telemetry
     assert skim(path, wanted) is None
-    assert told(path) == told(whole)
+    assert metadata_of(path) == metadata_of(whole)
     (session,) = replay([path]).sessions
     assert (session.ticks, session.differ) == (TICKS, 0)
 
 
-def test_the_index_as_it_was_written_is_believed_until_a_bit_of_it_flips(whole: Path, tmp_path: Path) -> None:
+def test_the_index_as_it_was_written_is_accepted_until_a_bit_of_it_flips(whole: Path, tmp_path: Path) -> None:
     """What puts wrong ones together puts this one together right."""
     data, path = whole.read_bytes(), tmp_path / "a.mcap"
     assert with_index(data, lambda index: index) == data
@@ -409,7 +409,7 @@ def test_the_index_as_it_was_written_is_believed_until_a_bit_of_it_flips(whole: 
         bent[bit // 8] ^= 1 << bit % 8
         path.write_bytes(bent)
         assert skim(path, is_telemetry) is None
-        assert told(path) == told(whole)
+        assert metadata_of(path) == metadata_of(whole)
 
 
 def test_what_was_recovered_ends_in_an_index_that_is_believed(whole: Path, tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def test_a_damaged_chunk_costs_its_own_messages_and_no_others(whole: Path, tmp_p
     assert everything[first : first + len(lost)] == lost  # in one piece
 
 
-def test_what_is_no_log_or_stands_in_the_way_is_told_in_one_line(whole: Path, tmp_path: Path) -> None:
+def test_what_is_no_log_or_stands_in_the_way_is_reported_in_one_line(whole: Path, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("hello")
     for broken, out in ((tmp_path / "text.mcap", tmp_path / "a"), (tmp_path / "none.mcap", tmp_path / "b")):
         with pytest.raises(RecoverError) as refused:

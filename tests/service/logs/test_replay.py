@@ -20,7 +20,7 @@ from aeroloop.service.logs.replay import EndReplay, SessionReplay, replay
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.requirements import Limit, LimitError
 from aeroloop.service.review.review import read, review
-from tests.support.edited_log import Said, retell, tell
+from tests.support.edited_log import Said, rewrite, write_messages
 from tests.support.made_log import AN_OPERATORS_WORDS, START_NS, lockstep, made, make_log, write
 
 TICKS = 600
@@ -55,7 +55,7 @@ def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_batch_on(tmp
         (CHANGE_METADATA, {"key": topics.key("trace", "aero", role="controller"), "json": change.model_dump_json()})
         for change in changes
     ]
-    both = replay([retell(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=before)])
+    both = replay([rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=before)])
     (session,) = both.sessions
     assert session.first_tick is not None
     assert begin <= session.first_tick < begin + 60
@@ -79,32 +79,32 @@ def test_the_first_command_that_differs_is_named(tmp_path: Path) -> None:
     assert logged[-1] ^ computed[-1] == 0x10
 
 
-def test_a_real_machine_is_not_replayed_and_the_reason_is_told(tmp_path: Path) -> None:
+def test_a_real_machine_is_not_replayed_and_the_reason_is_reported(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 100)
     config = {**lockstep().description(), "plant": {**lockstep().description()["plant"], "via": "quanser"}}
     description = Description(
         protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config
     ).model_dump_json()
     key = topics.key("description", "aero", role="plant")
-    path = tell_with(tmp_path / "a.mcap", tmp_path / "b.mcap", {"key": key, "json": description})
+    path = rewrite_with(tmp_path / "a.mcap", tmp_path / "b.mcap", {"key": key, "json": description})
     both = replay([path])
     assert both.plant is None
     assert both.controller == EndReplay(ticks=100, differ=0)
     assert "quanser" in both.reasons["plant"]
 
 
-def tell_with(log: Path, out: Path, description: dict[str, str]) -> Path:
+def rewrite_with(log: Path, out: Path, description: dict[str, str]) -> Path:
     """The log with this description before any other of its role."""
-    retell(log, out)
+    rewrite(log, out)
     with out.open("rb") as file:
         reader = make_reader(file)
         messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
         known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
     others = [(name, entries) for name, entries in known if entries.get("key") != description["key"]]
-    return tell(out, messages, [(DESCRIPTION_METADATA, description), *others])
+    return write_messages(out, messages, [(DESCRIPTION_METADATA, description), *others])
 
 
-def test_with_another_law_it_says_what_would_have_been_commanded(tmp_path: Path) -> None:
+def test_with_another_law_it_reports_what_would_have_been_commanded(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", TICKS)
     session = replayed(tmp_path / "a.mcap", "law.C2=[0.3, 0.3, 0.3]")
     assert session.differ > TICKS / 2
@@ -124,7 +124,7 @@ def test_the_figures_of_a_made_log_are_those_of_the_experiment(tmp_path: Path) -
 # Broken files
 
 
-def test_a_file_cut_anywhere_gives_what_was_whole_before_the_cut_and_says_so(tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_gives_what_was_whole_before_the_cut_and_reports_it(tmp_path: Path) -> None:
     """At 100 places, and at every byte of each chunk's end; a chunk of 20 messages is the unit of loss."""
     whole = tmp_path / "a.mcap"
     make_log(whole, TICKS, changes=AN_OPERATORS_WORDS)
@@ -239,7 +239,7 @@ def test_a_figure_is_held_to_its_limit_and_what_is_not_known_does_not_hold(limit
 
 
 @pytest.mark.parametrize("text", ["", "z_track", "z_track=", "z_track=x", "speed=1", "=1"])
-def test_what_is_no_limit_is_told_in_one_line(text: str) -> None:
+def test_what_is_no_limit_is_reported_in_one_line(text: str) -> None:
     with pytest.raises(LimitError) as refused:
         Limit.parse(text)
     assert len(str(refused.value).splitlines()) == 1

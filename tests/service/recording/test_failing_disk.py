@@ -56,11 +56,11 @@ def test_a_full_disk_loses_nothing_wherever_it_was_full(
         assert list(raw(path)) == expected, f"full at {room}"
         assert decoded_count([path]) == decoded
         assert recording.log.written == len(messages)
-        if recording.told:  # else the last bytes, of the index, came when there was room again
+        if recording.reported:  # else the last bytes, of the index, came when there was room again
             refused += 1
-            assert [bad for _, bad in recording.told] == [True, False]
-            assert os.strerror(errno.ENOSPC) in recording.told[0][0]
-            assert recording.told[1][0] == f"recording again to {path}"
+            assert [bad for _, bad in recording.reported] == [True, False]
+            assert os.strerror(errno.ENOSPC) in recording.reported[0][0]
+            assert recording.reported[1][0] == f"recording again to {path}"
     assert refused > 20
     assert not list(tmp_path.glob("*-0*.mcap")), "all went into one file each"
 
@@ -97,7 +97,7 @@ def test_a_disk_that_writes_a_little_at_a_time_is_written_to_the_end(
     assert list(raw(tmp_path / "a.mcap")) == numbered(story.messages[:200])
 
 
-def test_while_a_disk_is_full_it_is_tried_once_a_second_and_told_of_once(
+def test_while_a_disk_is_full_it_is_tried_once_a_second_and_reported_once(
     tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.03)
@@ -108,7 +108,7 @@ def test_while_a_disk_is_full_it_is_tried_once_a_second_and_told_of_once(
     for _ in range(100):
         recording.wait(0.1)
     assert 9 <= disk.writes - before <= 10
-    assert len(recording.told) == 1
+    assert len(recording.reported) == 1
     disk.room = EVERYTHING
     recording.wait(1.0)
     recording.log.close()
@@ -151,7 +151,7 @@ def _errors(disk: Disk, *errors: int) -> None:
     disk.changes = changes
 
 
-def test_a_file_that_is_moved_or_removed_is_told_of_and_another_begun(
+def test_a_file_that_is_moved_or_removed_is_reported_and_another_begun(
     tmp_path: Path, story: EventLog, clock: Clock
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.05)
@@ -163,7 +163,7 @@ def test_a_file_that_is_moved_or_removed_is_told_of_and_another_begun(
     recording.wait(rolling.LOOK_S)
     recording.take(story.messages[200:300])
     recording.log.close()
-    assert recording.told_bad() == [
+    assert recording.reported_bad() == [
         f"{tmp_path / name} was moved or removed while it was written" for name in ("a.mcap", "a-0001.mcap")
     ]
     expected = numbered(story.messages[:300])
@@ -180,7 +180,7 @@ def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
     recording.wait(2.5)
     recording.take(story.messages[100:200])
     recording.wait(1.5)  # time enough to look again, but not to try again
-    assert recording.told_bad() == [
+    assert recording.reported_bad() == [
         f"no new file can be begun ({os.strerror(errno.EACCES)}), so {tmp_path / 'a.mcap'} goes on"
     ]
     disk.new_files = 0
@@ -213,7 +213,7 @@ def test_a_new_file_that_finds_the_disk_full_leaves_nothing_behind(
 # The end
 
 
-def test_the_end_on_a_full_disk_is_told_in_one_line_and_what_was_written_can_be_recovered(
+def test_the_end_on_a_full_disk_is_reported_in_one_line_and_what_was_written_can_be_recovered(
     tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1)

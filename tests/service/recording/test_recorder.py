@@ -51,8 +51,8 @@ class Running:
         self.error: Exception | None = None
         self._write = os.pwrite
         self.role = Role("recorder", "aero", gathering.settings, {})
-        told = {"chunk_s": 0.05, "decoded_hz": 0.0, **settings}
-        self.recorder = Recorder(self.role, RecorderSettings.model_validate({"path": path, **told}))
+        options = {"chunk_s": 0.05, "decoded_hz": 0.0, **settings}
+        self.recorder = Recorder(self.role, RecorderSettings.model_validate({"path": path, **options}))
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -89,8 +89,8 @@ class Running:
 
     def losses(self) -> list[tuple[str, int, str]]:
         """Key, how many and why, in the log."""
-        told = [Loss.model_validate_json(data) for data in self.of("aeroloop/aero/loss")]
-        return [(loss.key, loss.count, loss.reason) for loss in told]
+        losses = [Loss.model_validate_json(data) for data in self.of("aeroloop/aero/loss")]
+        return [(loss.key, loss.count, loss.reason) for loss in losses]
 
 
 @pytest.fixture
@@ -180,10 +180,12 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert running.losses() == []
         with parts(running.path)[-1].open("rb") as file:
             metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
-        changes = [told for name, told in metadata if name == CHANGE_METADATA]
-        assert {told["key"] for told in changes} == {"aeroloop/aero/trace/controller"}
-        assert [Change.model_validate_json(told["json"]) for told in changes] == list(CHANGES.values())
-        descriptions = {told["key"]: told["json"].encode() for name, told in metadata if name == DESCRIPTION_METADATA}
+        changes = [entry for name, entry in metadata if name == CHANGE_METADATA]
+        assert {entry["key"] for entry in changes} == {"aeroloop/aero/trace/controller"}
+        assert [Change.model_validate_json(entry["json"]) for entry in changes] == list(CHANGES.values())
+        descriptions = {
+            entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA
+        }
         assert descriptions[description] == published[description][0]
 
 
@@ -303,23 +305,24 @@ def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothi
 # What is lost
 
 
-def test_while_the_disk_is_full_it_says_so_and_what_finds_no_room_in_memory_is_counted_in_the_log(
+def test_a_full_disk_is_reported_and_what_finds_no_room_in_memory_is_counted_in_the_log(
     record: Record, publisher: Publisher, gathering: Gathering
 ) -> None:
     """Every message is in the log or in the count of those that are not; none is in both, and none is lost twice."""
     running = record()
-    told = statuses(gathering)
+    reported = statuses(gathering)
     publisher.send(1)
     eventually("the first", lambda: running.recorder.log.written > 2)
     running.full = True
     publisher.send(2)
     eventually("trouble", lambda: not running.recorder.log.writable)
     publisher.send(502)
-    eventually("its word", lambda: any(status.state == "waiting for the disk" for status in told))
+    eventually("its word", lambda: any(status.state == "waiting for the disk" for status in reported))
     eventually("a full backlog", lambda: len(running.recorder._backlog) == ROOM)
     running.full = False
     eventually(
-        "its word", lambda: told[-1].state == "recording" and any("lost: disk" in note for note in told[-1].notes)
+        "its word",
+        lambda: reported[-1].state == "recording" and any("lost: disk" in note for note in reported[-1].notes),
     )
     publisher.send(510)
     running.end()
@@ -364,7 +367,7 @@ def test_a_recorder_that_is_stopped_when_the_disk_has_room_again_writes_what_wai
     assert running.numbers() == list(range(30))
 
 
-def test_a_recorder_that_is_stopped_while_the_disk_is_full_says_how_much_is_lost(
+def test_a_recorder_that_is_stopped_while_the_disk_is_full_reports_how_much_is_lost(
     record: Record, publisher: Publisher
 ) -> None:
     running = record()

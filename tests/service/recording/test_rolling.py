@@ -50,7 +50,7 @@ def rotated(
     recording = Recording(clock, story, path=tmp_path / "a.mcap", chunk_s=0.1, **ROTATIONS[request.param])
     recording.take(story.messages)
     recording.log.close()
-    assert recording.told == []
+    assert recording.reported == []
     return tmp_path
 
 
@@ -65,7 +65,7 @@ def test_over_all_files_every_message_stands_once_and_their_numbers_go_on(rotate
     assert every_message(files) == numbered(story.messages)
 
 
-def test_no_file_is_larger_or_older_than_told_by_more_than_a_chunk(
+def test_no_file_is_larger_or_older_than_configured_by_more_than_a_chunk(
     tmp_path: Path, story: EventLog, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rolling, "LOOK_S", 0.01)
@@ -134,7 +134,7 @@ def test_no_log_is_written_over(tmp_path: Path, story: EventLog, clock: Clock) -
     assert every_message([tmp_path / "a-0002.mcap"]) == numbered(story.messages[:50])
 
 
-def test_where_no_log_can_be_made_it_is_told_in_one_line(tmp_path: Path, story: EventLog, clock: Clock) -> None:
+def test_where_no_log_can_be_made_it_is_reported_in_one_line(tmp_path: Path, story: EventLog, clock: Clock) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(RecorderError) as refused:
         Recording(clock, story, path=tmp_path / "file" / "a.mcap")
@@ -184,7 +184,7 @@ def _topics_of_messages(path: Path) -> list[str]:
 # Retention
 
 
-def test_the_oldest_of_ones_own_go_and_nobody_elses(
+def test_the_oldest_of_ones_own_go_and_no_other_file(
     tmp_path: Path, story: EventLog, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rolling, "LOOK_S", 0.01)
@@ -222,7 +222,7 @@ def test_the_oldest_of_ones_own_go_and_nobody_elses(
     assert own[-1] == recording.log.path
     sizes = [path.stat().st_size for path in own]
     assert sum(sizes[:-1]) < 400e3 < sum(sizes) + max(sizes), "no more than needed"
-    removed = [text for text, _ in recording.told if text.startswith("removed")]
+    removed = [text for text, _ in recording.reported if text.startswith("removed")]
     assert len(removed) == numbers[0]
     kept = every_message(own)
     assert kept == numbered(story.messages)[-len(kept) :]

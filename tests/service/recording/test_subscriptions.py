@@ -66,7 +66,7 @@ def test_numbers_that_no_cache_has_are_lost_on_the_network_and_those_that_a_full
         for received in subscriptions.take():
             taken[received.key].append(received.sequence)
         for loss in subscriptions.losses():
-            lost[loss.key, loss.reason] += loss.messages
+            lost[loss.key, loss.reason] += loss.count
         return taken[EVENT][-1:] == [99] and taken[TRUTH][-1:] == [40]
 
     def send(number: int) -> None:

@@ -60,7 +60,7 @@ def test_text_and_attributes_are_escaped_and_markup_is_not() -> None:
     )
 
 
-def test_the_page_says_what_was_asked_and_what_was_found() -> None:
+def test_the_page_states_what_was_asked_and_what_was_found() -> None:
     held = Texts(page([made_report(checks=[HELD])])).texts
     assert " Held" in held
     assert HELD.text in held
@@ -71,7 +71,7 @@ def test_the_page_says_what_was_asked_and_what_was_found() -> None:
     assert " Tracked" in Texts(page([made_report(marks=())])).texts
 
 
-def test_the_page_says_what_the_theorem_promises_and_which_inequality_was_broken() -> None:
+def test_the_page_states_what_the_theorem_promises_and_which_inequality_was_broken() -> None:
     held = page([made_report(theorem=made_theorem())])
     texts = Texts(held).texts
     assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in texts
@@ -89,7 +89,7 @@ def test_the_page_says_what_the_theorem_promises_and_which_inequality_was_broken
     assert "first broken" not in held
 
 
-def test_where_no_run_was_held_against_the_theorem_the_page_says_nothing_of_it() -> None:
+def test_where_no_run_was_checked_against_the_theorem_the_page_leaves_it_out() -> None:
     assert 'id="theorem"' not in page([made_report()])
     several = page([made_report("a"), made_report("b", theorem=made_theorem())])
     assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in Texts(several).texts
@@ -102,7 +102,7 @@ def test_the_theorems_panels_stand_in_its_own_section_and_nowhere_else() -> None
     assert text.count('data-name="z_norm"') == 1
 
 
-def test_the_wire_is_told_with_each_signals_quantizer() -> None:
+def test_the_wire_is_listed_with_each_signals_quantizer() -> None:
     signals = {
         "attitude": {"bits": 8, "limit": 1.0},  # of before there were kinds
         "rate": {"bits": 10, "limit": 2.0, "kind": "hysteresis-uniform"},
@@ -118,20 +118,20 @@ def test_the_wire_is_told_with_each_signals_quantizer() -> None:
     assert row("voltage u") == ["–", "cont", "±24"]
 
 
-def test_what_could_not_be_read_is_told() -> None:
+def test_what_could_not_be_read_is_reported() -> None:
     damage = "a.mcap: cut at byte 1234"
     assert damage in Texts(page([made_report(damages=[damage])])).texts
     assert "What is missing from the log" not in Texts(page([made_report()])).texts
 
 
-def test_the_page_says_whether_lines_are_thinned_out() -> None:
+def test_the_page_states_whether_lines_are_thinned_out() -> None:
     assert "up to 64 ticks" in page([made_report(thinned=64)])
     assert "thinned out" not in page([made_report(thinned=2)])
 
 
-def test_a_missing_figure_says_why() -> None:
+def test_a_missing_figure_states_why() -> None:
     run = made_report()
-    why = "the plant told no latency"
+    why = "the plant reported no latency"
     findings = run.findings.model_copy(update={"latency_us": None, "reasons": {"latency_us": why}})
     assert Texts(page([replace(run, findings=findings)])).texts.count(why) >= 2  # p50 and p99
 
@@ -235,7 +235,7 @@ def open_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(scope="module")
 def one(open_page: Open) -> Page:
-    """The page of one run; whoever moves its time or theme puts it back."""
+    """The page of one run; a test that moves its time or theme restores it."""
     return open_page(made_report(checks=[HELD]))
 
 

@@ -17,7 +17,7 @@ from aeroloop.service.review.report import Check, Findings, Mark, Spread
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report, review
 from aeroloop.service.terminal.log_tables import sparkline
-from tests.support.edited_log import Said, edited, retell, told
+from tests.support.edited_log import Said, edited, message_of, rewrite
 from tests.support.made_log import AN_OPERATORS_WORDS, START_NS, make_log
 
 TICKS = 500
@@ -39,13 +39,15 @@ def found(path: Path) -> Findings:
 
 
 def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
-    """The controller tells of it in words, too, but only the change itself has the tick."""
+    """The controller reports it in words, too, but only the change itself has the tick."""
     make_log(tmp_path / "a.mcap", TICKS, changes=AN_OPERATORS_WORDS)
     more = [
-        told("event", Event(role="controller", kind="changed", text=text, session=session), START_NS + 240_000_000)
+        message_of(
+            "event", Event(role="controller", kind="changed", text=text, session=session), START_NS + 240_000_000
+        )
         for text, session in (("gains set", "s1"), ("configuration read again", None))
     ]
-    happened = found(retell(tmp_path / "a.mcap", tmp_path / "b.mcap", more=more)).marks
+    happened = found(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", more=more)).marks
     assert [mark.text for mark in happened if mark.kind == "changed"] == ["configuration read again"]
     marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
     assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
@@ -64,7 +66,7 @@ def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_r
         at_s: float, role: str, kind: str, text: str, session: str | None = "s1", tick: int | None = None
     ) -> Said:
         message = Event.model_validate({"role": role, "kind": kind, "text": text, "session": session, "tick": tick})
-        return told("event", message, START_NS + round(at_s * 1e9))
+        return message_of("event", message, START_NS + round(at_s * 1e9))
 
     more = [
         event(1.1, "plant", "tripped", "tilted", tick=499),
@@ -75,7 +77,7 @@ def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_r
         event(0.53, "controller", "fault", "5 ticks missed", tick=260),
         event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event"),
     ]
-    findings = found(retell(whole, tmp_path / "a.mcap", more=more))
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
     marks = [mark for mark in findings.marks if mark.kind != "change"]
     assert [(mark.time_s, mark.role, mark.kind, mark.text) for mark in marks] == [
         (None, "plant", "started", "waits"),
@@ -89,8 +91,8 @@ def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_r
 
 
 def test_what_a_restarted_recorder_received_again_counts_once(whole: Path, tmp_path: Path) -> None:
-    event = told("event", Event(role="plant", kind="tripped", text="tilted"), START_NS + 500_000_000)
-    findings = found(retell(whole, tmp_path / "a.mcap", more=[event, event]))
+    event = message_of("event", Event(role="plant", kind="tripped", text="tilted"), START_NS + 500_000_000)
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=[event, event]))
     assert findings.trips == ["tilted"]
     assert len([mark for mark in findings.marks if mark.kind == "tripped"]) == 1
 
@@ -102,8 +104,8 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
     def stale(columns: Any) -> None:
         columns["outcome"][columns["session_tick"] == 300] = Outcome.STALE
 
-    path = retell(whole, tmp_path / "a.mcap", edited("controller", late))
-    findings = found(retell(path, tmp_path / "b.mcap", edited("plant", stale)))
+    path = rewrite(whole, tmp_path / "a.mcap", edited("controller", late))
+    findings = found(rewrite(path, tmp_path / "b.mcap", edited("plant", stale)))
     assert findings.lapses == {"late": 2, "missed": 2, "stale": 1}
     assert Limit.parse("lapses=2").broken(findings) == "lapses is 5, more than 2"
 
@@ -111,14 +113,14 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
     def loss(key: str, count: int, at_s: float) -> Said:
         at = START_NS + round(at_s * 1e9)
-        return told("loss", Loss(key=key, count=count, reason="queue"), at)
+        return message_of("loss", Loss(key=key, count=count, reason="queue"), at)
 
     more = [
         loss("aeroloop/aero/s1/measurement", 3, 0.21),
         loss("aeroloop/aero/s1/measurement", 4, 0.41),
         loss("aeroloop/aero/event", 1, 0.51),
     ]
-    findings = found(retell(whole, tmp_path / "a.mcap", more=more))
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
     assert findings.losses == {"measurement": 7, "event": 1}
     marks = [(mark.time_s, mark.role, mark.text[:17]) for mark in findings.marks if mark.kind == "lost"]
     assert marks == [
@@ -128,11 +130,12 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
     ]
 
 
-def test_a_storm_of_events_is_told_in_a_bounded_number_of_marks(whole: Path, tmp_path: Path) -> None:
+def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tmp_path: Path) -> None:
     storm = [
-        told("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + i * 1_000_000) for i in range(900)
+        message_of("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + i * 1_000_000)
+        for i in range(900)
     ]
-    marks = [mark for mark in found(retell(whole, tmp_path / "a.mcap", more=storm)).marks if mark.kind == "refused"]
+    marks = [mark for mark in found(rewrite(whole, tmp_path / "a.mcap", more=storm)).marks if mark.kind == "refused"]
     assert len(marks) == 301
     assert marks[-1].text == "600 more, the last: no 899"
 
@@ -152,7 +155,7 @@ def test_findings_are_the_figures_and_more(whole: Path) -> None:
 
 def test_a_report_has_the_configuration_and_what_is_known_of_software_and_host(whole: Path, tmp_path: Path) -> None:
     facts = {"git": "abc", "cpu": "two cores"}
-    path = retell(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
+    path = rewrite(whole, tmp_path / "night.mcap", metadata=[("aeroloop.recorder", {"json": json.dumps(facts)})])
     made = report([path], [Limit.parse("skipped=0"), Limit.parse("latency.p99=100")])
     assert made.name == "night"
     assert made.settings["wire"]["voltage"]["bits"] == 6
@@ -194,7 +197,7 @@ def test_short_names_of_limits_mean_what_they_say(whole: Path, limit: str, value
     assert Limit.parse(limit).value(findings) == value
 
 
-def test_what_could_not_be_had_breaks_its_limit_and_says_why(whole: Path) -> None:
+def test_a_missing_figure_breaks_its_limit_and_states_why(whole: Path) -> None:
     check = Limit.parse("age.p99=5000").check(found(whole))
     assert not check.holds
     assert "controller" in check.found
@@ -212,7 +215,7 @@ THEOREM_KEYS = {
 }  # fmt: skip
 
 
-def test_the_keys_of_the_json_are_stable_and_the_exit_code_says_whether_limits_hold(
+def test_the_keys_of_the_json_are_stable_and_the_exit_code_reports_whether_limits_hold(
     whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert execute(["log", "review", str(whole), "--json", "--require", "z_track=50e-4", "--require", "skipped=0"]) == 0
@@ -235,16 +238,18 @@ def test_a_single_late_tick_in_a_million_is_seen_in_the_bars_and_how_late_it_was
     assert sparkline(Spread(count=1, p50=9, p90=9, p99=9, p999=9, max=9, bins=[(9.0, 1)])) == "█"
 
 
-def test_the_account_tells_timing_gaps_what_happened_and_what_does_not_hold(
+def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make_log(tmp_path / "whole.mcap", TICKS, settings=load(), lost=range(50, 53))
     more = [
-        told("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + 500_000_000 + i)
+        message_of("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + 500_000_000 + i)
         for i in range(15)
     ]
-    more.append(told("event", Event(role="plant", kind="tripped", text="the [red] limit"), START_NS + 410_000_000))
-    path = retell(tmp_path / "whole.mcap", tmp_path / "a.mcap", more=more)
+    more.append(
+        message_of("event", Event(role="plant", kind="tripped", text="the [red] limit"), START_NS + 410_000_000)
+    )
+    path = rewrite(tmp_path / "whole.mcap", tmp_path / "a.mcap", more=more)
     assert execute(["log", "review", str(path), "--require", "gaps=0"]) == 1
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out

@@ -14,7 +14,7 @@ from aeroloop.service.config import load
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.downsample import DownsampledLines
 from aeroloop.service.review.review import read, report
-from tests.support.edited_log import LATENCY_NS, PERIOD_NS, observer_of, retell, ticks_of, told
+from tests.support.edited_log import LATENCY_NS, PERIOD_NS, message_of, observer_of, rewrite, ticks_of
 from tests.support.made_log import SESSION, START_NS, make_log
 
 TICKS = 500
@@ -75,13 +75,13 @@ def test_of_both_signs_the_attitude_is_drawn_with_that_beside_the_desired_one() 
 
 
 def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_path: Path) -> None:
-    """The truth, told at every tenth tick, is the desired attitude turned by 10°: the angle between them is that."""
+    """The truth, sent at every tenth tick, is the desired attitude turned by 10°: the angle between them is that."""
     turn = cos(radians(5)), 0.0, sin(radians(5)), 0.0
     blocks: list[Ticks] = []
     read(whole, watch=blocks.append)
     ticks = Ticks.joined(blocks)
     more = [
-        told(
+        message_of(
             "truth",
             Truth(tick=k, session=SESSION, session_tick=k, attitude=product(tuple(desired), turn), rate=(0, 0, 0),
                   voltages=(0, 0)),
@@ -89,7 +89,7 @@ def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_pa
         )
         for k, desired in list(zip(ticks.k.tolist(), ticks.desired.tolist(), strict=True))[::10]
     ]  # fmt: skip
-    made = report([retell(whole, tmp_path / "a.mcap", more=more)])
+    made = report([rewrite(whole, tmp_path / "a.mcap", more=more)])
     (panel,) = (panel for panel in made.panels if panel.group == "error_angle")
     assert [line.label for line in panel.lines] == ["measured", "true"]
     assert panel.lines[1].values[1:-10] == pytest.approx(10.0, abs=0.05)  # interpolated while q_d turns

@@ -13,7 +13,7 @@ from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import load
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read
-from tests.support.edited_log import Said, edited, observer_of, retell, ticks_of, told
+from tests.support.edited_log import Said, edited, message_of, observer_of, rewrite, ticks_of
 from tests.support.made_log import START_NS, make_log
 
 TICKS = 500
@@ -74,7 +74,7 @@ def test_latency_and_period_are_those_of_the_plants_own_clock(whole: Path, tmp_p
         columns["received"][columns["answered"] % 50 == 7] += 1000
         columns["sent"][columns["session_tick"] == 300] += 200
 
-    timing = found(retell(whole, tmp_path / "a.mcap", edited("plant", later))).timing
+    timing = found(rewrite(whole, tmp_path / "a.mcap", edited("plant", later))).timing
     latency, period = timing["latency"], timing["period"]
     assert (latency.count, period.count) == (TICKS - 1, TICKS - 1)  # nothing acts on the last command any more
     assert latency.p50 == pytest.approx(300, rel=0.044)
@@ -93,10 +93,10 @@ def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: 
         message = Status(
             role="controller", state="running", session=session, uptime_s=1, ticks=1, rate_hz=1, skipped=0, age_us=age
         )
-        return told("status", message, START_NS + i * 100_000_000)
+        return message_of("status", message, START_NS + i * 100_000_000)
 
     more = [status(1, 400, 900, 1000), status(2, 400, 700, 5000), status(3, 500, 800, 900), status(4, 1, 9999, 1, "s2")]
-    age = found(retell(whole, tmp_path / "a.mcap", more=more)).age_us
+    age = found(rewrite(whole, tmp_path / "a.mcap", more=more)).age_us
     assert age is not None
     assert age["p50"] == pytest.approx(400, rel=0.044)
     assert (age["p99"], age["max"]) == (900, 5000)
@@ -122,8 +122,8 @@ def test_values_at_the_outermost_level_are_counted_by_signal(whole: Path, tmp_pa
             frame = np.void(wire.measurement.pack(k % 256, (126, 0, 0, 0, 0, -127)))
             columns["measurement"][columns["session_tick"] == k] = frame
 
-    path = retell(whole, tmp_path / "a.mcap", edited("controller", commands))
-    clean, findings = found(whole), found(retell(path, tmp_path / "b.mcap", edited("plant", measurements)))
+    path = rewrite(whole, tmp_path / "a.mcap", edited("controller", commands))
+    clean, findings = found(whole), found(rewrite(path, tmp_path / "b.mcap", edited("plant", measurements)))
     more = {name: findings.saturated[name] - clean.saturated[name] for name in findings.saturated}
     assert more == pytest.approx({"attitude": 0.0, "rate": 10 / (3 * TICKS), "voltage": 3 / (2 * TICKS)}, abs=1e-12)
     assert findings.invalid == {"measurement": 0, "command": 0}

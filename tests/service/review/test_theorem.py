@@ -19,8 +19,8 @@ from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.logs.runs import BLOCK
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.report.plots import draw_theorem
-from aeroloop.service.review import certificate_cache as grounds
-from aeroloop.service.review.certificate_cache import CertificateCache, damping_of
+from aeroloop.service.review import certified_bounds as grounds
+from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
 from aeroloop.service.review.report import Findings, Line, TheoremFindings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report
@@ -29,7 +29,7 @@ from aeroloop.service.terminal.log_tables import review_account
 from aeroloop.service.theorem.certificate import Evaluated, bounds_of, certify
 from aeroloop.service.theorem.lemma import coordinates
 from tests.support import numpy_twin as twin
-from tests.support.edited_log import Said, retell
+from tests.support.edited_log import Said, rewrite
 from tests.support.made_log import SESSION, make_log
 
 TICKS = 600
@@ -109,8 +109,8 @@ def test_a_bound_that_is_half_of_what_it_must_be_is_found_broken(
     assert why == f"lemma_broken is {theorem.broken}, more than 0"
 
 
-def told_of(one: Said, **changed: Any) -> Said:
-    """A truth, told otherwise; what is none, as it was."""
+def truth_with(one: Said, **changed: Any) -> Said:
+    """A truth with these fields changed; any other message unchanged."""
     if one.topic != "truth":
         return one
     return one._replace(data=Truth.model_validate_json(one.data).model_copy(update=changed).encode())
@@ -121,7 +121,7 @@ def next_tick(one: Said) -> Said:
         return one
     tick = Truth.model_validate_json(one.data).session_tick
     assert tick is not None
-    return told_of(one, session_tick=tick + 1)
+    return truth_with(one, session_tick=tick + 1)
 
 
 def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_a_true_state_is_compared_with_the_measurement_that_was_taken_of_it(tmp_
     make_log(tmp_path / "a.mcap", 300, settings=lockstep("plant.ideal=true", *cont), truth_every=1)
     exact = found(tmp_path / "a.mcap")
     assert (exact.outside["C.28"], exact.outside["C.29"]) == (0, 0)
-    late = found(retell(tmp_path / "a.mcap", tmp_path / "b.mcap", next_tick))
+    late = found(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", next_tick))
     assert late.outside["C.29"] > 250
 
 
@@ -195,15 +195,15 @@ def test_a_session_that_begins_far_from_its_reference_is_judged_once_it_is_there
     ("change", "why"),
     [
         (lambda one: None if one.topic == "truth" else one, "no true state"),
-        (lambda one: told_of(one, session=None, session_tick=None), "no true state"),
-        (lambda one: told_of(one, session="another"), "no true state"),
+        (lambda one: truth_with(one, session=None, session_tick=None), "no true state"),
+        (lambda one: truth_with(one, session="another"), "no true state"),
     ],
     ids=["none", "outside of sessions", "of another session"],
 )
-def test_without_a_true_state_of_a_tick_nothing_is_judged_and_the_reason_is_told(
+def test_without_a_true_state_of_a_tick_nothing_is_judged_and_the_reason_is_reported(
     ideal: Path, tmp_path: Path, change: Callable[[Said], Said | None], why: str
 ) -> None:
-    findings = read(retell(ideal, tmp_path / "a.mcap", change)).findings
+    findings = read(rewrite(ideal, tmp_path / "a.mcap", change)).findings
     assert findings.theorem is not None
     assert (findings.theorem.samples, findings.theorem.broken) == (0, None)
     assert why in findings.reasons["theorem.broken"]
@@ -223,7 +223,7 @@ def block(first: int, count: int) -> Ticks:
 
 def trial(*changes: Change) -> TheoremCheck:
     settings = load(overrides=["reference.kind=hold"])
-    one = TheoremCheck(CertificateCache(settings).of(changes), 0.002, None)
+    one = TheoremCheck(certified_bounds(settings, changes), 0.002, None)
     one.changed(changes)
     return one
 
@@ -245,7 +245,7 @@ def test_a_true_state_that_comes_after_its_block_still_counts_and_long_silence_c
     assert all(np.isfinite(lines).all() for lines in drawn)
 
 
-def test_the_true_line_goes_from_one_told_state_to_the_next_and_begins_with_the_first() -> None:
+def test_the_true_line_goes_from_one_published_state_to_the_next_and_begins_with_the_first() -> None:
     one = trial()
     for k in (10, 30):
         one.truth(k, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.001 * k))
@@ -261,7 +261,7 @@ def test_v_has_its_damping_term_where_the_plants_damping_is_known() -> None:
     settings = load(overrides=["reference.kind=hold"])
     values = []
     for damping in (None, (0.0, 0.0, 0.02)):
-        one = TheoremCheck(CertificateCache(settings).of(()), 0.002, damping)
+        one = TheoremCheck(certified_bounds(settings, ()), 0.002, damping)
         one.truth(0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         values.append(float(one.ticks(block(0, 1))[1][0, 3]))
     assert values == pytest.approx([0.0, 0.02**2 / 0.02 / 2])
@@ -315,7 +315,7 @@ def test_the_largest_norm_and_error_after_the_transient_are_beside_what_is_guara
     assert theorem.true_error_deg == pytest.approx(theorem.error_deg, abs=1e-2)
 
 
-def test_before_the_transient_is_over_there_is_no_largest_norm_and_the_reason_is_told(ideal: Path) -> None:
+def test_before_the_transient_is_over_there_is_no_largest_norm_and_the_reason_is_reported(ideal: Path) -> None:
     findings = read(ideal).findings
     assert findings.theorem is not None
     assert (findings.theorem.transient_s, findings.theorem.z_norm) == (20.0, None)
@@ -336,7 +336,7 @@ def with_description(path: Path, out: Path, certificate: dict[str, Any]) -> Path
         certificate=certificate,
     )
     entry = {"key": "aeroloop/aero/description/controller", "json": description.model_dump_json()}
-    return retell(path, out, metadata=[(DESCRIPTION_METADATA, entry)])
+    return rewrite(path, out, metadata=[(DESCRIPTION_METADATA, entry)])
 
 
 def test_the_contracts_certificate_is_what_counts_unless_the_session_began_with_other_gains(
@@ -344,10 +344,10 @@ def test_the_contracts_certificate_is_what_counts_unless_the_session_began_with_
 ) -> None:
     promise = promised(lockstep("plant.ideal=true"))
     assert found(with_description(ideal, tmp_path / "a.mcap", {**promise, "radius": 0.5})).radius == 0.5
-    library = CertificateCache(lockstep(), {**promise, "radius": 0.5})
-    assert library.of(()).radius == 0.5
+    half = {**promise, "radius": 0.5}
+    assert certified_bounds(lockstep(), (), half).radius == 0.5
     other = Change(session=SESSION, tick=0, gains=Gains(C1=(0.4, 0.3, 0.3)), reference=lockstep().reference)
-    assert library.of([other]).radius not in (0.5, promise["radius"], None)
+    assert certified_bounds(lockstep(), [other], half).radius not in (0.5, promise["radius"], None)
 
 
 def test_of_a_stream_and_of_gains_that_fail_nothing_is_guaranteed() -> None:

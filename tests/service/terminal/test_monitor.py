@@ -24,7 +24,7 @@ def status(role: str, state: str) -> Status:
     return Status(role=role, state=state, uptime_s=1.0, ticks=10, rate_hz=500.0, skipped=7)
 
 
-def heard(**messages: Message) -> Top:
+def top_of(**messages: Message) -> Top:
     top = Top()
     for key, message in messages.items():
         top.receive(f"aeroloop/aero/{key.replace('__', '/')}", message.encode())
@@ -36,7 +36,7 @@ def test_an_empty_network_is_shown_as_such() -> None:
 
 
 def test_every_role_of_every_vehicle_is_shown_with_its_state() -> None:
-    top = heard(status__plant=status("plant", "driven"), status__controller=status("controller", "running"))
+    top = top_of(status__plant=status("plant", "driven"), status__controller=status("controller", "running"))
     top.receive("aeroloop/other/status/plant", status("plant", "tripped").encode())
     shown = text(top)
     for word in ("aero", "other", "driven", "running", "tripped", "500/s", "7"):
@@ -50,7 +50,7 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
     )  # fmt: skip
     half = 2**-0.5
     shown = text(
-        heard(
+        top_of(
             status__controller=status("controller", "running"),
             description__plant=Description(
                 protocol=PROTOCOL_VERSION,
@@ -71,24 +71,24 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
 
 def test_where_only_changes_are_sent_the_bits_are_those_of_the_frames_that_were() -> None:
     config = load(overrides=["wire.transmit.command=on_change"]).description()
-    top = heard(
+    top = top_of(
         description__plant=Description(
             protocol=PROTOCOL_VERSION, role="plant", vehicle="aero", host="h", versions={}, config=config
         )
     )
     for uptime_s, sent in ((1.0, 40), (3.0, 440), (3.1, 441)):  # the last says nothing of a rate
-        told = status("controller", "running").model_copy(update={"uptime_s": uptime_s, "sent": sent, "received": 10})
-        top.receive("aeroloop/aero/status/controller", told.encode())
+        report = status("controller", "running").model_copy(update={"uptime_s": uptime_s, "sent": sent, "received": 10})
+        top.receive("aeroloop/aero/status/controller", report.encode())
     assert "28.0 + 4.8 kbit/s" in text(top)  # 500 measurements of 7 bytes, 200 commands of 3
     again = status("controller", "running").model_copy(update={"uptime_s": 0.5, "sent": 3})
     after = again.model_copy(update={"uptime_s": 1.5, "sent": 103})
-    for told in (again, after):  # started anew, and so are its counts
-        top.receive("aeroloop/aero/status/controller", told.encode())
+    for report in (again, after):  # started anew, and so are its counts
+        top.receive("aeroloop/aero/status/controller", report.encode())
     assert "28.0 + 2.4 kbit/s" in text(top)
 
 
 def test_a_role_that_fell_silent_is_shown_so() -> None:
-    top = heard(status__plant=status("plant", "driven"))
+    top = top_of(status__plant=status("plant", "driven"))
     vehicle = top._vehicles["aero"]
     at, last = vehicle.statuses["plant"]
     vehicle.statuses["plant"] = at - SILENT_S - 1, last
@@ -96,7 +96,7 @@ def test_a_role_that_fell_silent_is_shown_so() -> None:
 
 
 def test_what_is_not_understood_is_left_out() -> None:
-    top = heard(status__plant=status("plant", "driven"))
+    top = top_of(status__plant=status("plant", "driven"))
     for key in (
         "aeroloop/aero/status/plant",
         "aeroloop/aero/telemetry",

@@ -224,7 +224,7 @@ def test_the_extremes_of_a_reference_are_those_of_what_the_law_is_given(referenc
     assert np.all(np.array(most) > 0.985 * np.array(bounds))
 
 
-def test_a_stream_is_not_certified_and_says_why(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_stream_is_not_certified_and_the_reason_is_reported(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(BoundlessError, match="not known beforehand"):
         extremes(Stream())
     with pytest.raises(BoundlessError, match="too fast for floating-point numbers"):
@@ -247,7 +247,7 @@ COARSE = ["wire.rate.limit=20", "wire.rate.bits=4"]
     ],
     ids=["coarse rate", "large C1", "small C2", "narrow rate", "narrow attitude"],
 )
-def test_one_that_fails_says_what_is_to_blame_and_each_remedy_cures_it(overrides: list[str], to_blame: str) -> None:
+def test_one_that_fails_names_what_is_to_blame_and_each_remedy_cures_it(overrides: list[str], to_blame: str) -> None:
     settings = load_over(PAPER, overrides)
     found = certificate(settings)
     assert not found.holds
@@ -287,7 +287,7 @@ def test_a_gain_that_is_printed_with_four_digits_still_cures(gain: float) -> Non
         assert certificate(load_over(settings, cure)).holds, cure
 
 
-def test_where_no_bits_and_no_gains_do_it_says_so() -> None:
+def test_where_no_bits_and_no_gains_suffice_it_is_reported() -> None:
     found = certificate(load_over(PAPER, ["law.inertia=[1, 1, 1]"]))
     assert [r.text for r in found.remedies] == ["no number of bits up to 16 would do", "no gains C1 and C2 would do"]
     assert (found.k, found.radius, found.radius_deg) == (None, None, None)

@@ -91,7 +91,7 @@ def random_samples(wire: WireSpec, b: Evaluated, seed: int) -> tuple[Samples, Fl
     omega[aimed] = _edges(wire, b.known.k_omega_d / sqrt(3), rng)[aimed]
     omega_d[aimed] = times(rotation(q[aimed]), omega[aimed])
 
-    q *= rng.choice([-1.0, 1.0], (COUNT, 1))  # the truth may be told with either sign
+    q *= rng.choice([-1.0, 1.0], (COUNT, 1))  # the truth may be given with either sign
     attitude, rate = wire.attitude.quantizer(), wire.rate.quantizer()
     sent = [sent_vector((w, x, y, z)) for w, x, y, z in q.tolist()]
     q_Q = np.array([received_quaternion(*_quantized(attitude, eps), IDENTITY) for eps in sent])

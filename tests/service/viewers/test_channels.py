@@ -241,7 +241,7 @@ def test_a_body_with_three_motors_and_no_quantizer_shows_all_three() -> None:
     assert list(said(shown).values()) == [1.5, -24.0, 0.0, False, True, False]
 
 
-# ── what was told ──
+# ── what was published ──
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -262,9 +262,9 @@ def test_tracking_has_the_measured_attitude_where_the_error_puts_it(sign: int) -
     assert fields(found["/aero/desired_tf"].data)[3] == [b"aero_desired"]
 
 
-def test_the_truth_is_shown_as_the_emulator_told_it() -> None:
-    told = Truth(tick=1, attitude=ATTITUDE, rate=(radians(1.0), radians(-2.0), 0.0), voltages=(1.0, 2.0))
-    (shown,) = configured().take(address("truth"), told.encode(), NOW)
+def test_the_truth_is_shown_as_the_emulator_published_it() -> None:
+    truth = Truth(tick=1, attitude=ATTITUDE, rate=(radians(1.0), radians(-2.0), 0.0), voltages=(1.0, 2.0))
+    (shown,) = configured().take(address("truth"), truth.encode(), NOW)
     assert said(shown) == {
         "roll_deg": pytest.approx(degrees(ROLL), abs=1e-3),
         "pitch_deg": pytest.approx(degrees(PITCH), abs=1e-3),
@@ -293,10 +293,10 @@ def test_a_status_shows_state_and_recent_times_and_a_plants_brings_the_body() ->
 
 @pytest.mark.parametrize(("kind", "rotors", "stands"), [("aero", 2, 1), ("rigid_body", 0, 0)])
 def test_the_body_hangs_in_the_frame_that_its_transform_moves(kind: str, rotors: int, stands: int) -> None:
-    told = description()
-    told.config["plant"]["kind"] = kind
+    described = description()
+    described.config["plant"]["kind"] = kind
     decoder = Decoder(None)
-    decoder.configure(told)
+    decoder.configure(described)
     scene = by_topic(decoder.take(address("status"), STATUS.encode(), NOW))["/aero/scene"]
     entities = [fields(entity) for entity in fields(scene.data)[2]]
     body, desired, *others = entities

@@ -160,7 +160,7 @@ def test_what_streams_comes_at_the_pace_that_was_asked_for_and_never_twice(setti
     assert times[-1] - times[0] > 7 * 50_000_000
 
 
-def test_a_viewer_that_never_reads_keeps_nobody_waiting() -> None:
+def test_a_viewer_that_never_reads_delays_no_other() -> None:
     """40 MB go to it, far more than sockets and the server's backlog hold."""
     shape = SHAPES["log"]
     with (
@@ -195,7 +195,7 @@ def await_subscribers(outlet: FoxgloveServer, viewer: Viewer) -> None:
     sender.join()
 
 
-def test_a_stopped_server_says_goodbye_and_frees_its_port(settings: Settings) -> None:
+def test_a_stopped_server_closes_its_connections_and_frees_its_port(settings: Settings) -> None:
     with ExitStack() as stack:
         with serving(settings.network) as url:
             viewer = stack.enter_context(Viewer(url))
@@ -232,7 +232,7 @@ def test_a_port_in_use_is_one_clear_line(settings: Settings, capfd: pytest.Captu
 
 
 @pytest.mark.processes
-def test_the_command_says_where_it_is_and_stops_on_a_signal(settings: Settings) -> None:
+def test_the_command_prints_its_address_and_stops_on_a_signal(settings: Settings) -> None:
     """A process of its own; it may take 20 s to start and to stop, where a second is enough."""
     command = [sys.executable, "-P", "-m", "aeroloop", "log", "live", "--port", "0"]
     command += ["--set", f"network.rendezvous={settings.network.rendezvous}"]

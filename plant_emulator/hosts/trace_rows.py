@@ -19,13 +19,9 @@ from aeroloop.protocol.wire.transmit import SILENCE
 
 
 class PlantTrace:
-    """Writer of one plant end's trace.
+    """Writer of one plant end's trace; `publish` is called with every batch.
 
-    Args:
-        loop: Loop settings, with the time between batches.
-        wire: Format of the frames.
-        publish: Called with every batch.
-        run: Random number that identifies this process; drawn if None.
+    `run` is the random number that identifies this process; drawn if None.
     """
 
     def __init__(
@@ -39,11 +35,7 @@ class PlantTrace:
     def row(self, end: Tenancy, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """Add the row of the last tick, and publish a batch that is due. Nothing without a session.
 
-        Args:
-            end: The plant end after the tick.
-            measurement: The endpoint's frame; SILENCE if it is not to be sent, None if the tick tripped.
-            arrival: The command received since the last tick; None for none.
-            sent_ns: When the measurement was sent, on the monotonic clock [ns].
+        The arguments are those of `Front.after_tick`; `measurement` is None if the tick tripped.
         """
         writer = self._writer
         if not writer.session:
@@ -62,7 +54,7 @@ class PlantTrace:
             1 if measurement else 0 if measurement is None else 2,
             received_as,
             end.outcome,
-            end.trip.number if end.session is None and end.trip is not None else 0,
+            0 if end.session or end.trip is None else end.trip.number,
             end.answered,
             sent_ns,
             received_ns,
