@@ -27,7 +27,7 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Eve
 from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.throttle import Throttle
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -68,6 +68,7 @@ class Role:
         self.vehicle = vehicle
         self.name = name or role
         self.stop = threading.Event()
+        self._network = network
         self.zenoh = join(network)
         self._status = b""
         self._publishers: dict[str, CachedPublisher] = {}
@@ -91,6 +92,15 @@ class Role:
         """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
         notify_systemd("READY=1")
         self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
+
+    def refresh_links(self) -> None:
+        """Make Zenoh link again to peers that it failed to link to, by a session that joins the network and leaves it.
+
+        A peer known by gossip is connected to once. If that fails, as on a machine that stalls, the next attempt comes
+        when gossip changes (seen with zenoh 1.10: a controller without a link to its recorder for 341 s).
+        """
+        with suppress(NetworkError):
+            join(self._network).close()
 
     def stop_on_signals(self) -> None:
         """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""

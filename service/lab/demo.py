@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,9 +21,11 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.host.bandwidth import PayloadRate
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.review.review import review
-from aeroloop.service.testing.process_group import ProcessGroup, standalone
+from aeroloop.service.testing.process_group import ProcessGroup, ProcessGroupError, standalone
 
 REFRESH_S = 0.1
+CLAIM_WAIT_S = 60.0
+"""The controller claims the plant within a second here; a machine may stall."""
 
 
 @dataclass
@@ -98,8 +101,13 @@ def run_demo(
         processes.await_role("recorder")
         processes.await_role("plant")
         processes.start("controller")
+        deadline, claimed = time.monotonic() + CLAIM_WAIT_S, False
         while processes.running("controller") and not interrupted.wait(REFRESH_S):
             processes.check()
+            claimed = claimed or any(status.session for status in progress.statuses.values())
+            if not claimed and time.monotonic() > deadline:
+                states = ", ".join(f"{role} {status.state}" for role, status in sorted(progress.statuses.items()))
+                raise ProcessGroupError(f"no session began within {CLAIM_WAIT_S:g} s ({states}); try again")
             if show is not None:
                 show(progress)
         processes.check()

@@ -11,6 +11,7 @@ import pytest
 import zenoh
 from pydantic import ValidationError
 
+from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.network import NetworkError, NetworkSettings
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
@@ -146,3 +147,13 @@ def test_messages_bear_no_time_of_zenohs() -> None:
 def test_network_settings_out_of_bounds_are_refused_by_name(broken: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match=next(iter(broken))):
         NetworkSettings.model_validate(broken)
+
+
+def test_refreshing_links_leaves_the_network_as_it_was() -> None:
+    """A link that Zenoh failed to make cannot be brought about on purpose; that a refresh disturbs nothing can."""
+    settings = NetworkSettings(rendezvous=f"tcp/127.0.0.1:{free_port()}")
+    with Role("plant", "aero", settings, {}) as plant, Role("recorder", "aero", settings, {}) as recorder:
+        eventually("the link", lambda: str(recorder.zenoh.zid()) in map(str, plant.zenoh.info.peers_zid()))
+        before = {str(peer) for peer in plant.zenoh.info.peers_zid()}
+        recorder.refresh_links()
+        eventually("the old peers", lambda: {str(peer) for peer in plant.zenoh.info.peers_zid()} == before)
