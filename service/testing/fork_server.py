@@ -73,7 +73,8 @@ class ForkedProcess:
     def send_signal(self, sig: int) -> None:
         """Send a signal, unless it has ended."""
         if self.poll() is None:
-            os.kill(self.pid, sig)
+            with suppress(ProcessLookupError):  # ended, and its exit code is on the way
+                os.kill(self.pid, sig)
 
     def kill(self) -> None:
         """SIGKILL."""

@@ -57,6 +57,8 @@ def test_a_signal_ends_it_with_the_code_that_a_child_of_this_process_would_have(
         child.wait(0.01)
     for which in signals:
         child.send_signal(which)
+    while child.poll() is None:
+        child.send_signal(signal.SIGCONT)  # also between its end and the report of its exit code
     assert child.wait(PATIENCE_S) == code
     assert child.poll() == code
     child.kill()  # does nothing to one that has ended
