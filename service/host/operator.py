@@ -94,7 +94,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         if not answers:
             role = "plant" if topic in ("arm", "stop") else "controller"
             silent = [_unanswered(place) for place in here.silent()]
-            raise OperatorError("; ".join([f"no {role} of {vehicle} answers", *(silent or [_nobody(network)])]))
+            raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *silent]))
         done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
         if not done:
             raise OperatorError("; ".join(answer.text for answer in answers))
@@ -156,7 +156,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
     others = ("controller", "recorder")
     failures += [_unanswered(place) for place, process in unanswered if process is None or process.role not in others]
     if not answers and not failures:
-        failures.append(_nobody(network))
+        failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
     return Stopped([text for texts in answers.values() for text in texts], failures)
 
 
@@ -240,6 +240,6 @@ def _unanswered(place: str) -> str:
     return f"the {process} at {place} does not answer" if process else f"the process at {place} does not answer"
 
 
-def _nobody(network: NetworkSettings) -> str:
+def _nobody(network: NetworkSettings, subject: str = "no role") -> str:
     where = ", ".join([*network.rendezvous, *network.connect])
-    return f"no role answers at {where}; is an emulator or a controller running?"
+    return f"{subject} answers at {where}; is an emulator or a controller running?"

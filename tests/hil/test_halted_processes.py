@@ -1,0 +1,96 @@
+"""A process that is halted, killed or started again, whichever came first: operators, newcomers and the rest go on.
+
+The halted one holds its port, and the kernel accepts connections for it: nobody must wait for it.
+"""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Final, get_args
+
+import pytest
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.operator import Ask
+from aeroloop.protocol.transport.network import join
+from aeroloop.service.config import Settings, load
+from aeroloop.service.host.operator import OperatorError, gather, send, stop
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous
+from tests.hil.test_faults import PATIENT
+from tests.support.zenoh_network import eventually
+
+ROLES: Final = ("recorder", "plant", "controller")
+AT_REST: Final = "aero is at 0 V; `aeroloop op arm` lets it be driven again"
+
+
+def assert_operable(settings: Settings, missing: RoleName, *, halted: bool) -> None:
+    """Status, stop, arm and a newcomer work without one role; a halted one is named."""
+    network = settings.network
+    names = [f"the {missing} with pid "] if halted else []
+    statuses, silent = gather(network)
+    assert set(statuses["aero"]) >= set(ROLES) - {missing}
+    assert [line[: len(name)] for line, name in zip(silent, names, strict=True)] == names
+    for _ in range(2):  # the second time it is at 0 V already
+        answers, failures = stop(network)
+        if missing == "plant":
+            assert answers == []
+            assert len(failures) == 1
+            assert failures[0].startswith(names[0] if names else "no plant answers")
+        else:
+            assert (answers, failures) == ([AT_REST], [])
+    if missing == "plant":
+        with pytest.raises(OperatorError, match=names[0] if names else "no plant of aero answers"):
+            send(network, "aero", "arm", Ask())
+    else:
+        assert "aero is armed" in send(network, "aero", "arm", Ask())
+    with join(network) as newcomer:
+        found: set[str] = set()
+        subscriber = newcomer.declare_subscriber(topics.key("status", "aero"), lambda s: found.add(str(s.key_expr)))
+        expected = {topics.key("status", "aero", role=role) for role in ROLES if role != missing}
+        eventually("statuses at a newcomer", lambda: found >= expected)
+        subscriber.undeclare()
+
+
+@pytest.mark.parametrize("first", ROLES)
+def test_a_process_that_hangs_or_dies_keeps_no_operator_and_no_newcomer_out(tmp_path: Path, first: RoleName) -> None:
+    assert set(ROLES) < set(get_args(RoleName))
+    overrides = [f"{name}={value}" for name, value in PATIENT.items()]
+    log = f"recorder.path={tmp_path / 'a.mcap'}"
+    settings = load(overrides=[*overrides, log, f"network.rendezvous={free_rendezvous()}", "controller.auto_arm=true"])
+    with ProcessGroup(settings) as processes:
+
+        def all_run() -> bool:
+            states = {role: status.state for role, status in gather(settings.network).statuses["aero"].items()}
+            return states == {"recorder": "recording", "plant": "driven", "controller": "running"}
+
+        for role in (first, *(role for role in ROLES if role != first)):
+            processes.start(role)
+            if role != "controller":  # each has a token of its own
+                processes.await_role(role)
+        eventually("driving", all_run)
+        processes.signal(first, signal.SIGSTOP)
+        assert_operable(settings, first, halted=True)
+        processes.signal(first, signal.SIGCONT)
+        send_until_armed(settings)
+        eventually("driving, after it went on", all_run)
+        processes.stop(first, signal.SIGKILL)
+        assert_operable(settings, first, halted=False)
+        if first == "recorder":
+            processes.replace_log(tmp_path / "b.mcap")
+        processes.start(first)
+        send_until_armed(settings)
+        eventually("driving, after it was started again", all_run)
+
+
+def send_until_armed(settings: Settings) -> None:
+    """Arm the plant, unless it is driven already."""
+
+    def armed() -> bool:
+        try:
+            send(settings.network, "aero", "arm", Ask())
+        except OperatorError as error:
+            return "held by" in str(error)
+        return True
+
+    eventually("arming", armed)
