@@ -27,7 +27,7 @@ class NoNamespacesError(Exception):
 
 def _ip(*words: str) -> None:
     try:
-        subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+        subprocess.run(["ip", *words], check=True, capture_output=True, text=True)  # noqa: S607 - any ip will do
     except (OSError, subprocess.CalledProcessError) as error:
         raise NoNamespacesError(getattr(error, "stderr", None) or str(error)) from None
 
@@ -124,7 +124,8 @@ def _print_messages(rendezvous: list[str]) -> None:
 
     def received(sample: zenoh.Sample) -> None:
         message: dict[str, Any] = json.loads(sample.payload.to_bytes())
-        print(json.dumps({"key": str(sample.key_expr), **message}), flush=True)
+        sys.stdout.write(json.dumps({"key": str(sample.key_expr), **message}) + "\n")
+        sys.stdout.flush()
 
     with join(NetworkSettings(rendezvous=rendezvous), listen=False) as session:
         for topic in ("status", "event"):

@@ -1,0 +1,116 @@
+"""What a third party's troubles cost the loop: `uv run python -m tests.benchmarks.third_parties [TRIALS]`, as root.
+
+Plant, controller and third party are on hosts of their own (network namespaces), at 500 Hz with the default settings.
+Each trouble is repeated; printed are the sessions lost and the ticks skipped by both ends, trial by trial, beside those
+of as many undisturbed stretches of the same length.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from subprocess import Popen
+
+from tests.support.namespaces import Hosts
+
+AWAY_S = 2.0
+SETTLE_S = 3.0
+TRIALS = 10
+
+Parties = dict[str, Popen[bytes]]
+
+
+class Seen:
+    """Statuses and events in the file that a watcher on the plant's host writes."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def totals(self) -> tuple[int, int]:
+        """Sessions lost, and ticks skipped by both ends so far."""
+        lines = [json.loads(line) for line in self._path.read_text().splitlines() if line.endswith("}")]
+        skipped = {line["role"]: line["skipped"] for line in lines if "skipped" in line}
+        return sum(line.get("kind") == "tripped" for line in lines), skipped["plant"] + skipped["controller"]
+
+
+def main(trials: int) -> None:
+    """Run all troubles and print a line for each."""
+    with tempfile.TemporaryDirectory() as name, Hosts(["plant", "controller", "third"], Path(name)) as hosts:
+        folder = Path(name)
+        hosts.aeroloop("plant", "emulator")
+        hosts.aeroloop("controller", "controller", "--auto-arm")
+        hosts.start("plant", "-m", "tests.support.namespaces", json.dumps(hosts.rendezvous), stdout=folder / "seen")
+        seen, logs = Seen(folder / "seen"), count()
+
+        def recorder() -> Popen[bytes]:
+            return hosts.aeroloop("third", "recorder", "--log", str(folder / f"{next(logs)}.mcap"))
+
+        def operator() -> Popen[bytes]:
+            return hosts.aeroloop("third", "op", "top")
+
+        def cable_out(_: Parties) -> None:
+            hosts.pull("third")
+            time.sleep(AWAY_S)
+            hosts.plug("third")
+
+        def narrow(_: Parties) -> None:
+            hosts.narrow("third", 64)
+            time.sleep(2 * AWAY_S)
+            hosts.plug("third")
+
+        def halted(parties: Parties) -> None:
+            for party in parties.values():
+                party.send_signal(signal.SIGSTOP)
+            time.sleep(AWAY_S)
+            for party in parties.values():
+                party.send_signal(signal.SIGCONT)
+
+        def killed(parties: Parties) -> None:
+            for name, start in starts.items():
+                if name in parties:
+                    parties[name].kill()
+                    parties[name].wait()
+                    parties[name] = start()
+
+        def joins_and_leaves(_: Parties) -> None:
+            for party in (recorder(), operator()):
+                time.sleep(AWAY_S)
+                party.terminate()
+                party.wait()
+
+        starts: dict[str, Callable[[], Popen[bytes]]] = {"recorder": recorder, "operator": operator}
+        troubles: list[tuple[str, list[str], Callable[[Parties], None]]] = [
+            ("nothing", ["recorder", "operator"], lambda _: time.sleep(AWAY_S)),
+            ("the recorder's cable out for 2 s", ["recorder"], cable_out),
+            ("an operator's cable out for 2 s", ["operator"], cable_out),
+            ("a link of 64 kbit/s for 4 s", ["recorder", "operator"], narrow),
+            ("both halted for 2 s", ["recorder", "operator"], halted),
+            ("both killed and started again", ["recorder", "operator"], killed),
+            ("a recorder and an operator join and leave", [], joins_and_leaves),
+        ]
+        time.sleep(2 * SETTLE_S)
+        for title, names, happens in troubles:
+            parties = {name: starts[name]() for name in names}
+            time.sleep(2 * SETTLE_S)
+            lost, skipped = [], []
+            for _ in range(trials):
+                before = seen.totals()
+                happens(parties)
+                time.sleep(SETTLE_S)
+                after = seen.totals()
+                lost.append(after[0] - before[0])
+                skipped.append(after[1] - before[1])
+            for party in parties.values():
+                party.terminate()
+                party.wait()
+            print(f"{title:44} sessions lost {sum(lost)} of {trials}, ticks skipped {skipped}", flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if sys.argv[1:] else TRIALS)
