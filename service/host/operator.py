@@ -63,7 +63,7 @@ def gather(network: NetworkSettings) -> Statuses:
 
 
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Send a command to a vehicle's plant (`arm`, `stop`) or controller (`stand_down`, `set_gains`, `track`).
+    """Send a command to a vehicle's plant (`arm`, `stop`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
 
     `arm` also recalls controllers that are holding or faulted.
 
@@ -147,7 +147,7 @@ def _query(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic
                     return answer.text
             raise OperatorError("; ".join(answer.text for answer in answers))
         time.sleep(0.02)
-    role = "plant" if topic in ("arm", "stop") else "controller"
+    role = {"arm": "plant", "stop": "plant", "inject": "emulator"}.get(topic, "controller")
     raise OperatorError(f"no {role} of {vehicle} answers at {network.rendezvous}")
 
 
