@@ -20,7 +20,7 @@ Source = Literal["configured", "injected"]
 
 
 class Turn(NamedTuple):
-    """A fault's begin or end: when, in ticks of the plant's time, and one line that says what."""
+    """A fault's begin, end or injection: when, in ticks of the plant's time, and one line that says what."""
 
     tick: int
     text: str

@@ -66,8 +66,11 @@ class Emulator(Driver):
         self._add(settings.parsed_faults, "configured")
         self._session: str | None = None
 
-    def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> None:
+    def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
         """Add faults with start and end counted from now; if `clear`, remove all others first.
+
+        Returns:
+            What was done, a line each; they are events, too.
 
         Raises:
             ValueError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
@@ -83,8 +86,12 @@ class Emulator(Driver):
             self._publish(self._schedule.clear(self._faulty.ticks))
             self.endpoint.operated("inject", name=None)
         self._add(faults, "injected")
+        done = ["no faults any more"] if clear else []
         for fault in faults:
             self.endpoint.operated("inject", name=str(fault))
+            done.append(f"fault injected: {fault}")
+        self._publish([Turn(self._faulty.ticks, text) for text in done])
+        return done
 
     def fault_statuses(self) -> list[FaultStatus]:
         """Status of every fault."""
@@ -109,7 +116,7 @@ class Emulator(Driver):
             self._schedule.add(fault, source, applied)
 
     def _publish(self, turns: Sequence[Turn]) -> None:
-        """Queue the events of faults that began or ended, with the session's tick if there was one then."""
+        """Queue events of faults, with the session's tick if there was one then."""
         endpoint = self.endpoint
         for turn in turns:
             tick = endpoint.event_tick
@@ -189,14 +196,10 @@ class EmulatorOnZenoh(Emulator):
 
         def inject() -> Answer:
             try:
-                self.inject(faults, clear=request.clear)
+                done = self.inject(faults, clear=request.clear)
             except ValueError as error:
                 raise FaultError(str(error)) from None
-            texts = ["no faults any more"] if request.clear else []
-            texts += [f"fault injected: {fault}" for fault in faults]
-            for text in texts:
-                self._role.event("fault", text, self.endpoint.session, self.endpoint.event_tick)
-            return Answer(done=bool(texts), text="; ".join(texts) or "no fault was given")
+            return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
         return inject
 

@@ -125,7 +125,7 @@ class ZenohFront(Front):
             self._since = None
         elif any(notice.kind == "tripped" for notice in endpoint.notices):
             self._published_state = endpoint.state
-        self._since = _now()
+            self._since = _now()
         for notice in endpoint.notices:
             self._role.event(*notice)
         endpoint.notices.clear()

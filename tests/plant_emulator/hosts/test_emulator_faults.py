@@ -75,7 +75,9 @@ class Run(Stage):
 
     @property
     def events(self) -> list[Notice]:
-        return [notice for notice in self.endpoint.notices if notice.kind == "fault"]
+        """Events of begins and ends."""
+        faults = [notice for notice in self.endpoint.notices if notice.kind == "fault"]
+        return [notice for notice in faults if notice.text.startswith(("fault begins", "fault ends"))]
 
     def column(self, name: str) -> np.ndarray:
         return np.concatenate([batch.columns[name] for batch in self.batches if batch.header.rows])
