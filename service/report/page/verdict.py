@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,7 +24,11 @@ def judgement(run: Findings) -> Judgement:
     found = _judgement(run)
     if not run.faults:
         return found
-    because = f"{found.because} {_count(len(run.faults), 'fault')} acted at the plant."
+    changed: Counter[str] = Counter()
+    for fault in run.faults:
+        changed[fault.effect] += fault.changed
+    counts = ", ".join(f"{count:,} {effect}" for effect, count in changed.items())
+    because = f"{found.because} {_count(len(run.faults), 'fault')} acted at the plant: {counts}."
     return Judgement(f"{found.word}, with faults", found.good, because)
 
 

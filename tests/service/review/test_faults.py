@@ -12,6 +12,7 @@ from aeroloop.protocol.messages.models import FaultStatus, Status
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.logs.runs import Block
+from aeroloop.service.report.page.page import page
 from aeroloop.service.report.page.verdict import judgement
 from aeroloop.service.review.faults import FaultLog
 from aeroloop.service.review.report import Band, FaultInterval, Findings
@@ -72,12 +73,20 @@ def test_the_verdict_and_the_bands_name_the_faults(faulty: Path) -> None:
     review = read(faulty)
     found = judgement(review.findings)
     assert found.word == "Tracked, with faults"
-    assert "3 faults acted" in found.because
+    counts = f"{review.findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
+    assert f"3 faults acted at the plant: {counts}." in found.because
     assert list(review.report().bands) == [
         Band(0.2, 0.6, "command:drop=0.3@0.2..0.6"),
         Band(0.648, 0.898, "motor1:bias=0.5@0.05"),
         Band(0.8, 0.898, "rate:noise=0.001@0.8"),
     ]
+
+
+def test_the_page_has_each_fault_with_its_times_and_counts(faulty: Path) -> None:
+    html = page([read(faulty).report()])
+    row = html[html.index("<td>motor1:bias=0.5@0.05</td>") - 600 :][:900]
+    for cell in ('data-time="0.648"', 'data-time="0.898"', "<td>injected</td>", "125 voltages shifted"):
+        assert cell in row
 
 
 def test_a_run_without_faults_or_with_faults_to_come_says_nothing_of_them(tmp_path: Path) -> None:
