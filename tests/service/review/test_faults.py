@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import FaultStatus, Status
+from aeroloop.service import examples
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.logs.runs import Block
@@ -52,6 +53,16 @@ def test_every_fault_that_acted_is_listed_with_its_ticks_and_what_it_changed(fau
             effect="samples made noisy",
         ),
     ]  # fmt: skip
+
+
+def test_the_shipped_example_shows_its_dropped_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example = Path(examples.__path__[0]) / "faults.toml"
+    make_log(tmp_path / "a.mcap", 1500, settings=load(example))
+    assert execute(["log", "review", str(tmp_path / "a.mcap")]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    dropped = read(tmp_path / "a.mcap").findings.lapses["withheld"]
+    assert 20 < dropped < 90  # a tenth of 500
+    assert f"with faults command:drop=0.1@2 from 2.000 s to the end, {dropped} commands dropped (configured)" in text
 
 
 def test_without_any_event_the_intervals_are_the_same(faulty: Path, tmp_path: Path) -> None:
