@@ -40,7 +40,9 @@ def plant(capsys: pytest.CaptureFixture[str]) -> Iterator[tuple[Inject, Callable
         def faults() -> list[str]:
             for reply in zenoh.get(topics.key("status", "aero", role="plant"), timeout=PATIENCE_S):
                 if reply.ok is not None:
-                    return [fault.fault for fault in Status.model_validate_json(reply.ok.payload.to_bytes()).faults]
+                    status = Status.model_validate_json(reply.ok.payload.to_bytes())
+                    assert status.since is None  # it is of the cause why a plant is not armed, which no fault is
+                    return [fault.fault for fault in status.faults]
             return []
 
         try:
