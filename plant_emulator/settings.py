@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 
 from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.faults.schedule import MAX_FAULTS
 from aeroloop.plant_emulator.faults.signals import FaultyPlant
 from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
@@ -54,7 +55,9 @@ class PlantSettings(BaseModel, extra="forbid"):
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
     substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
     faults: list[str] = Field(
-        default=[], description="faults: signal:kind[=value][@start[..end]], in s since the first claim was granted"
+        default=[],
+        max_length=MAX_FAULTS,
+        description="faults: signal:kind[=value][@start[..end]], in s since the first claim was granted",
     )
     fault_seed: int = Field(default=0, ge=0, description="of the faults' random numbers")
     steps_on_request: bool = Field(

@@ -18,12 +18,12 @@ reorder=p                                                                      a
 
 p is the probability per sample, period or frame. `attitude` and `rate` take an axis of the body, `.x .y .z`; bias and
 noise of the attitude are rotations about the body's axes. Motors are numbered from 1 in the order of the commanded
-voltages; `motors` fails all of them at the same times.
+voltages; `motors` fails all of them at the same times. README.md has the limits of the values, with their reasons.
 """
 
 from __future__ import annotations
 
-from math import inf, isfinite, ulp
+from math import ceil, ulp
 from typing import Final, Literal, NamedTuple, TypeAlias, get_args
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
@@ -32,6 +32,14 @@ Kind: TypeAlias = Literal["off", "stuck", "bias", "noise", "delay", "drop", "gar
 Whole: TypeAlias = Literal["attitude", "rate", "motors", "measurement", "command"]
 
 MAX_DELAY_S: Final = 10.0
+MAX_TIME_S: Final = 1e8
+"""Latest begin and end [s]; three years."""
+MAX_ANGLE: Final = 3.1416
+"""Largest bias and noise of an attitude [rad]: half a turn, π rounded up."""
+MAX_RATE: Final = 35.0
+"""Largest bias and noise of an angular velocity [rad/s]: 2000 °/s, the full scale of common gyroscopes."""
+MAX_VOLTS: Final = 48.0
+"""Largest bias and noise of a voltage [V]: from one end of the Aero's supply of ±24 V to the other."""
 MAX_MOTORS: Final = 3
 
 
@@ -69,15 +77,38 @@ SIGNALS: Final[dict[str, Signal]] = {
 
 _PROBABILITY = (ulp(0.0), 1.0, "a probability above 0 and up to 1")
 _VALUES: Final[dict[Kind, tuple[float, float, str]]] = {
-    "bias": (-inf, inf, "a finite number"),
-    "noise": (0.0, inf, "a finite number from 0 up"),
     "delay": (0.0, MAX_DELAY_S, f"0 to {MAX_DELAY_S:g} s"),
     "drop": _PROBABILITY,
     "garble": _PROBABILITY,
     "duplicate": _PROBABILITY,
     "reorder": _PROBABILITY,
 }
-"""Range of each kind's value, in numbers and in words. Other kinds take no value."""
+"""Range of each kind's value, in numbers and in words; of bias and noise, `_SIZES` has it. Others take no value."""
+_SIZES: Final[dict[Whole, tuple[float, str]]] = {
+    "attitude": (MAX_ANGLE, "rad"),
+    "rate": (MAX_RATE, "rad/s"),
+    "motors": (MAX_VOLTS, "V"),
+}
+"""Largest bias and noise of each signal, and their unit."""
+
+_CHANGES: Final[dict[Kind, str]] = {
+    "off": "dropped",
+    "stuck": "replaced by the last",
+    "bias": "shifted",
+    "noise": "made noisy",
+    "delay": "delayed",
+    "drop": "dropped",
+    "garble": "garbled",
+    "duplicate": "duplicated",
+    "reorder": "reordered",
+}
+_CHANGED: Final[dict[Whole, str]] = {
+    "attitude": "samples",
+    "rate": "samples",
+    "motors": "voltages",
+    "measurement": "measurements",
+    "command": "commands",
+}
 
 
 class Fault(BaseModel, frozen=True, extra="forbid"):
@@ -135,6 +166,11 @@ class Fault(BaseModel, frozen=True, extra="forbid"):
         """Signal that the fault acts on."""
         return SIGNALS[self.signal]
 
+    @property
+    def effect(self) -> str:
+        """What it does to what, after a number: `commands dropped`."""
+        return f"{_CHANGED[self.target.whole]} {_CHANGES[self.kind]}"
+
     def active(self, t: float) -> bool:
         """Whether it acts at time t [s]: start ≤ t < end."""
         return self.start_s <= t and not self.over(t)
@@ -171,31 +207,46 @@ class Fault(BaseModel, frozen=True, extra="forbid"):
     def _is_what_the_kind_takes(cls, value: float | None, info: ValidationInfo) -> float | None:
         if (kind := info.data.get("kind")) is None:
             return value
-        if kind not in _VALUES:
-            if value is not None:
-                raise ValueError(f"{kind} takes no value, but was given {_text(value)}: write {kind} alone")
+        if kind in ("bias", "noise"):
+            high, unit = _SIZES[SIGNALS[info.data["signal"]].whole]
+            low = 0.0 if kind == "noise" else -high
+            words = f"{low:g} to {high:g} {unit}"
+        elif kind in _VALUES:
+            low, high, words = _VALUES[kind]
+        elif value is None:
             return value
-        low, high, words = _VALUES[kind]
+        else:
+            raise ValueError(f"{kind} takes no value, but was given {_text(value)}: write {kind} alone")
         if value is None:
             raise ValueError(f"{kind} takes {words}: write {kind}=0.1, say")
-        if not (isfinite(value) and low <= value <= high):
+        if not low <= value <= high:
             raise ValueError(f"{kind} takes {words}, not {_text(value)}")
         return value
 
     @field_validator("start_s")
     @classmethod
     def _starts_in_time(cls, start: float) -> float:
-        if not (isfinite(start) and start >= 0):
-            raise ValueError(f"it must begin at 0 s or later, not at {_text(start)} s")
+        if not 0 <= start <= MAX_TIME_S:
+            raise ValueError(f"it must begin within 0 to {MAX_TIME_S:g} s, not at {_text(start)} s")
         return start
 
     @field_validator("end_s")
     @classmethod
     def _ends_after_its_start(cls, end: float | None, info: ValidationInfo) -> float | None:
         start = info.data.get("start_s")
-        if end is not None and start is not None and not (isfinite(end) and end > start):
-            raise ValueError(f"it must end after it begins at {_text(start)} s, not at {_text(end)} s")
+        if end is not None and start is not None and not start < end <= MAX_TIME_S:
+            raise ValueError(
+                f"it must end after it begins at {_text(start)} s and by {MAX_TIME_S:g} s, not at {_text(end)} s"
+            )
         return end
+
+
+def first_tick(time_s: float, period: float) -> int:
+    """The first tick at or after a time [s]. Tick n is at n·period, rounded to the nanosecond."""
+    tick = max(0, ceil(time_s / period) - 1)
+    while round(tick * period, 9) < time_s:
+        tick += 1
+    return tick
 
 
 def _number(text: str) -> float:

@@ -30,12 +30,17 @@ class ValueFault:
 
     `size` is the number of components of an error, `last` the values just before, if there are any, and `bound` the
     largest size of a garbled value.
+
+    Attributes:
+        fault: The fault, in the plant's time.
+        changed: Samples, or voltages of a period, on which it has acted.
     """
 
     def __init__(
         self, fault: Fault, random: np.random.Generator, size: int, last: Values | None, bound: float = GARBLED_RATE
     ) -> None:
         self.fault = fault
+        self.changed = 0
         self._bound = bound
         self._value = 0.0 if fault.value is None else fault.value
         self._random, self._size, self._last = random, size, last
@@ -50,6 +55,9 @@ class ValueFault:
         if not self.fault.active(t):
             self._last = values
             return values
+        if kind in ("drop", "garble") and self._random.random() >= self._value:
+            return values
+        self.changed += 1
         if kind == "delay":
             return self.replaced(values, delayed)
         if kind == "stuck":
@@ -60,11 +68,7 @@ class ValueFault:
         if kind == "noise":
             noise: list[float] = (self._value * self._random.standard_normal(self._size)).tolist()
             return self.shifted(values, self._within_parts(noise))
-        if kind == "off":
-            return self.missing(values)
-        if self._random.random() >= self._value:
-            return values
-        return self.missing(values) if kind == "drop" else self.replaced(values, self.garbled())
+        return self.replaced(values, self.garbled()) if kind == "garble" else self.missing(values)
 
     def missing(self, values: Values) -> Values:
         """No valid value, on all axes: a rate with one axis missing is invalid."""
@@ -126,16 +130,10 @@ class MotorFault(ValueFault):
     """A fault of the motors' voltages [V].
 
     `last` are the motors' present voltages [V], shape (actuators,); `limit` is the largest garbled voltage [V].
-
-    Raises:
-        ValueError: The plant has no such motor.
     """
 
     def __init__(self, fault: Fault, random: np.random.Generator, last: Values, limit: float) -> None:
         super().__init__(fault, random, len(last), last, limit)
-        if self._parts.stop > len(last):
-            there = ", ".join(f"motor{i + 1}" for i in range(len(last)))
-            raise ValueError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
 
     def missing(self, values: Values) -> Values:
         """0 V."""
@@ -185,13 +183,27 @@ class FaultyPlant(Plant):
             self._started = True
             self._seen = None
 
-    def inject(self, fault: Fault) -> None:
+    @property
+    def ticks(self) -> int:
+        """Periods since `start`; −1 before."""
+        return self._ticks if self._started else -1
+
+    def check(self, fault: Fault) -> None:
+        """Raise ValueError if it is a fault of a motor that the plant does not have."""
+        if fault.target.whole == "motors" and (fault.target.part or 0) >= self.actuators:
+            there = ", ".join(f"motor{i + 1}" for i in range(self.actuators))
+            raise ValueError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
+
+    def inject(self, fault: Fault) -> ValueFault | None:
         """Add a fault with start and end counted from now. The current sample stays unchanged.
+
+        Returns:
+            What applies it; None for a fault of a stream.
 
         Raises:
             ValueError: A fault of a motor that the plant does not have.
         """
-        self._attach(fault.later(self.time))
+        return self._attach(fault.later(self.time))
 
     def clear(self) -> None:
         """Remove all faults and put the commanded voltages on the motors."""
@@ -254,16 +266,23 @@ class FaultyPlant(Plant):
         a, b, c = rate
         return Measurement((w, x, y, z), (a, b, c))
 
-    def _attach(self, fault: Fault) -> None:
+    def _attach(self, fault: Fault) -> ValueFault | None:
+        self.check(fault)
         whole, seen = fault.target.whole, self._seen
         random = generator(self._seed, self._attached, fault)
-        if whole == "motors":
-            self._motors.append(MotorFault(fault, random, self._applied, self._limit))
-        elif whole == "attitude":
-            self._sensors.append(AttitudeFault(fault, random, 3, seen.attitude if seen else None))
-        elif whole == "rate":
-            self._sensors.append(ValueFault(fault, random, 3, seen.rate if seen else None))
         self._attached += 1
+        if whole == "motors":
+            self._motors.append(motor := MotorFault(fault, random, self._applied, self._limit))
+            return motor
+        if whole not in ("attitude", "rate"):
+            return None
+        sensor = (
+            AttitudeFault(fault, random, 3, seen.attitude if seen else None)
+            if whole == "attitude"
+            else ValueFault(fault, random, 3, seen.rate if seen else None)
+        )
+        self._sensors.append(sensor)
+        return sensor
 
 
 def generator(seed: int, number: int, fault: Fault) -> np.random.Generator:

@@ -16,10 +16,16 @@ from aeroloop.plant_emulator.faults.signals import generator
 
 
 class StreamFault:
-    """A fault of frames; `last` is the frame that passed last, if there was one."""
+    """A fault of frames; `last` is the frame that passed last, if there was one.
+
+    Attributes:
+        fault: The fault, in the plant's time.
+        changed: Frames that it has dropped, delayed, garbled and so on.
+    """
 
     def __init__(self, fault: Fault, random: np.random.Generator, last: bytes | None) -> None:
         self.fault = fault
+        self.changed = 0
         self._value = 0.0 if fault.value is None else fault.value
         self._random, self._last = random, last
         self._held: deque[tuple[float, bytes]] = deque()  # due time [s] and frame
@@ -40,7 +46,7 @@ class StreamFault:
             case "drop":
                 return [frame for frame in frames if not self._happens(t)]
             case _:
-                return [] if self.fault.active(t) else frames
+                return [frame for frame in frames if not self._active(t)]
 
     def done(self, t: float) -> bool:
         """Whether it has ended by time t [s] and holds nothing back."""
@@ -50,12 +56,22 @@ class StreamFault:
         """Drop the frames held back."""
         self._held.clear()
 
+    def _active(self, t: float) -> bool:
+        """Whether it acts on a frame, which is counted, whatever it is."""
+        active = self.fault.active(t)
+        self.changed += active
+        return active
+
     def _happens(self, t: float) -> bool:
-        return self.fault.active(t) and bool(self._random.random() < self._value)
+        """Whether chance has it act on a frame, which is counted."""
+        happens = self.fault.active(t) and bool(self._random.random() < self._value)
+        self.changed += happens
+        return happens
 
     def _delayed(self, frames: list[bytes], t: float) -> list[bytes]:
         """When the fault ends, all held frames pass at once, ahead of the newer ones."""
         active = self.fault.active(t)
+        self.changed += active * len(frames)
         self._held.extend((round(t + self._value, 9), frame) for frame in frames)
         passed = []
         while self._held and (not active or self._held[0][0] <= t):
@@ -84,6 +100,7 @@ class StreamFault:
         if not self.fault.active(t):
             self._last = frames[-1]
             return frames
+        self.changed += len(frames)
         if self._last is None:
             self._last = frames[0]
         return [self._last] * len(frames)
@@ -122,12 +139,14 @@ class FaultyStream:
             self._last = frames[-1]
         return frames
 
-    def inject(self, fault: Fault, now: float) -> None:
-        """Add a fault with start and end counted from `now` [s], if it is of this signal."""
-        if fault.signal == self._signal:
-            random = generator(self._seed, self._attached, fault)
-            self._faults.append(StreamFault(fault.later(now), random, self._last))
-            self._attached += 1
+    def inject(self, fault: Fault, now: float) -> StreamFault | None:
+        """Add a fault with start and end counted from `now` [s]; None if it is not of this signal."""
+        if fault.signal != self._signal:
+            return None
+        random = generator(self._seed, self._attached, fault)
+        self._faults.append(added := StreamFault(fault.later(now), random, self._last))
+        self._attached += 1
+        return added
 
     def forget(self) -> None:
         """Drop the frames held back: they belong to the last session's keys."""

@@ -196,6 +196,7 @@ class Bridge:
         self._arrival: Arrival | None = None  # the last command since the last tick
         self._machine_notes: list[str] = []
         self._granted_ns = 0
+        self._faults = settings.faults
 
     def run(self) -> None:
         """Run until the role stops; then release the node and publish a last status."""
@@ -203,6 +204,9 @@ class Bridge:
         if not self._loop.lockstep:
             front.notes = self._machine_notes = prepare_process(self._loop)
         front.serve()
+        if self._faults:
+            text = f"an emulated node has faults whose begin and end are not published: {', '.join(self._faults)}"
+            self._role.event("fault", text)
         try:
             while not self._role.stop.is_set():
                 with self._changed:

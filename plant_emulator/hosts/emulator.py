@@ -1,24 +1,28 @@
 """Emulator: a driver with a computed plant and injectable faults.
 
 Faults act on the plant's sensors and motors, on measurements before they are sent and on commands after they were
-received. On Zenoh it also publishes the true state, accepts faults while it runs, and steps on request in lockstep.
+received; an event says when each begins and when it ends. On Zenoh the emulator also publishes the true state, accepts
+faults while it runs, and steps on request in lockstep.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.endpoint.tenancy import Notice
 from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.faults.schedule import Schedule, Source, Turn
+from aeroloop.plant_emulator.faults.signals import FaultyPlant
 from aeroloop.plant_emulator.faults.streams import FaultyStream
 from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.link import Arrival
@@ -53,28 +57,72 @@ class Emulator(Driver):
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
         self._emulated = settings.build(loop.period)
-        self._faulty = settings.with_faults(self._emulated, loop.period)
+        limit, seed = settings.voltage_limit, settings.fault_seed
+        self._faulty = FaultyPlant(self._emulated, (), loop.period, voltage_limit=limit, seed=seed)
         super().__init__(self._faulty, loop, wire, settings, stop)
-        faults = settings.parsed_faults
-        self._measurements = FaultyStream("measurement", faults, settings.fault_seed)
-        self._commands = FaultyStream("command", faults, settings.fault_seed)
+        self._measurements = FaultyStream("measurement", (), seed)
+        self._commands = FaultyStream("command", (), seed)
+        self._schedule = Schedule(loop.period)
+        self._add(settings.parsed_faults, "configured")
         self._session: str | None = None
 
-    def inject(self, fault: Fault | None) -> None:
-        """Add a fault with start and end counted from now; None removes all faults.
+    def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
+        """Add faults with start and end counted from now; if `clear`, remove all others first.
+
+        Returns:
+            What was done, a line each; they are events, too.
 
         Raises:
-            ValueError: A fault of a motor that the plant does not have.
+            ValueError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
         """
-        if fault is None:
+        for fault in faults:
+            self._faulty.check(fault)
+        if not clear:
+            self._schedule.make_room(len(faults))
+        else:
             self._faulty.clear()
             self._measurements.clear()
             self._commands.clear()
-        else:
-            self._faulty.inject(fault)
-            self._measurements.inject(fault, self._faulty.time)
-            self._commands.inject(fault, self._faulty.time)
-        self.endpoint.operated("inject", name=None if fault is None else str(fault))
+            self._publish(self._schedule.clear(self._faulty.ticks))
+            self.endpoint.operated("inject", name=None)
+        self._add(faults, "injected")
+        done = ["no faults any more"] if clear else []
+        for fault in faults:
+            self.endpoint.operated("inject", name=str(fault))
+            done.append(f"fault injected: {fault}")
+        self._publish([Turn(self._faulty.ticks, text) for text in done])
+        return done
+
+    def fault_statuses(self) -> list[FaultStatus]:
+        """Status of every fault."""
+        ticks = self._faulty.ticks
+        return self._schedule.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
+
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """Tick the plant end, and note the faults that began or ended."""
+        measurement = super().tick(frame, k)
+        if self._faulty.ticks >= self._schedule.due:
+            self._publish(self._schedule.turns(self._faulty.ticks))
+        return measurement
+
+    def _add(self, faults: Sequence[Fault], source: Source) -> None:
+        now = self._faulty.time
+        self._schedule.make_room(len(faults))
+        for fault in faults:
+            applied = (
+                self._faulty.inject(fault) or self._measurements.inject(fault, now) or self._commands.inject(fault, now)
+            )
+            assert applied is not None
+            self._schedule.add(fault, source, applied)
+
+    def _publish(self, turns: Sequence[Turn]) -> None:
+        """Queue events of faults, with the session's tick if there was one then."""
+        endpoint = self.endpoint
+        for turn in turns:
+            tick = endpoint.event_tick
+            if tick is not None:
+                tick = max(0, tick + turn.tick - self._faulty.ticks)
+            endpoint.notices.append(Notice("fault", turn.text, endpoint.session, tick))
 
     def _incoming(self, frame: bytes | None) -> bytes | None:
         session = self.endpoint.session
@@ -108,9 +156,9 @@ class EmulatorOnZenoh(Emulator):
 
     def run(self, front: Front | None = None) -> None:
         """Run until the role stops; then set 0 V and publish a last status."""
-        self._role.serve("inject", Inject, lambda inject: self._inject(inject.fault))
+        self._role.serve("inject", Inject, self._inject)
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        super().run(front or ZenohFront(self._role, self._loop, self.endpoint))
+        super().run(front or ZenohFront(self._role, self._loop, self.endpoint, faults=self.fault_statuses))
 
     def reconfigure(self, settings: PlantSettings) -> None:
         """Apply limits, watchdog and the rate of true states."""
@@ -140,20 +188,18 @@ class EmulatorOnZenoh(Emulator):
 
     # ── queries `inject` and `advance`, for tests ──
 
-    def _inject(self, text: str | None) -> Callable[[], Answer]:
+    def _inject(self, request: Inject) -> Callable[[], Answer]:
         try:
-            fault = Fault.parse(text) if text is not None else None
+            faults = [Fault.parse(text) for text in request.faults]
         except ValueError as error:
             raise FaultError(str(error)) from None
 
         def inject() -> Answer:
             try:
-                self.inject(fault)
+                done = self.inject(faults, clear=request.clear)
             except ValueError as error:
                 raise FaultError(str(error)) from None
-            text = "no faults any more" if fault is None else f"fault injected: {fault}"
-            self._role.event("fault", text, self.endpoint.session, self.endpoint.event_tick)
-            return Answer(done=True, text=text)
+            return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
         return inject
 

@@ -221,7 +221,8 @@ class PlantReplay:
                 assert operation.cause is not None
                 endpoint.expire(operation.cause, operation.reason or "")
             case "inject":
-                emulator.inject(None if operation.name is None else Fault.parse(operation.name))
+                fault = operation.name
+                emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
             case "reconfigure":
                 changed = operation.settings or {}
                 limits = LimitSettings.model_validate(changed["limits"])

@@ -8,6 +8,7 @@ takes them between ticks, so that only one thread uses the endpoint.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from threading import Condition
@@ -20,7 +21,7 @@ from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, Status
+from aeroloop.protocol.messages.models import Claim, FaultStatus, Grant, Refusal, Release, Status
 from aeroloop.protocol.messages.operator import Answer, Ask
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s
@@ -36,11 +37,20 @@ STATUS_PERIOD_NS: Final = 1_000_000_000
 class ZenohFront(Front):
     """A plant end, an Endpoint or the bridge's Relay, on the network.
 
-    `changed` is notified when a command arrives, for an owner that waits for more than one thing.
+    `changed` is notified when a command arrives, for an owner that waits for more than one thing; `faults` returns the
+    status of an emulator's faults.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, endpoint: Tenancy, changed: Condition | None = None) -> None:
+    def __init__(
+        self,
+        role: Role,
+        loop: LoopSettings,
+        endpoint: Tenancy,
+        changed: Condition | None = None,
+        faults: Callable[[], list[FaultStatus]] = list,
+    ) -> None:
         super().__init__()
+        self._faults = faults
         self._role = role
         self._loop = loop
         self._endpoint = endpoint
@@ -123,7 +133,7 @@ class ZenohFront(Front):
             self._since = None
         elif any(notice.kind == "tripped" for notice in endpoint.notices):
             self._published_state = endpoint.state
-        self._since = _now()
+            self._since = _now()
         for notice in endpoint.notices:
             self._role.event(*notice)
         endpoint.notices.clear()
@@ -215,6 +225,7 @@ class ZenohFront(Front):
                 recent_latency_us=summary(self._latency.recent()),
                 timing=report(self.timing) if self.timing else None,
                 notes=self.notes,
+                faults=self._faults(),
             )
         )
         self._status_tick, self._status_time = endpoint.ticked, now

@@ -106,6 +106,17 @@ class Timing(Message):
     recent_period: Percentiles | None = Field(description="`period`, last 10 s")
 
 
+class FaultStatus(Message):
+    """A fault of an emulated plant. Ticks are the plant's since its start, as in the trace's rows."""
+
+    fault: str = Field(description="as it was configured or injected: signal:kind[=value][@start[..end]]")
+    source: Literal["configured", "injected"]
+    begin_tick: int | None = Field(description="first tick of its action; null before the first claim")
+    end_tick: int | None = Field(description="first tick after it; null if none is known")
+    changed: int = Field(description="frames, samples or voltages that it has changed since the plant's start")
+    effect: str = Field(description="what it changes, and how: `commands dropped`")
+
+
 class Status(Message):
     """State and counters of a role; the last one before it ends has the final counts."""
 
@@ -136,6 +147,9 @@ class Status(Message):
     )
     timing: Timing | None = Field(default=None, description="timing of the loop; null in lockstep")
     notes: list[str] = Field(default_factory=list, description="settings that the host refused")
+    faults: list[FaultStatus] = Field(
+        default_factory=list, description="emulated plant: faults that act, have acted, or are to come"
+    )
 
 
 class Telemetry(Message):

@@ -140,9 +140,12 @@ class Change(Message):
 
 
 class Inject(Message):
-    """Inject a fault into an emulated plant, now; null clears all faults."""
+    """Inject faults into an emulated plant, all between the same two ticks or, if one is refused, none."""
 
-    fault: str | None = Field(description="signal:kind[=value][@start[..end]], seconds from now")
+    faults: list[Annotated[str, Field(max_length=200)]] = Field(
+        default_factory=list, max_length=64, description="each signal:kind[=value][@start[..end]], seconds from now"
+    )
+    clear: bool = Field(default=False, description="first remove all faults, configured ones too")
 
 
 class Advance(Message):

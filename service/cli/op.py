@@ -91,6 +91,36 @@ def release(config: Config = None, overrides: Overrides = None) -> None:
     _send(settings_of(config, overrides), "stand_down")
 
 
+@group.command()
+def inject(
+    faults: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="FAULT",
+            help="signal:kind[=value][@start[..end]], in s from now, such as rate:off@1..2 or command:drop=0.1.",
+            show_default=False,
+        ),
+    ] = None,
+    clear: Annotated[bool, typer.Option("--clear", help="First remove all faults, configured ones too.")] = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Inject faults into the running emulator, between two ticks; if one is refused, none is injected."""
+    from aeroloop.plant_emulator.faults.language import Fault
+    from aeroloop.protocol.messages.operator import Inject
+
+    settings = settings_of(config, overrides)
+    if not (faults or clear):
+        fail("name a fault, such as rate:off@1..2, or give --clear", 2)
+    try:
+        texts = [str(Fault.parse(text)) for text in faults or ()]
+    except ValueError as error:
+        fail(str(error), 2)
+    with checked():
+        message = Inject(faults=texts, clear=clear)
+    _send(settings, "inject", message)
+
+
 @group.command("set-gains")
 def set_gains(
     c1: Annotated[Three | None, typer.Option("--C1", help="For the attitude error (1/s).", show_default=False)] = None,

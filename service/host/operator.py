@@ -75,7 +75,7 @@ def gather(network: NetworkSettings) -> Gathered:
 
 
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Send a request to a vehicle's plant (`arm`) or controller (`stand_down`, `set_gains`, `track`).
+    """Send a request to a vehicle's plant (`arm`, `inject`) or controller (`stand_down`, `set_gains`, `track`).
 
     `arm` also recalls controllers that are holding or faulted.
 
@@ -92,7 +92,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
             answers = _answers(here.session, topic, vehicle, message)
             time.sleep(POLL_S)
         if not answers:
-            role = "plant" if topic in ("arm", "stop") else "controller"
+            role = {"arm": "plant", "inject": "emulator"}.get(topic, "controller")
             silent = [_unanswered(place) for place in here.silent()]
             raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *silent]))
         done = [answer.text for answer in answers if answer.done]  # of several, one success is enough

@@ -18,6 +18,7 @@ from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.timing import Histogram
 from aeroloop.service.logs.runs import Taker
 from aeroloop.service.logs.traces import SessionKey
+from aeroloop.service.review.faults import FaultLog
 from aeroloop.service.review.report import Mark
 
 MAX_MARKS: Final = 300
@@ -66,6 +67,7 @@ class EventLog:
         statuses: The last status of every vehicle and role.
         trips: Reason of every trip, in which a plant goes to 0 V by itself.
         losses: Messages of the vehicle that the recorder lost, by topic.
+        faults: Faults of its plant.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class EventLog:
         self.statuses: dict[tuple[str, str], Status] = {}
         self.trips: list[str] = []
         self.losses: dict[str, int] = {}
+        self.faults = FaultLog(which[1], period)
         self._which = which
         self._period = period
         self._reached = reached
@@ -138,6 +141,8 @@ class EventLog:
             return  # a duplicate
         self._status_ns[vehicle, role] = at_ns
         status = self.statuses[vehicle, role] = Status.model_validate_json(payload)
+        if (vehicle, role) == (self._which[0], "plant"):
+            self.faults.status(status)
         age = status.age_us
         if (vehicle, status.session) == self._which and role == "controller" and age is not None:
             medians, p99, most = self._ages

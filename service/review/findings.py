@@ -54,6 +54,7 @@ def findings_of(
         frames=frames,
         theorem=theorem,
         marks=events.marks(),
+        faults=events.faults.intervals(),
     )
 
 

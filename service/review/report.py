@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
@@ -43,6 +43,17 @@ class Mark(BaseModel, frozen=True):
     kind: str = Field(description="`tripped`, `fault`, `change`, `lost`… as in the log's events")
     role: str
     text: str
+
+
+class FaultInterval(BaseModel, frozen=True):
+    """A fault of the emulated plant that acted in the session."""
+
+    fault: str = Field(description="signal:kind[=value][@start[..end]], as it was configured or injected")
+    source: Literal["configured", "injected"]
+    begin_s: float = Field(description="when it began, on the law's clock; 0 if before the session [s]")
+    end_s: float | None = Field(description="when it ended [s]; null if not within the session")
+    changed: int = Field(description="frames, samples or voltages that it changed, at the plant")
+    effect: str = Field(description="what it changed, and how: `commands dropped`")
 
 
 class Check(BaseModel, frozen=True):
@@ -136,6 +147,9 @@ class Findings(Figures):
         "how many `differ` from what the ends have in their traces",
     )
     marks: list[Mark]
+    faults: list[FaultInterval] = Field(
+        default_factory=list, description="faults of the emulated plant that acted in the session, in order of time"
+    )
     theorem: TheoremFindings | None = None
     checks: list[Check] = Field(default_factory=list)
 
@@ -169,6 +183,21 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class Band:
+    """A span of time that is shaded on every drawing over time, with a label: such as an injected fault.
+
+    Attributes:
+        start_s: On the law's clock [s].
+        end_s: None if it did not end within the session.
+        label: In a few words.
+    """
+
+    start_s: float
+    end_s: float | None
+    label: str
+
+
+@dataclass(frozen=True)
 class Report:
     """A run.
 
@@ -179,6 +208,7 @@ class Report:
         panels: What is drawn over time, in the order of the paper's figures.
         thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
             and the largest value.
+        bands: Shaded spans of time.
         settings: The effective configuration, as nested tables.
         facts: Facts about software and host, by role: versions, git revision, kernel, notes.
     """
@@ -190,6 +220,7 @@ class Report:
     thinned: int
     settings: dict[str, Any]
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    bands: Sequence[Band] = ()
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -23,6 +23,7 @@ from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.logs.wire_check import WireCheck
 from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
 from aeroloop.service.review.events import EventLog
+from aeroloop.service.review.faults import bands
 from aeroloop.service.review.findings import facts_of, findings_of, name_of
 from aeroloop.service.review.report import Findings, Report
 from aeroloop.service.review.requirements import Limit
@@ -61,6 +62,7 @@ class Review(NamedTuple):
             thinned=observer.thinned,
             settings=self.session.settings.description(),
             facts=self.facts,
+            bands=bands(self.findings.faults),
         )
 
 
@@ -114,6 +116,7 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
 
         for block in run.read([which], route):
             events.changed(block.changes)
+            events.faults.take(block)
             frames.take(block)
             session.take(block)
         session.finish()

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from aeroloop.service.review.report import Findings, Mark, Spread, TheoremFindings
+from aeroloop.service.review.report import FaultInterval, Findings, Mark, Spread, TheoremFindings
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 
 if TYPE_CHECKING:
@@ -41,6 +41,9 @@ def review_account(findings: Findings) -> None:
     if findings.theorem is not None:
         console.print()
         console.print(theorem_table(findings, findings.theorem))
+    if findings.faults:
+        console.print()
+        console.print(_faults_table(findings.faults))
     if findings.marks:
         console.print()
         console.print(_marks_table(findings.marks))
@@ -148,6 +151,16 @@ def _lemma(findings: Findings, found: TheoremFindings) -> str:
         return f"broken: {which}, of {by}"
     closest = max(found.lemma, key=lambda check: check.closest or 0.0)
     return f"holds at {by}; closest is ({closest.equation}), {100 * (closest.closest or 0.0):.0f} % of its bound"
+
+
+def _faults_table(faults: Sequence[FaultInterval]) -> Table:
+    """Faults at the plant, a line each: from when to when, what it changed, and where it came from."""
+    table = labelled()
+    for i, fault in enumerate(faults):
+        until = "to the end" if fault.end_s is None else f"to {fault.end_s:.3f} s"
+        text = f"{fault.fault} from {fault.begin_s:.3f} s {until}, {fault.changed} {fault.effect} ({fault.source})"
+        table.add_row("" if i else "with faults", Text(text, style="bold red"))
+    return table
 
 
 def _marks_table(marks: Sequence[Mark]) -> Table:

@@ -217,7 +217,7 @@ class Hil:
         Raises:
             HilError: The fault is malformed, or the plant is not emulated.
         """
-        self._query("inject", Inject(fault=fault))
+        self._query("inject", Inject(clear=True) if fault is None else Inject(faults=[fault]))
 
     def arm(self) -> None:
         """Arm the plant, as `aeroloop op arm`."""

@@ -42,7 +42,7 @@ class Ends:
         bus = virtual()
         self.role = Role("plant", "aero", gathering.settings, {})
         # No watchdog here: it counts real time, and the relay's is tried without.
-        self._bridge = Bridge(self.role, LOOP, WIRE, PlantSettings(watchdog_s=10), bus)
+        self._bridge = Bridge(self.role, LOOP, WIRE, PlantSettings(watchdog_s=10, faults=["rate:off@9"]), bus)
         self.node = CanLink(bus, WIRE, "plant")
         self.events: list[Event] = []
         self._session = gathering.join()
@@ -155,6 +155,12 @@ def ends() -> Iterator[Ends]:
             yield ends
         finally:
             ends.close()
+
+
+def test_faults_of_the_node_are_named_at_the_start_because_it_cannot_publish_them(ends: Ends) -> None:
+    eventually("the event", lambda: any(event.kind == "fault" for event in ends.events))
+    (event,) = (event for event in ends.events if event.kind == "fault")
+    assert event.text == "an emulated node has faults whose begin and end are not published: rate:off@9"
 
 
 def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
 
+from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Grant
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
 from aeroloop.protocol.messages.trace import End, Received, Sent, TraceWriter, read_batch
 from aeroloop.protocol.transport.link import Arrival
@@ -166,6 +167,7 @@ def make_log(
     truth_every: int = 0,
     lost: Container[int] = (),
     skipped: Container[int] = (),
+    injected: Mapping[int, str | None] = {},
 ) -> None:
     """Write a log of a loop in which nothing else goes wrong.
 
@@ -180,9 +182,11 @@ def make_log(
         truth_every: Publish the true state every so many ticks; 0 is never.
         lost: Ticks whose measurement never reaches the controller.
         skipped: Ticks that the plant has no time for.
+        injected: Faults that are injected before a tick; None clears all. With faults, injected or configured, the
+            plant also publishes events, and a status every 100 ticks.
     """
     settings = settings or lockstep()
-    messages = made(settings, ticks, changes or {}, spoil, truth_every, lost, skipped)
+    messages = made(settings, ticks, changes or {}, spoil, truth_every, lost, skipped, injected=injected)
     write(path, settings, [message for message in messages if not begin or not _before(message, begin)], chunk_every)
 
 
@@ -196,6 +200,7 @@ def made(
     skipped: Container[int] = (),
     session: str = SESSION,
     at_ns: int = 0,
+    injected: Mapping[int, str | None] = {},
 ) -> list[Logged]:
     """The messages of such a loop; arguments as of `make_log`.
 
@@ -207,6 +212,18 @@ def made(
     plant_clock, clock = Clock("plant"), Clock("controller")
     emulator = Emulator(loop, wire, settings.plant, threading.Event())
     endpoint, n = emulator.endpoint, at_ns // 1_000_000
+
+    def publish(k: int) -> None:
+        """Events and a status of the plant."""
+        for notice in endpoint.notices:
+            messages.add("event", Event(role="plant", **notice._asdict()).encode(), plant_clock, "plant")
+        endpoint.notices.clear()
+        status = Status(
+            role="plant", state=endpoint.state, session=endpoint.session, uptime_s=1 + k * loop.period, ticks=k,
+            rate_hz=loop.rate_hz, skipped=0, faults=emulator.fault_statuses(),
+        )  # fmt: skip
+        messages.add("status", status.encode(), plant_clock, "plant")
+
     with patch("aeroloop.plant_emulator.hosts.trace_rows.time", plant_clock):
         plant_clock.now_ns = at_ns
         trace = PlantTrace(
@@ -223,11 +240,16 @@ def made(
             if k in skipped:
                 continue
             now_ns = plant_clock.now_ns = at_ns + k * loop.period_ns
+            if k in injected:
+                fault = injected[k]
+                emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
             measurement = emulator.tick(arrival.frame if arrival else None, k)
             assert measurement is not None, endpoint.notices
             trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
             if truth_every and k % truth_every == 0:
                 messages.add("truth", truth_of(emulator._emulated, endpoint).encode(), plant_clock, "plant")
+            if k % 100 == 0 and (injected or settings.plant.faults):
+                publish(k)
             arrival = None
             if k in lost:
                 continue
@@ -246,6 +268,8 @@ def made(
         end.publish(final=True)
         endpoint.release(session)
         trace.follow(endpoint)
+        if injected or settings.plant.faults:
+            publish(ticks)
     return messages.all
 
 

@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Self
 from unittest.mock import patch
 
 from aeroloop.plant_emulator.endpoint.front import Front
@@ -122,7 +123,7 @@ class Stage(Front):
         self._claims = 0
         self._ends = 0
 
-    def run(self, ticks: int) -> Stage:
+    def run(self, ticks: int) -> Self:
         """Run so many ticks of the plant, and leave."""
         self._ends = ticks
         with (

@@ -98,19 +98,16 @@ class World(Link):
             at_ns, frame = self._to_plant.pop(0)
             arrival = Arrival(frame, self._plant_clock.at(at_ns))
         if self._chance.random() < 0.002:
-            self.emulator.inject(
-                Fault.parse(
-                    self._chance.choice(
-                        [
-                            "measurement:drop=0.3@0..0.1",
-                            "command:duplicate=0.2@0..0.1",
-                            "command:delay=0.006@0..0.05",
-                            "rate.z:bias=0.05@0..0.1",
-                            "measurement:garble=0.1@0..0.1",
-                        ]
-                    )
-                )
+            fault = self._chance.choice(
+                [
+                    "measurement:drop=0.3@0..0.1",
+                    "command:duplicate=0.2@0..0.1",
+                    "command:delay=0.006@0..0.05",
+                    "rate.z:bias=0.05@0..0.1",
+                    "measurement:garble=0.1@0..0.1",
+                ]
             )
+            self.emulator.inject([Fault.parse(fault)])
             self.trace.follow(endpoint)
         measurement = self.emulator.tick(arrival.frame if arrival else None, tick)
         session_tick = endpoint.session_tick

@@ -53,6 +53,18 @@ def events(reports: Sequence[Report]) -> Html:
     return table(reports, [("Time [s]", True), ("What", False), ("Role", False), (TEXT, False)], rows, tall=True)
 
 
+def faults(reports: Sequence[Report]) -> Html:
+    """Faults of the plant: when each acted, and how much it changed; empty if there were none."""
+    rows = []
+    for index, report in enumerate(reports):
+        for fault in report.findings.faults:
+            end = "–" if fault.end_s is None else jump(fault.end_s, index, f"{fault.fault} ends")
+            when = [jump(fault.begin_s, index, f"{fault.fault} begins"), end]
+            rows.append((index, [*when, fault.fault, fault.source, f"{fault.changed:,} {fault.effect}"]))
+    columns = [("From [s]", True), ("To [s]", True), ("Fault", False), ("Source", False), (TEXT, False)]
+    return table(reports, columns, rows) if rows else Html("")
+
+
 def gaps(reports: Sequence[Report]) -> Html:
     """Ticks in a row that no command answered."""
     total = sum(report.findings.gap_count for report in reports)

@@ -88,7 +88,7 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
         *([("broken", "What is missing from the log", broken)] if broken else []),
         ("tracking", "Tracking", joined([_thinned(reports), drawn])),
         *([("theorem", "What the theorem promises", joined([promised, _groups(reports, proved)]))] if promised else []),
-        ("events", "Events", happenings.events(reports)),
+        ("events", "Events", joined([happenings.faults(reports), happenings.events(reports)])),
         ("timing", "Timing", timing),
         ("gaps", "Gaps", happenings.gaps(reports)),
         ("wire", "On the wire", happenings.wire(reports)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,7 +20,19 @@ class Judgement(NamedTuple):
 
 
 def judgement(run: Findings) -> Judgement:
-    """Verdict by the limits of `--require`; without any, by trips and missing figures."""
+    """Verdict by the limits of `--require`; without any, by trips and missing figures. It says if there were faults."""
+    found = _judgement(run)
+    if not run.faults:
+        return found
+    changed: Counter[str] = Counter()
+    for fault in run.faults:
+        changed[fault.effect] += fault.changed
+    counts = ", ".join(f"{count:,} {effect}" for effect, count in changed.items())
+    because = f"{found.because} {_count(len(run.faults), 'fault')} acted at the plant: {counts}."
+    return Judgement(f"{found.word}, with faults", found.good, because)
+
+
+def _judgement(run: Findings) -> Judgement:
     broken = [check for check in run.checks if not check.holds]
     if broken:
         return Judgement("Not held", False, f"{len(broken)} of {_count(len(run.checks), 'limit')} broken.")

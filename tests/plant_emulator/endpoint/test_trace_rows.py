@@ -53,7 +53,7 @@ def operations(batches: list[Batch]) -> list[Operation]:
 def inject(text: str) -> Callable[[Stage], None]:
     def do(stage: Stage) -> None:
         assert isinstance(stage.driver, Emulator)
-        stage.driver.inject(Fault.parse(text))
+        stage.driver.inject([Fault.parse(text)])
 
     return do
 

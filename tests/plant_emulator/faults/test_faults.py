@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
-from aeroloop.plant_emulator.faults.language import SIGNALS, Fault
+from aeroloop.plant_emulator.faults.language import (
+    MAX_ANGLE,
+    MAX_RATE,
+    MAX_TIME_S,
+    MAX_VOLTS,
+    SIGNALS,
+    Fault,
+)
 from aeroloop.plant_emulator.faults.signals import GARBLED_RATE, FaultyPlant
 from aeroloop.plant_emulator.faults.streams import FaultyStream
 from aeroloop.plant_emulator.plant import Measurement, Plant
@@ -154,10 +161,13 @@ def test_a_fault_is_read_as_it_is_written(text: str, fault: Fault) -> None:
         ("motor1:reorder=1", "motor1 takes no 'reorder'", "drop and garble"),
         ("attitude:off=1", "off takes no value, but was given 1", "write off alone"),
         ("motor1:stuck=0", "stuck takes no value, but was given 0", "write stuck alone"),
-        ("rate:bias", "bias takes a finite number", "bias=0.1"),
-        ("rate:bias=nan", "not nan", "a finite number"),
-        ("rate:noise=inf", "not inf", "a finite number from 0 up"),
-        ("rate:noise=-1", "not -1", "from 0 up"),
+        ("rate:bias", "bias takes -35 to 35 rad/s", "bias=0.1"),
+        ("rate:bias=nan", "not nan", "-35 to 35 rad/s"),
+        ("attitude.x:bias=-3.2", "not -3.2", "-3.1416 to 3.1416 rad"),
+        ("motors:bias=1e308", "not 1e+308", "-48 to 48 V"),
+        ("motor1:noise=48.1", "not 48.1", "0 to 48 V"),
+        ("rate:noise=inf", "not inf", "0 to 35 rad/s"),
+        ("rate:noise=-1", "not -1", "0 to 35 rad/s"),
         ("rate:delay=10.5", "not 10.5", "0 to 10 s"),
         ("command:delay=-0.1", "not -0.1", "0 to 10 s"),
         ("rate:drop=0", "not 0", "a probability above 0 and up to 1"),
@@ -169,11 +179,14 @@ def test_a_fault_is_read_as_it_is_written(text: str, fault: Fault) -> None:
         ("rate:off@", "'' is not a number", ""),
         ("rate:off@soon", "'soon' is not a number", ""),
         ("rate:off@1..", "'' is not a number", ""),
-        ("rate:off@-1", "not at -1 s", "0 s or later"),
-        ("rate:off@inf", "not at inf s", "0 s or later"),
+        ("rate:off@-1", "not at -1 s", "within 0 to 1e+08 s"),
+        ("rate:off@inf", "not at inf s", "within 0 to 1e+08 s"),
+        ("rate:off@nan", "not at nan s", "within 0 to 1e+08 s"),
+        ("rate:off@1e308", "not at 1e+308 s", "within 0 to 1e+08 s"),
         ("rate:off@4..2", "not at 2 s", "after it begins at 4 s"),
         ("rate:off@4..4", "not at 4 s", "after it begins at 4 s"),
-        ("rate:off@4..inf", "not at inf s", "after it begins at 4 s"),
+        ("rate:off@4..inf", "not at inf s", "after it begins at 4 s and by 1e+08 s"),
+        ("rate:off@4..1e9", "not at 1000000000 s", "by 1e+08 s"),
         ("rate:off\n@1", "takes no 'off\\n'", "off, stuck"),
     ],
 )
@@ -193,19 +206,18 @@ def test_what_is_no_fault_is_refused_in_a_line_that_names_it_and_what_would_be_o
 def test_fields_are_held_to_the_same_rules_as_texts() -> None:
     with pytest.raises(ValueError, match="rate takes no 'reorder'"):
         Fault(signal="rate", kind="reorder", value=0.5)
-    with pytest.raises(ValueError, match="bias takes a finite number"):
+    with pytest.raises(ValueError, match="bias takes -35 to 35 rad/s"):
         Fault(signal="rate", kind="bias")
     with pytest.raises(ValueError, match="extra"):
         Fault.model_validate({"signal": "rate", "kind": "off", "until": 3})
 
 
-def values_of(kind: str) -> st.SearchStrategy[float | None]:
+def values_of(signal: str, kind: str) -> st.SearchStrategy[float | None]:
     if kind in ("off", "stuck"):
         return st.none()
-    if kind == "bias":
-        return st.floats(allow_nan=False, allow_infinity=False)
-    if kind == "noise":
-        return st.floats(0.0, allow_infinity=False)
+    if kind in ("bias", "noise"):
+        size = {"attitude": MAX_ANGLE, "rate": MAX_RATE, "motors": MAX_VOLTS}[SIGNALS[signal].whole]
+        return st.floats(-size if kind == "bias" else 0.0, size)
     return st.floats(0.0, 10.0) if kind == "delay" else st.floats(0.0, 1.0, exclude_min=True)
 
 
@@ -213,9 +225,9 @@ def values_of(kind: str) -> st.SearchStrategy[float | None]:
 def any_fault(draw: st.DrawFn) -> Fault:
     signal = draw(st.sampled_from(sorted(SIGNALS)))
     kind = draw(st.sampled_from(SIGNALS[signal].kinds))
-    start = draw(st.floats(0.0, 1e9))
-    end = draw(st.none() | st.floats(start, 1e10, exclude_min=True))
-    return Fault(signal=signal, kind=kind, value=draw(values_of(kind)), start_s=start, end_s=end)
+    start = draw(st.floats(0.0, MAX_TIME_S, exclude_max=True))
+    end = draw(st.none() | st.floats(start, MAX_TIME_S, exclude_min=True))
+    return Fault(signal=signal, kind=kind, value=draw(values_of(signal, kind)), start_s=start, end_s=end)
 
 
 @given(fault=any_fault())

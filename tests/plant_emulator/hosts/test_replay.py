@@ -115,7 +115,9 @@ class Mischief:
                 )
             )()
         if random.random() < 0.02 and not self._quiet:
-            emulator.inject(Fault.parse(random.choice(FAULTS)) if random.random() < 0.8 else None)
+            clear = random.random() < 0.3
+            count = random.choice((0, 1, 2) if clear else (1, 1, 2))
+            emulator.inject([Fault.parse(random.choice(FAULTS)) for _ in range(count)], clear=clear)
         if random.random() < 0.005:
             limits = self._plant.limits.model_copy(update={"max_rate": random.choice((0.02, 20.0))})
             changed = {"watchdog_s": random.choice((0.04, 0.1)), "limits": limits}

@@ -15,6 +15,7 @@ from aeroloop.protocol.messages.models import (
     Claim,
     Description,
     Event,
+    FaultStatus,
     Grant,
     Loss,
     Percentiles,
@@ -45,6 +46,9 @@ from aeroloop.protocol.runtime.timing import Histogram, summary
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
+FAULT = FaultStatus(
+    fault="command:drop=0.1@2", source="injected", begin_tick=1001, end_tick=None, changed=7, effect="commands dropped"
+)
 
 MESSAGES: list[Message] = [
     Claim(controller="c1", session="5f0c", period_ns=2_000_000, lockstep=False, wire=WireSpec()),
@@ -83,7 +87,9 @@ MESSAGES: list[Message] = [
         saturated=5,
         latency_us=LATENCY,
         notes=["SCHED_FIFO: Operation not permitted"],
+        faults=[FAULT],
     ),
+    FAULT,
     Telemetry(
         session="5f0c",
         tick=7,
@@ -111,8 +117,8 @@ MESSAGES: list[Message] = [
     Change(session="5f0c", tick=0),
     Ask(),
     Track(reference=Points(times=[0.0, 1.0], attitudes=[(0.0, 0.0, 0.0)] * 2), within_s=2.5),
-    Inject(fault="rate:off@2"),
-    Inject(fault=None),
+    Inject(faults=["rate:off@2", "command:drop=0.1"]),
+    Inject(clear=True),
     Advance(seconds=0.5),
     Answer(done=True, text="armed"),
     Operation(tick=-1, kind="inject", name="rate:off@2"),

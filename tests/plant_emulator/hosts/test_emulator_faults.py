@@ -1,0 +1,183 @@
+"""Faults of a running emulator: one that is to come changes nothing, and each begin, end and frame is accounted for.
+
+Loops of an emulator's driver in simulated time; every measurement is answered at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from aeroloop.plant_emulator.endpoint.tenancy import Notice
+from aeroloop.plant_emulator.faults.language import SIGNALS, Fault
+from aeroloop.plant_emulator.faults.schedule import MAX_FAULTS
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import FaultStatus
+from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from tests.support.plant_stage import Stage, Wires
+
+WIRE = WireSpec()
+CLAIMED_AT = 7
+"""The plant's last tick before the claim."""
+FIRST = CLAIMED_AT + 2
+"""The plant's tick of the session's first measurement: a driver waits for the next tick after a grant."""
+
+
+class RecordedWires(Wires):
+    """Wires that keep the last frame that they returned."""
+
+    last: Arrival | None = None
+
+    def take(self) -> Arrival | None:
+        self.last = super().take()
+        return self.last
+
+
+class Run(Stage):
+    """An emulator with faults, driven from tick 8 on, and what its front was passed."""
+
+    def __init__(self, *faults: str, lockstep: bool = False, between: Callable[[Run], None] = lambda _: None) -> None:
+        def answer(stage: Stage, measurement: bytes) -> None:
+            counter = WIRE.measurement.counter(measurement)
+            assert counter is not None
+            stage.wires.deliver(WIRE.command.pack(counter, (1, -1)), stage.endpoint.ticked)
+
+        def before(stage: Stage) -> None:
+            assert isinstance(stage, Run)
+            if stage.endpoint.ticked == (-1 if lockstep else CLAIMED_AT):  # in lockstep there is no tick before it
+                stage.claim()
+            between(stage)
+
+        loop = LoopSettings(realtime="off", lockstep=lockstep, trace_s=10)
+        super().__init__(loop, WIRE, PlantSettings(faults=list(faults)), between=before, answer=answer)
+        self.wires = RecordedWires()
+        self.altered = 0
+
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        assert isinstance(self.wires, RecordedWires)
+        self.altered += not self.loop.lockstep and arrival is not self.wires.last
+        super().after_tick(measurement, arrival, sent_ns)
+
+    @property
+    def emulator(self) -> Emulator:
+        assert isinstance(self.driver, Emulator)
+        return self.driver
+
+    @property
+    def statuses(self) -> list[FaultStatus]:
+        return self.emulator.fault_statuses()
+
+    @property
+    def events(self) -> list[Notice]:
+        """Events of begins and ends."""
+        faults = [notice for notice in self.endpoint.notices if notice.kind == "fault"]
+        return [notice for notice in faults if notice.text.startswith(("fault begins", "fault ends"))]
+
+    def column(self, name: str) -> np.ndarray:
+        return np.concatenate([batch.columns[name] for batch in self.batches if batch.header.rows])
+
+
+def every_fault(when: str) -> list[str]:
+    values = {"off": "", "stuck": ""}
+    return [f"{name}:{kind}{values.get(kind, '=0.5')}{when}" for name in SIGNALS for kind in SIGNALS[name].kinds]
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_faults_that_are_to_come_change_no_byte_and_leave_every_frame_as_it_arrived(lockstep: bool) -> None:
+    """A frame that arrived otherwise would also have another time of arrival, and the loop another latency."""
+    without = Run(lockstep=lockstep).run(300)
+    faults = [text for text in every_fault("@1000") if not text.startswith("motor3")]
+    for i in range(0, len(faults), MAX_FAULTS):
+        run = Run(*faults[i : i + MAX_FAULTS], lockstep=lockstep).run(300)
+        assert run.sent == without.sent
+        assert run.altered == 0
+        for name in ("tick", "session_tick", "sent_as", "received_as", "outcome", "answered", "measurement", "command"):
+            assert (run.column(name) == without.column(name)).all(), name
+        assert (run.column("voltages") == without.column("voltages")).all()
+        assert {status.changed for status in run.statuses} == {0}
+        assert run.events == []
+
+
+def test_configured_faults_count_from_the_claim_and_publish_begin_and_end_with_the_sessions_tick() -> None:
+    run = Run("command:drop=1@0.1..0.14", "rate:bias=0.1@0.2").run(300)
+    begin, later = CLAIMED_AT + 50, CLAIMED_AT + 100
+    found = [(status.begin_tick, status.end_tick, status.source) for status in run.statuses]
+    assert found == [(begin, begin + 20, "configured"), (later, None, "configured")]
+    assert [(notice.tick, notice.text) for notice in run.events] == [
+        (begin - FIRST, "fault begins (configured): command:drop=1@0.1..0.14"),
+        (begin + 20 - FIRST, "fault ends (configured): command:drop=1@0.1..0.14, 20 commands dropped"),
+        (later - FIRST, "fault begins (configured): rate:bias=0.1@0.2"),
+    ]
+    assert {notice.session for notice in run.events} == {"s1"}
+    withheld = run.column("tick")[run.column("outcome") == Outcome.WITHHELD]
+    assert withheld.tolist() == list(range(begin + 1, begin + 21))  # a row has the command received before its tick
+
+
+def test_injected_faults_count_from_the_injection_and_end_when_they_are_cleared() -> None:
+    def operator(run: Run) -> None:
+        if run.endpoint.ticked == 100:
+            run.emulator.inject([Fault.parse("motor1:bias=0.1@0.01..0.05"), Fault.parse("rate:drop=0.5")])
+        if run.endpoint.ticked == 200:
+            run.emulator.inject([Fault.parse("command:garble=0.5@9")], clear=True)
+
+    run = Run("measurement:off@5", between=operator).run(300)
+    found = [(status.fault, status.begin_tick, status.end_tick) for status in run.statuses]
+    assert found == [
+        ("motor1:bias=0.1@0.01..0.05", 105, 125),
+        ("rate:drop=0.5", 100, 200),
+        ("command:garble=0.5@9", 200 + 4500, None),
+    ]
+    assert run.statuses[0].changed == 20
+    assert [notice.tick for notice in run.events] == [100 - FIRST, 105 - FIRST, 125 - FIRST, 200 - FIRST]
+
+
+@pytest.mark.parametrize(
+    ("fault", "effect"),
+    [
+        ("command:off", "commands dropped"),
+        ("command:delay=0.01", "commands delayed"),
+        ("command:garble=1", "commands garbled"),
+        ("command:duplicate=1", "commands duplicated"),
+        ("command:stuck", "commands replaced by the last"),
+        ("measurement:drop=1", "measurements dropped"),
+        ("rate:noise=0.001", "samples made noisy"),
+        ("attitude:stuck", "samples replaced by the last"),
+        ("motors:delay=0.01", "voltages delayed"),
+    ],
+)
+def test_every_frame_sample_and_voltage_that_a_fault_changed_is_counted(fault: str, effect: str) -> None:
+    """Ten ticks at 500 Hz, while the loop runs."""
+    (status,) = Run(f"{fault}@0.1..0.12").run(150).statuses
+    assert (status.changed, status.effect) == (10, effect)
+
+
+def test_a_command_that_overtakes_another_is_counted_once_for_both() -> None:
+    (status,) = Run("command:reorder=1@0.1..0.12").run(150).statuses
+    assert (status.changed, status.effect) == (5, "commands reordered")
+
+
+def test_a_fault_goes_on_without_a_session_and_its_end_names_none() -> None:
+    def release(run: Run) -> None:
+        if run.endpoint.ticked == 100:
+            run.endpoint.release("s1")
+
+    run = Run("rate:bias=0.1@0.1..0.3", between=release).run(300)
+    assert [(notice.session, notice.tick) for notice in run.events] == [("s1", 48), (None, None)]
+
+
+def test_of_faults_one_of_which_is_refused_none_is_injected() -> None:
+    emulator = Run().emulator
+    with pytest.raises(ValueError, match="the plant has no motor3"):
+        emulator.inject([Fault.parse("motor1:off"), Fault.parse("motor3:off")], clear=True)
+    assert emulator.fault_statuses() == []
+    assert emulator.endpoint.operations == []
+    emulator.inject([Fault.parse("rate:off@5")] * MAX_FAULTS)
+    with pytest.raises(ValueError, match=f"takes {MAX_FAULTS} faults"):
+        emulator.inject([Fault.parse("rate:off")])
+    assert len(emulator.fault_statuses()) == MAX_FAULTS

@@ -1,0 +1,91 @@
+"""`aeroloop op inject` against an emulator on a real Zenoh, in this process."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Status
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.cli.main import execute
+from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
+
+LOOP = LoopSettings(realtime="off", rate_hz=100)
+
+Inject = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def plant(capsys: pytest.CaptureFixture[str]) -> Iterator[tuple[Inject, Callable[[], list[str]], list[Event]]]:
+    """`op inject` with exit code and lines of stdout and stderr; the faults of the plant's status; its events."""
+    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+        emulator = EmulatorOnZenoh(role, LOOP, WireSpec(), PlantSettings(faults=["rate:bias=0.1@9"]))
+        thread = threading.Thread(target=emulator.run)
+        zenoh, events = gathering.join(), list[Event]()
+        key = topics.key("event", "aero")
+        zenoh.declare_subscriber(key, lambda one: events.append(Event.model_validate_json(one.payload.to_bytes())))
+        thread.start()
+
+        def inject(*arguments: str) -> tuple[int, str, str]:
+            code = execute(["op", "inject", *arguments, "--set", f"network.rendezvous=tcp/127.0.0.1:{gathering.ports[0]}"])
+            return code, *capsys.readouterr()
+
+        def faults() -> list[str]:
+            for reply in zenoh.get(topics.key("status", "aero", role="plant"), timeout=PATIENCE_S):
+                if reply.ok is not None:
+                    status = Status.model_validate_json(reply.ok.payload.to_bytes())
+                    assert status.since is None  # it is of the cause why a plant is not armed, which no fault is
+                    return [fault.fault for fault in status.faults]
+            return []
+
+        try:
+            eventually("its status", lambda: faults() == ["rate:bias=0.1@9"])
+            yield inject, faults, events
+        finally:
+            role.stop.set()
+            thread.join()
+
+
+def test_faults_are_injected_and_cleared_with_one_line_each(
+    plant: tuple[Inject, Callable[[], list[str]], list[Event]],
+) -> None:
+    inject, faults, events = plant
+    line = "fault injected: rate:off@1..2; fault injected: command:drop=0.1\n"
+    assert inject("rate:off@1..2", "command:drop=0.1") == (0, line, "")
+    eventually("three faults", lambda: faults() == ["rate:bias=0.1@9", "rate:off@1..2", "command:drop=0.1"])
+    assert inject("--clear") == (0, "no faults any more\n", "")
+    eventually("no fault", lambda: faults() == [])
+    texts = ["fault injected: rate:off@1..2", "fault injected: command:drop=0.1", "no faults any more"]
+    eventually("the events", lambda: [event.text for event in events if event.kind == "fault"] == texts)
+
+
+def test_what_the_plant_refuses_is_one_line_and_nothing_is_injected(
+    plant: tuple[Inject, Callable[[], list[str]], list[Event]],
+) -> None:
+    inject, faults, _ = plant
+    code, out, error = inject("rate:off", "motor3:off")
+    assert (code, out) == (1, "")
+    assert error == "aeroloop: fault 'motor3:off': the plant has no motor3, but motor1, motor2\n"
+    assert faults() == ["rate:bias=0.1@9"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((), "name a fault, such as rate:off@1..2, or give --clear"),
+        (("motors:bias=1e308",), "fault 'motors:bias=1e308': bias takes -48 to 48 V, not 1e+308"),
+        (("rate:drop=nan",), "fault 'rate:drop=nan': drop takes a probability above 0 and up to 1, not nan"),
+    ],
+)
+def test_what_is_no_fault_is_refused_before_anything_is_sent(
+    arguments: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert execute(["op", "inject", *arguments]) == 2
+    assert capsys.readouterr() == ("", f"aeroloop: {says}\n")

@@ -1,0 +1,162 @@
+"""Faults in a review: their intervals to the tick, their counts, and a verdict that names them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aeroloop.protocol.messages.models import FaultStatus, Status
+from aeroloop.service import examples
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import load
+from aeroloop.service.logs.runs import Block
+from aeroloop.service.report.page.page import page
+from aeroloop.service.report.page.verdict import judgement
+from aeroloop.service.review.faults import FaultLog
+from aeroloop.service.review.report import Band, FaultInterval, Findings
+from aeroloop.service.review.review import read
+from tests.support.edited_log import Said, rewrite
+from tests.support.made_log import make_log
+
+TICKS = 500
+CONFIGURED = ["command:drop=0.3@0.2..0.6", "rate:noise=0.001@0.8", "attitude:off@5"]
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second at 500 Hz: two configured faults, a third to come, one injected at tick 300, all cleared at 450."""
+    path = tmp_path_factory.mktemp("faulty") / "faulty.mcap"
+    settings = load(overrides=[f"plant.faults={json.dumps(CONFIGURED)}"])
+    make_log(path, TICKS, settings=settings, injected={300: "motor1:bias=0.5@0.05", 450: None})
+    return path
+
+
+def test_every_fault_that_acted_is_listed_with_its_ticks_and_what_it_changed(faulty: Path) -> None:
+    """The plant's time starts with its first tick. An injection counts from the tick before it, as does clearing."""
+    findings = read(faulty).findings
+    withheld = findings.lapses["withheld"]
+    assert 30 < withheld < 90  # of 200 commands; the plant's trace counts for itself
+    assert findings.faults == [
+        FaultInterval(
+            fault="command:drop=0.3@0.2..0.6", source="configured", begin_s=0.2, end_s=0.6, changed=withheld,
+            effect="commands dropped",
+        ),
+        FaultInterval(
+            fault="motor1:bias=0.5@0.05", source="injected", begin_s=0.648, end_s=0.898, changed=125,
+            effect="voltages shifted",
+        ),
+        FaultInterval(
+            fault="rate:noise=0.001@0.8", source="configured", begin_s=0.8, end_s=0.898, changed=50,
+            effect="samples made noisy",
+        ),
+    ]  # fmt: skip
+
+
+def test_the_shipped_example_shows_its_dropped_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example = Path(examples.__path__[0]) / "faults.toml"
+    make_log(tmp_path / "a.mcap", 1500, settings=load(example))
+    assert execute(["log", "review", str(tmp_path / "a.mcap")]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    dropped = read(tmp_path / "a.mcap").findings.lapses["withheld"]
+    assert 20 < dropped < 90  # a tenth of 500
+    assert f"with faults command:drop=0.1@2 from 2.000 s to the end, {dropped} commands dropped (configured)" in text
+
+
+def test_without_any_event_the_intervals_are_the_same(faulty: Path, tmp_path: Path) -> None:
+    def lost(message: Said) -> Said | None:
+        return None if message.topic == "event" else message
+
+    quiet = read(rewrite(faulty, tmp_path / "a.mcap", lost)).findings
+    assert [mark for mark in quiet.marks if mark.role == "plant"] == []
+    assert quiet.faults == read(faulty).findings.faults
+
+
+def test_events_have_the_same_times_as_the_intervals(faulty: Path) -> None:
+    findings = read(faulty).findings
+    times = {mark.text.split(": ")[1].split(",")[0]: mark.time_s for mark in findings.marks if "begins" in mark.text}
+    assert times == {fault.fault: fault.begin_s for fault in findings.faults}
+
+
+def test_the_verdict_and_the_bands_name_the_faults(faulty: Path) -> None:
+    review = read(faulty)
+    found = judgement(review.findings)
+    assert found.word == "Tracked, with faults"
+    counts = f"{review.findings.lapses['withheld']} commands dropped, 125 voltages shifted, 50 samples made noisy"
+    assert f"3 faults acted at the plant: {counts}." in found.because
+    assert list(review.report().bands) == [
+        Band(0.2, 0.6, "command:drop=0.3@0.2..0.6"),
+        Band(0.648, 0.898, "motor1:bias=0.5@0.05"),
+        Band(0.8, 0.898, "rate:noise=0.001@0.8"),
+    ]
+
+
+def test_the_page_has_each_fault_with_its_times_and_counts(faulty: Path) -> None:
+    html = page([read(faulty).report()])
+    row = html[html.index("<td>motor1:bias=0.5@0.05</td>") - 600 :][:900]
+    for cell in ('data-time="0.648"', 'data-time="0.898"', "<td>injected</td>", "125 voltages shifted"):
+        assert cell in row
+
+
+def test_a_run_without_faults_or_with_faults_to_come_says_nothing_of_them(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 100, settings=load(overrides=['plant.faults=["rate:off@1"]']))
+    findings = read(tmp_path / "a.mcap").findings
+    assert findings.faults == []
+    assert judgement(findings).word == "Tracked"
+
+
+def test_the_terminal_and_json_list_them(faulty: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert execute(["log", "review", str(faulty)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "with faults command:drop=0.3@0.2..0.6 from 0.200 s to 0.600 s" in text
+    assert execute(["log", "review", "--json", str(faulty)]) == 0
+    findings = Findings.model_validate_json(capsys.readouterr().out)
+    assert [fault.source for fault in findings.faults] == ["configured", "injected", "configured"]
+
+
+# ── several sessions and processes ──
+
+
+def status(session: str | None, uptime_s: float, changed: int, end_tick: int | None = None) -> Status:
+    fault = FaultStatus(
+        fault="command:drop=0.1", source="configured", begin_tick=10, end_tick=end_tick, changed=changed, effect="…"
+    )
+    return Status(
+        role="plant",
+        state="driven",
+        session=session,
+        uptime_s=uptime_s,
+        ticks=1,
+        rate_hz=500,
+        skipped=0,
+        faults=[fault],
+    )
+
+
+def intervals(*statuses: Status, first: int = 100, ticks: int = 50) -> list[FaultInterval]:
+    log = FaultLog("s", 0.1)
+    for one in statuses:
+        log.status(one)
+    k = np.arange(ticks)
+    log.take(Block(("aero", "s"), k, {}, {"tick": first + k, "session_tick": k}, k, k, k, [], None))
+    return log.intervals()
+
+
+def test_of_a_fault_that_acts_in_several_sessions_only_this_ones_frames_count() -> None:
+    (found,) = intervals(
+        status("r", 1, 3), status(None, 2, 5), status("s", 3, 6), status(None, 4, 9), status("t", 5, 20)
+    )
+    assert (found.begin_s, found.end_s, found.changed) == (0.0, None, 9 - 5)
+
+
+def test_what_another_process_of_the_plant_counted_before_is_not_subtracted() -> None:
+    (found,) = intervals(status(None, 100, 50), status("s", 3, 6), status(None, 0.5, 0))
+    assert found.changed == 6
+
+
+def test_a_fault_that_was_over_before_the_session_is_not_listed() -> None:
+    assert intervals(status("s", 3, 6, end_tick=100)) == []
+    (found,) = intervals(status("s", 3, 6, end_tick=101))
+    assert found.end_s == pytest.approx(0.1)
