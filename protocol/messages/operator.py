@@ -7,9 +7,17 @@ rate and acceleration never jump.
 from __future__ import annotations
 
 from math import isfinite, pi
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from aeroloop.protocol.wire.attitude import Vector
 
@@ -153,6 +161,11 @@ class Change(Message):
         default=0.0,
         description="time before a single quintic to reduce the acceleration to 0; in older logs, 0 otherwise [s]",
     )
+
+    @model_serializer(mode="wrap")
+    def _without_null_times(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `brake_s` and `run_up_s` where they are null: those are the bytes of a single quintic so far."""
+        return {name: value for name, value in dump(self).items() if value is not None or not name.endswith("_s")}
 
 
 class Inject(Message):

@@ -69,8 +69,8 @@ class Approach(NamedTuple):
         else:
             rate = (self.within_s - sum(parts.values())) / turn_s * limits.rate
             why = (
-                f"in {within_s:g} s it would turn at {rounded_up(rate):g} rad/s, and controller.max_reference_rate is "
-                f"{limits.rate:g} rad/s"
+                f"in {within_s:g} s it would turn at {rounded_up(rate):g} rad/s, more than "
+                f"controller.max_reference_rate = {limits.rate:g} rad/s"
             )
         enough = self.within_s <= MAX_WITHIN_S
         remedy = f"--in {rounded_up(self.within_s):g} would do" if enough else f"even {MAX_WITHIN_S:g} s would be"
@@ -125,14 +125,13 @@ def braking_times(state: Angles, limits: Limits) -> Floats:
     rate, acceleration = np.abs(state.rate[0]), np.abs(state.acceleration[0])
     # `braked` accelerates by at most 3/2 rate / T + acceleration / 3, or by what it begins with.
     times: Floats = 1.5 * rate / (np.maximum(limits.braking, acceleration) - acceleration / 3)
-    times = np.where(acceleration > 0, np.maximum(times, LET_GO_S), times)
+    times = np.ceil(1000 * np.where(acceleration > 0, np.maximum(times, LET_GO_S), times)) / 1000
     for _ in range(_HARDER):
-        times = np.ceil(times * 1000) / 1000
         way = braked(state, times, np.linspace(0.0, float(times.max()), SAMPLES))
         speeds, tilts = way.speeds(), way.tilts()
         if speeds.max() <= max(limits.rate, speeds[0]) * _SLACK and tilts.max() <= max(limits.tilt, tilts[0]) * _SLACK:
             break
-        times = times / 2
+        times = np.ceil(500 * times) / 1000
     return times
 
 
@@ -163,9 +162,11 @@ def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
     tilts = turn.tilts()
     if tilts.max() > max(limits.tilt, tilts[0], tilts[-1]) * _SLACK:
         raise FollowError(
-            f"the approach tilts by {degrees(float(tilts.max())):.1f}°, and controller.max_reference_tilt_deg is "
+            f"the approach tilts by {degrees(float(tilts.max())):.1f}°, more than controller.max_reference_tilt_deg = "
             f"{degrees(limits.tilt):g}°: no --in would do, only a way in smaller steps"
         )
+    if not still_s:
+        return Approach(within_s)  # from rest to rest it is a single quintic
     return Approach(within_s, brake_s=_vector(brake_s), run_up_s=_vector(run_up_s))
 
 
@@ -187,15 +188,12 @@ def to_set_point(target: Plan, here: Angles, within_s: float, limits: Limits) ->
     candidate = within_s
     for _ in range(_TRIES):
         way = approached(target, here, 0.0, Approach(candidate)).samples()
+        if not (np.all((low <= way.angle) & (way.angle <= high)) and way.tilts().max() <= limits.tilt):
+            break  # a slower one would swing further
         fastest = float(way.speeds().max())
         if fastest <= limits.rate:
-            near = bool(np.all((low <= way.angle) & (way.angle <= high)))
-            if near and way.tilts().max() <= limits.tilt:
-                return Approach(candidate)
-            break
+            return Approach(candidate)
         candidate *= _SLOWER * fastest / limits.rate
-        if not candidate <= MAX_WITHIN_S:
-            break
     return shortest(target, here, limits).at_least(within_s)
 
 

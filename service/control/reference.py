@@ -184,8 +184,8 @@ class Plan:
             fastest = self.fastest()
         if not fastest <= limits.rate:
             raise FollowError(
-                f"the reference itself turns at {fastest:.2f} rad/s, and controller.max_reference_rate is "
-                f"{limits.rate:g} rad/s: no --in would do, only a slower or smaller reference"
+                f"the reference itself turns at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
+                f"{limits.rate:g} rad/s: no --in would do, only a slower or a smaller reference"
             )
         samples = self.samples()
         # A sinusoid with an amplitude beyond the limit passes through it, though its extremes may be level again.
@@ -193,7 +193,7 @@ class Plan:
         tilt = max(float(samples.tilts().max()), float(np.minimum(swings, pi).max()))
         if tilt > limits.tilt:
             raise FollowError(
-                f"the reference itself tilts by {degrees(tilt):.1f}°, and controller.max_reference_tilt_deg is "
+                f"the reference itself tilts by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
                 f"{degrees(limits.tilt):g}°: no --in would do"
             )
         if not limits.rolls and np.abs(samples.angle[:, 0]).max() > 0:

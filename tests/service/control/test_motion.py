@@ -227,8 +227,8 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
         followed.follow(reference, t, within_s)
         # At τ = 0 only c₀, c₁ and 2·c₂ count, which are the state itself; the products of three turns round on.
         tolerance = 100 * EPS * (1 + np.abs(now).max()) ** 2
-        for was, now in zip(before, followed.at(t), strict=True):
-            assert np.abs(was - now).max() <= tolerance
+        for left, right in zip(before, followed.at(t), strict=True):
+            assert np.abs(left - right).max() <= tolerance
 
 
 @settings(max_examples=75)
