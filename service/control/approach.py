@@ -1,12 +1,11 @@
 """Approach: the way from the present reference to another one, in a time that an operator chooses.
 
 Each axis brakes to rest, then all of them turn along a straight line of roll, pitch and yaw, from rest to rest, and
-each runs up to the rate of the reference that is reached; the run-up is a braking seen backwards. So between its start
-and its target no axis goes further beyond either than it takes to stop there. Neither braking nor run-up depends on the
-time given, and it changes the speed of the turn only, not its path: more time never makes an approach less possible,
-and the shortest time is known without a search.
+each runs up to the rate of the reference that is reached; the run-up is a braking seen backwards. So no axis goes
+further beyond its start or its target than it takes to stop there. The time given changes the speed of the turn and
+nothing else: more time never makes an approach less possible, and the shortest time is known without a search.
 
-A set-point of a stream is reached by a single quintic, which need not stop, where that stays within the same bounds.
+A set-point of a stream is reached by a single quintic, which need not stop, where that swings out no further.
 """
 
 from __future__ import annotations
@@ -163,7 +162,7 @@ def shortest(target: Plan, here: Angles, limits: Limits) -> Approach:
     if tilts.max() > max(limits.tilt, tilts[0], tilts[-1]) * _SLACK:
         raise FollowError(
             f"the approach tilts by {degrees(float(tilts.max())):.1f}°, more than controller.max_reference_tilt_deg = "
-            f"{degrees(limits.tilt):g}°: no --in would do, only a way in smaller steps"
+            f"{degrees(limits.tilt):g}°, however long it takes: go there in smaller steps"
         )
     if not still_s:
         return Approach(within_s)  # from rest to rest it is a single quintic

@@ -185,7 +185,7 @@ class Plan:
         if not fastest <= limits.rate:
             raise FollowError(
                 f"the reference itself turns at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
-                f"{limits.rate:g} rad/s: no --in would do, only a slower or a smaller reference"
+                f"{limits.rate:g} rad/s, however it is approached: make it slower or smaller"
             )
         samples = self.samples()
         # A sinusoid with an amplitude beyond the limit passes through it, though its extremes may be level again.
@@ -194,7 +194,7 @@ class Plan:
         if tilt > limits.tilt:
             raise FollowError(
                 f"the reference itself tilts by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
-                f"{degrees(limits.tilt):g}°: no --in would do"
+                f"{degrees(limits.tilt):g}°, however it is approached"
             )
         if not limits.rolls and np.abs(samples.angle[:, 0]).max() > 0:
             raise FollowError("this vehicle has no motor that rolls it: set its roll to 0")
