@@ -29,6 +29,13 @@ class ControllerSettings(BaseModel):
     max_reference_rate: float = Field(
         default=1.0, gt=0, le=100, description="largest angular velocity of an operator's reference [rad/s]"
     )
+    max_reference_braking: float = Field(
+        default=1.0,  # the Aero's motors turn it by 2.4 rad/s² in pitch at 24 V
+        ge=0.01,
+        le=100,
+        description="largest acceleration with which roll, pitch and yaw each brake before an operator's motion and "
+        "run up to a reference that moves; from the rate v an axis stops within 0.75 v² / this [rad/s²]",
+    )
     max_reference_tilt_deg: float = Field(
         default=60.0, gt=0, le=180, description="largest tilt of an operator's reference [deg]"
     )

@@ -1,19 +1,28 @@
 """Operator requests, references, gains and changes, with their bounds.
 
-A reference gives roll, pitch and yaw over time. A new one is joined to the one before by a quintic over `within_s`, so
-that angle, rate and acceleration never jump.
+A reference gives roll, pitch and yaw over time. A new one is approached from the one before within `within_s`: angle,
+rate and acceleration never jump.
 """
 
 from __future__ import annotations
 
 from math import isfinite, pi
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from aeroloop.protocol.wire.attitude import Vector
 
 MAX_POINTS: Final = 10_000
+MAX_WITHIN_S: Final = 600.0
 
 
 class Message(BaseModel):
@@ -118,7 +127,12 @@ class Track(Message):
     """Follow another reference from the next tick on."""
 
     reference: Reference
-    within_s: float = Field(default=2.0, ge=0.02, le=600, description="time to reach it from the present one [s]")
+    within_s: float = Field(
+        default=2.0,
+        ge=0.02,
+        le=MAX_WITHIN_S,
+        description="time to reach it from the present one; coming to rest takes as long as braking does [s]",
+    )
 
 
 class Change(Message):
@@ -131,12 +145,27 @@ class Change(Message):
     tick: int = Field(description="the first tick k of the law to which it applies")
     gains: Gains | None = Field(default=None, description="null: as before")
     reference: Reference | None = Field(default=None, description="null: as before")
-    within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: at once [s]")
+    within_s: float = Field(default=0.0, description="time to reach the reference from the one before; 0: a jump [s]")
     start: Angles | None = Field(
         default=None,
         description="where the approach to the reference starts, at rest; null: at the reference before [deg]",
     )
-    ease_s: float = Field(default=0.0, description="time before that to reduce the present acceleration to 0 [s]")
+    brake_s: Angles | None = Field(
+        default=None,
+        description="time of it in which roll, pitch, yaw each brake to rest first; null: a single quintic [s]",
+    )
+    run_up_s: Angles | None = Field(
+        default=None, description="time of it in which each runs up to the reference's rate at last [s]"
+    )
+    ease_s: float = Field(
+        default=0.0,
+        description="time before a single quintic to reduce the acceleration to 0; in older logs, 0 otherwise [s]",
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_null_times(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `brake_s` and `run_up_s` where they are null: those are the bytes of a single quintic so far."""
+        return {name: value for name, value in dump(self).items() if value is not None or not name.endswith("_s")}
 
 
 class Inject(Message):

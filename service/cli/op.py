@@ -15,7 +15,12 @@ if TYPE_CHECKING:
     from aeroloop.service.config import Settings
 
 Three = tuple[float, float, float]
-Within = Annotated[float, typer.Option("--in", metavar="S", help="Duration of the move, in s.")]
+Within = Annotated[
+    float,
+    typer.Option(
+        "--in", metavar="S", help="Time to get there, in s; too short a time is refused, and the shortest named."
+    ),
+]
 
 group = typer.Typer(no_args_is_help=True, help="Operate running roles over the network.")
 
@@ -153,7 +158,7 @@ def goto(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Turn smoothly to an attitude and hold it; a turn that would be too fast is refused."""
+    """Brake, turn to an attitude and hold it."""
     from aeroloop.protocol.messages.operator import Hold, Track
 
     settings = settings_of(config, overrides)
@@ -182,7 +187,7 @@ def track(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Follow another reference: a sinusoid, the current attitude, a file, or set-points published on `reference`."""
+    """Follow another reference: a sinusoid, a file, or set-points on `reference`; `hold` and `stream` brake at once."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.host.operator import read_points
 

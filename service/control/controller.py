@@ -20,7 +20,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.protocol.wire.transmit import SILENCE, Sender
 from aeroloop.service.control.law import LawSettings, law_function
-from aeroloop.service.control.reference import Motion
+from aeroloop.service.control.motion import Motion
 
 Codes = tuple[float, ...]
 

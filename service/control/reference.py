@@ -2,16 +2,14 @@
 
 Every reference is a sequence of pieces, and every piece a quintic plus a sinusoid, of which either may be zero. One
 CasADi function evaluates any piece: the desired quaternion, the angular velocity of (C.12) in the inertial frame and
-its derivative follow by CasADi's own derivatives, so they are exact and consistent. A new reference is joined to the
-present one by a quintic piece, so angle, rate and acceleration never jump, however often the reference changes.
+its derivative follow by CasADi's own derivatives, so they are exact and consistent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from math import acos, degrees, pi
+from math import degrees, pi
 from typing import Final, NamedTuple
 
 import casadi as ca
@@ -19,22 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Change, Hold, Points, Reference, Sinusoid
+from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
 from aeroloop.protocol.wire import attitude
-from aeroloop.protocol.wire.attitude import Quaternion, Vector
-from aeroloop.protocol.wire.symbolic import Buffer, Compiled
 
 Floats = NDArray[np.float64]
 
 POWERS: Final = 6
-_SAMPLES: Final = 65
+SAMPLES: Final = 65
 """Samples of a quintic. Its rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
 _TURNS: Final = 8
 _MOST_SAMPLES: Final = 100_000
-_SLOWER: Final = 1.05
-_TRIES: Final = 8
-_LONGEST_S: Final = 3600.0
-"""Longest approach tried [s]. One that would take longer begins too fast for any; it is tried again with an ease."""
 
 
 class FollowError(AeroloopError):
@@ -46,11 +38,13 @@ class Limits(NamedTuple):
 
     Attributes:
         rate: Largest angular velocity [rad/s].
+        braking: Largest acceleration with which roll, pitch and yaw each brake before a motion [rad/s²].
         tilt: Largest angle between the body's z axis and the vertical [rad].
         rolls: Whether the vehicle can roll; a 2-DOF bench cannot.
     """
 
     rate: float
+    braking: float
     tilt: float
     rolls: bool
 
@@ -61,6 +55,18 @@ class Angles(NamedTuple):
     angle: Floats
     rate: Floats
     acceleration: Floats
+
+    def speeds(self) -> Floats:
+        """Angular velocities [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ. Shape (n,)."""
+        square = (self.rate**2).sum(axis=1)
+        square -= 2 * self.rate[:, 0] * self.rate[:, 2] * np.sin(self.angle[:, 1])
+        speeds: Floats = np.sqrt(np.maximum(0.0, square))  # NaN stays NaN
+        return speeds
+
+    def tilts(self) -> Floats:
+        """Angles between the body's z axis and the vertical [rad]. Shape (n,)."""
+        tilts: Floats = np.arccos(np.clip(np.cos(self.angle[:, 0]) * np.cos(self.angle[:, 1]), -1.0, 1.0))
+        return tilts
 
 
 @dataclass(frozen=True)
@@ -109,26 +115,22 @@ class Plan:
         last[0, 0] = angles[-1]
         return cls._polynomial(times, np.concatenate([join(here, there, np.diff(times)), last]))
 
-    def joined(self, here: Angles, t: float, within_s: float, ease_s: float = 0.0) -> Plan:
-        """This plan from t + ease_s + within_s on, reached by a quintic from the state at t; shapes (1, 3).
+    @property
+    def first(self) -> Angles:
+        """The state at its start. Shapes (1, 3)."""
+        return Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
 
-        With `ease_s`, the present acceleration is first reduced to 0: a long approach that began with it would only get
-        faster.
+    def after(self, starts: Floats, lengths: Floats, knots: Angles) -> Plan:
+        """This plan from the last of these times on, preceded by quintics through the states at them.
+
+        Args:
+            starts: Times [s], increasing. Shape (n,).
+            lengths: Their differences, before they were rounded by an addition [s]. Shape (n − 1,).
+            knots: States, the last of them this plan's first. Shapes (n, 3).
         """
-        if ease_s:
-            eased = Angles(
-                here.angle + here.rate * ease_s + here.acceleration * ease_s**2 / 3,
-                here.rate + here.acceleration * ease_s / 2,
-                np.zeros((1, 3)),
-            )
-            rest = self.joined(eased, t + ease_s, within_s)
-            return self._polynomial(np.array([t]), join(here, eased, np.array([ease_s])))._then(rest)
-        later = replace(self, starts=self.starts + (t + within_s))
-        if not within_s:
-            return later
-        first = Angles(*(part[:1, 0] for part in self.at(np.zeros((len(self.starts), 1)))))
-        approach = self._polynomial(np.array([t]), join(here, first, np.array([within_s])))
-        return approach._then(later)
+        later = replace(self, starts=self.starts + starts[-1])
+        here, there = Angles(*(part[:-1] for part in knots)), Angles(*(part[1:] for part in knots))
+        return self._polynomial(starts[:-1], join(here, there, lengths))._then(later)
 
     def _then(self, later: Plan) -> Plan:
         return Plan(*(np.concatenate([getattr(p, name) for p in (self, later)]) for name in self.__annotations__))
@@ -155,7 +157,7 @@ class Plan:
     def samples(self) -> Angles:
         """All pieces, sampled densely enough for their extremes, concatenated. Shapes (n, 3)."""
         lengths = np.append(np.diff(self.starts), 0.0)
-        every = Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, _SAMPLES))))
+        every = Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, SAMPLES))))
         if not self.frequency[-1].any():
             return every
         return Angles(*(np.concatenate(both) for both in zip(every, self._swing(), strict=True)))
@@ -163,7 +165,7 @@ class Plan:
     def _swing(self) -> Angles:
         """The last piece's sinusoid over `_TURNS` periods of its slowest axis; its bounds if too many samples."""
         moving = self.frequency[-1][self.frequency[-1] > 0]
-        count = int(_TURNS * (_SAMPLES - 1) * moving.max() / moving.min()) + 1
+        count = int(_TURNS * (SAMPLES - 1) * moving.max() / moving.min()) + 1
         if count <= _MOST_SAMPLES:
             tau = np.zeros((len(self.starts), count))
             tau[-1] = np.linspace(0, _TURNS * 2 * pi / moving.min(), count)
@@ -173,32 +175,28 @@ class Plan:
         return Angles(signs[:, :3] * amplitude, signs[:, 3:] * amplitude * f, signs[:, :3] * amplitude * f * f)
 
     def fastest(self) -> float:
-        """The largest angular velocity [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ."""
-        angles = self.samples()
-        square = (angles.rate**2).sum(axis=1)
-        square -= 2 * angles.rate[:, 0] * angles.rate[:, 2] * np.sin(angles.angle[:, 1])
-        return float(np.sqrt(np.maximum(0.0, square).max()))  # NaN stays NaN
+        """The largest angular velocity [rad/s]."""
+        return float(self.samples().speeds().max())
 
     def check(self, limits: Limits) -> None:
-        """Raise FollowError if it goes beyond the limits."""
+        """Raise FollowError if the reference itself, however it is reached, goes beyond the limits."""
         with np.errstate(over="ignore", invalid="ignore"):  # a rate that is not finite counts as too fast
             fastest = self.fastest()
         if not fastest <= limits.rate:
             raise FollowError(
-                f"that would turn at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
-                f"{limits.rate:g} rad/s; allow more time, or a smaller motion"
+                f"the reference itself turns at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
+                f"{limits.rate:g} rad/s, however it is approached: make it slower or smaller"
             )
-        angle = self.samples().angle
-        tilt = acos(max(-1.0, float((np.cos(angle[:, 0]) * np.cos(angle[:, 1])).min())))
+        samples = self.samples()
         # A sinusoid with an amplitude beyond the limit passes through it, though its extremes may be level again.
         swings = (np.abs(self.amplitude) * (self.frequency > 0))[:, :2]
-        tilt = max(tilt, float(np.minimum(swings, pi).max()))
+        tilt = max(float(samples.tilts().max()), float(np.minimum(swings, pi).max()))
         if tilt > limits.tilt:
             raise FollowError(
-                f"that would tilt by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
-                f"{degrees(limits.tilt):g}°"
+                f"the reference itself tilts by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
+                f"{degrees(limits.tilt):g}°, however it is approached"
             )
-        if not limits.rolls and np.abs(angle[:, 0]).max() > 0:
+        if not limits.rolls and np.abs(samples.angle[:, 0]).max() > 0:
             raise FollowError("this vehicle has no motor that rolls it: set its roll to 0")
 
 
@@ -248,111 +246,3 @@ def reference_function() -> ca.Function:
         ["q_d", "omega_d", "omega_d_dot"],
         {"cse": True},  # the derivatives repeat sines and cosines: 12 instead of 36, and the same numbers
     )
-
-
-def at_rest(attitude: Vector) -> Angles:
-    """The state of a body at rest at roll, pitch, yaw [deg]. Shapes (1, 3)."""
-    return Angles(np.radians(np.array([attitude])), np.zeros((1, 3)), np.zeros((1, 3)))
-
-
-class Motion:
-    """The reference as the loop evaluates it, tick by tick.
-
-    Args:
-        reference: What to follow from t = 0 on.
-        shared: Memory for the outputs q_d, omega_d and omega_d_dot; own memory if None.
-
-    Attributes:
-        plan: The plan followed now.
-    """
-
-    def __init__(self, reference: Reference, shared: Mapping[str, Buffer] | None = None) -> None:
-        self._function = Compiled(reference_function(), shared)
-        self._time = self._function.inputs["t"]
-        self.plan = Plan.of(reference)
-        self._load(0)
-
-    def at(self, t: float) -> None:
-        """Write the desired motion at time t [s]; t never decreases between calls."""
-        if t >= self._until:
-            self._load(self.plan.piece(t))
-        self._time[0] = t
-        self._function()
-
-    def follow(
-        self,
-        target: Plan,
-        t: float,
-        within_s: float,
-        limits: Limits | None = None,
-        *,
-        ease_s: float = 0.0,
-        start: Vector | None = None,
-    ) -> None:
-        """Follow another plan, reached from the present one after `within_s`; its own time begins then.
-
-        Args:
-            target: What to follow.
-            t: The time now [s].
-            within_s: Time to reach it [s]; 0 jumps.
-            limits: Limits of the approach; None for no limits.
-            ease_s: Time before that to reduce the present acceleration to 0 [s].
-            start: Roll, pitch, yaw to begin from, at rest, instead of the present plan [deg].
-
-        Raises:
-            FollowError: The approach exceeds the limits; the present plan stays.
-        """
-        here = self._here(t) if start is None else at_rest(start)
-        plan = target.joined(here, t, within_s, ease_s)
-        if limits is not None and within_s:
-            count = plan.piece(t + ease_s + within_s) + 1  # pieces, up to the target's first
-            replace(plan, **{name: getattr(plan, name)[:count] for name in plan.__annotations__}).check(limits)
-        self.plan = plan
-        self._load(plan.piece(t))
-
-    def change(self, change: Change, period: float) -> None:
-        """Follow the reference of a change, if it has one, from its tick on; period in s."""
-        if change.reference is not None:
-            t = change.tick * period
-            self.follow(Plan.of(change.reference), t, change.within_s, ease_s=change.ease_s, start=change.start)
-
-    def attitude(self, t: float) -> Quaternion:
-        """q_d at time t [s]."""
-        self.at(t)
-        w, x, y, z = self._function.outputs["q_d"]
-        return w, x, y, z
-
-    def rest(self, t: float, within_s: float) -> Hold:
-        """The attitude reached when braking evenly to rest within `within_s` [s]."""
-        here = self._here(t)
-        roll, pitch, yaw = (degrees(float(angle)) for angle in here.angle[0] + here.rate[0] * within_s / 2)
-        return Hold(attitude=(roll, pitch, yaw))
-
-    def time_to_reach(
-        self, target: Plan, t: float, within_s: float, limits: Limits, start: Vector | None = None
-    ) -> tuple[float, float]:
-        """The times that keep an approach within the rate limit: `within_s`, at least as given, and `ease_s` [s]."""
-        here = self._here(t) if start is None else at_rest(start)
-        least = within_s
-        for ease_s in (0.0, least):
-            within_s = least
-            for _ in range(_TRIES):
-                fastest = target.joined(here, t, within_s, ease_s).fastest()
-                if fastest <= limits.rate:
-                    return within_s, ease_s
-                within_s = min(within_s * _SLOWER * fastest / limits.rate, _LONGEST_S)
-        return within_s, least
-
-    def _here(self, t: float) -> Angles:
-        i = self.plan.piece(t)
-        tau = np.zeros((len(self.plan.starts), 1))
-        tau[i] = t - self.plan.starts[i]
-        return Angles(*(part[i] for part in self.plan.at(tau)))
-
-    def _load(self, i: int) -> None:
-        plan, inputs = self.plan, self._function.inputs
-        self._until = float(plan.starts[i + 1]) if i + 1 < len(plan.starts) else float("inf")
-        inputs["start"][0] = plan.starts[i]
-        inputs["quintic"][:] = memoryview(plan.quintic[i].ravel())  # CasADi is column-major
-        inputs["amplitude"][:] = memoryview(plan.amplitude[i].copy())
-        inputs["frequency"][:] = memoryview(plan.frequency[i].copy())

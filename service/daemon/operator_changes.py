@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from math import degrees, radians
+from math import degrees, pi, radians
 from typing import Any, Final
 
 import zenoh
@@ -20,6 +20,7 @@ from aeroloop.protocol.messages.operator import Answer, Change, Gains, Hold, Poi
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.attitude import distance, to_euler
+from aeroloop.service.control.approach import nearest_turn
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import FollowError, Limits, Plan
@@ -27,7 +28,7 @@ from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
 from aeroloop.service.settings import ControllerSettings
 
 START_S: Final = 1.0
-"""Least time to reach a reference that is far away when a session begins [s]."""
+"""Least time to reach a reference that no operator gave a time for, at a session's start or a reload [s]."""
 
 
 def _action_text(reference: Reference) -> str:
@@ -91,7 +92,12 @@ class OperatorChanges:
     def configure(self, settings: ControllerSettings) -> None:
         """Take over limits."""
         self._settings = settings
-        self._limits = Limits(settings.max_reference_rate, radians(settings.max_reference_tilt_deg), self._rolls)
+        self._limits = Limits(
+            rate=settings.max_reference_rate,
+            braking=settings.max_reference_braking,
+            tilt=radians(settings.max_reference_tilt_deg),
+            rolls=self._rolls,
+        )
 
     def serve(self) -> None:
         """Serve operators' queries and set-points."""
@@ -118,7 +124,7 @@ class OperatorChanges:
                 self._stream = reference if isinstance(reference, Stream) else None
             else:
                 try:
-                    self.follow(reference, self.plan(reference), Track(reference=reference).within_s)
+                    self.follow(reference, self.plan(reference))
                 except FollowError as error:
                     self._role.event("fault", f"the configured reference is not followed: {error}", self._session)
         self.certify()
@@ -129,7 +135,7 @@ class OperatorChanges:
         """Begin a session with the present gains and reference; a stream starts at its last set-point."""
         self._controller, self._session = controller, session
         controller.set_gains(self._gains)
-        controller.motion.follow(Plan.of(self._reference), 0.0, 0.0)
+        controller.motion.follow(Plan.of(self._reference), 0.0)
         self._started_near = False
         self._trace.changes.append(Change(session=session, tick=0, gains=self._gains, reference=self._reference))
 
@@ -158,15 +164,16 @@ class OperatorChanges:
             return
         self._started_near = True
         roll, pitch, yaw = (degrees(angle) for angle in to_euler(attitude))
-        start = (roll if self._rolls else 0.0, pitch, yaw)
         target, t = Plan.of(self._reference), self._time
+        start = nearest_turn((roll if self._rolls else 0.0, pitch, yaw), target)
         away = degrees(distance(attitude, controller.motion.attitude(t)))
         if away <= self._settings.start_within_deg:
             return
-        within_s, _ = controller.motion.time_to_reach(target, t, START_S, self._limits, start)
-        controller.motion.follow(target, t, within_s, start=start)
-        self._record(reference=self._reference, within_s=within_s, start=start)
-        text = f"begins {away:.0f}° away from its reference: approaches within {within_s:.1f} s"
+        approach = controller.motion.shortest(target, t, self._limits._replace(tilt=pi), start)
+        approach = approach.at_least(START_S)
+        controller.motion.follow(target, t, approach)
+        self._record(reference=self._reference, **approach._asdict())
+        text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
         self._role.event("changed", text, self._session, self._k)
 
     # ── requests ──
@@ -209,20 +216,26 @@ class OperatorChanges:
         plan.check(self._limits)
         return plan
 
-    def follow(self, reference: Reference, plan: Plan, within_s: float) -> Answer:
-        """Follow a planned reference from this tick on."""
-        controller, target, t = self._running(), plan, self._time
+    def follow(self, reference: Reference, plan: Plan, within_s: float | None = None) -> Answer:
+        """Follow a planned reference from this tick on, reached in `within_s`; None for as long as it takes.
+
+        Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
+        """
+        motion, target, t = self._running().motion, plan, self._time
         held = reference
         if isinstance(reference, Stream) or (isinstance(reference, Hold) and reference.attitude is None):
-            held = controller.motion.rest(t, within_s)
+            held = motion.rest(t, self._limits)
             target = Plan.of(held)
-        controller.motion.follow(target, t, within_s, self._limits)
+            within_s = None
+        approach = motion.shortest(target, t, self._limits)
+        approach = approach.at_least(START_S) if within_s is None else approach.lasting(within_s, self._limits)
+        motion.follow(target, t, approach)
         self._reference = held
         self._stream = reference if isinstance(reference, Stream) else None
         self._setpoint = None  # of the previous stream
         self._last_setpoint_s = time.monotonic()
-        self._record(reference=held, within_s=within_s)
-        text = f"{_action_text(reference)} within {within_s:g} s"
+        self._record(reference=held, **approach._asdict())
+        text = f"{_action_text(reference)} within {approach.within_s:g} s"
         self._role.event("changed", text, self._session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
@@ -248,14 +261,14 @@ class OperatorChanges:
             return
         (hold, plan), self._setpoint, self._last_setpoint_s = self._setpoint, None, now
         motion, t = self._running().motion, self._time
-        within_s, ease_s = motion.time_to_reach(plan, t, stream.within_s, self._limits)
         try:
-            motion.follow(plan, t, within_s, self._limits, ease_s=ease_s)
+            approach = motion.to_set_point(plan, t, stream.within_s, self._limits)
         except FollowError as error:
             self._refuse(error)
             return
+        motion.follow(plan, t, approach)
         self._reference = hold
-        self._record(reference=hold, within_s=within_s, ease_s=ease_s)
+        self._record(reference=hold, **approach._asdict())
 
     def _refuse(self, error: Exception) -> None:
         self.refused += 1

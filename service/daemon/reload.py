@@ -20,6 +20,7 @@ LIVE: Final = {
         "controller.stale_s",
         "controller.telemetry_rate_hz",
         "controller.max_reference_rate",
+        "controller.max_reference_braking",
         "controller.max_reference_tilt_deg",
         "controller.auto_arm",
         "controller.require_certificate",

@@ -21,7 +21,8 @@ from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.protocol.wire.transmit import Sender
 from aeroloop.service.control.controller import ControllerSnapshot, resume
 from aeroloop.service.control.law import LawSettings, law_of_many
-from aeroloop.service.control.reference import Motion, reference_function
+from aeroloop.service.control.motion import Motion
+from aeroloop.service.control.reference import reference_function
 from aeroloop.service.logs.codes import encoded_by, levels
 from aeroloop.service.logs.traces import Array, Integers
 

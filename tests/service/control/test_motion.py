@@ -1,7 +1,8 @@
 """Reference under any sequence of operator's changes: never jumps, stays within limits, and arrives.
 
 Angles are compared with polynomials and sines written here, and q_d, ω_d, ω̇_d with those of the NumPy twin: the three
-turns by hand. Joins are checked just before and just after.
+turns by hand. Joins are checked just before and just after. Single quintics stand here; approaches that brake are in
+test_approach.py, with the same doubles.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from math import nextafter, pi, radians
 from typing import Any, Final
 
@@ -32,12 +32,14 @@ from aeroloop.protocol.messages.operator import (
     Track,
 )
 from aeroloop.protocol.wire.symbolic import buffer
-from aeroloop.service.control.reference import Angles, FollowError, Limits, Motion, Plan
+from aeroloop.service.control.approach import Approach, approached
+from aeroloop.service.control.motion import Motion
+from aeroloop.service.control.reference import Angles, FollowError, Limits, Plan
 from tests.support.numpy_twin import Array, Sinusoids
 
 EPS: Final = 2.0**-52
-NO_LIMITS = Limits(rate=1e9, tilt=pi, rolls=True)
-BENCH = Limits(rate=1.0, tilt=radians(60), rolls=False)
+NO_LIMITS = Limits(rate=1e9, braking=1e9, tilt=pi, rolls=True)
+BENCH = Limits(rate=1.0, braking=1.0, tilt=radians(60), rolls=False)
 """A 2-DOF bench as configured unless stated otherwise."""
 BODY = BENCH._replace(rolls=True)
 
@@ -88,6 +90,11 @@ def piece_states(plan: Plan, i: int, t: float | Array) -> tuple[Array, Array, Ar
         sum((n * c[n] * tau ** (n - 1) for n in powers[1:]), a * f * np.cos(f * tau)),
         sum((n * (n - 1) * c[n] * tau ** (n - 2) for n in powers[2:]), -a * f * f * np.sin(f * tau)),
     )
+
+
+def here(state: tuple[Array, Array, Array]) -> Angles:
+    """A state as code takes it."""
+    return Angles(*(part[None] for part in state))
 
 
 def quaternion(angles: Array) -> Array:
@@ -155,10 +162,12 @@ class Followed:
 
     def follow(self, reference: Reference, t: float, within_s: float, ease_s: float = 0.0) -> None:
         """Follow something else, and know the plan of that."""
-        angle, rate, acceleration = states(self.plan, t)
-        here = Angles(angle[None], rate[None], acceleration[None])
-        self.plan = Plan.of(reference).joined(here, t, within_s, ease_s)
-        self.motion.follow(Plan.of(reference), t, within_s, ease_s=ease_s)
+        self.approach(reference, t, Approach(within_s, ease_s=ease_s))
+
+    def approach(self, reference: Reference, t: float, approach: Approach) -> None:
+        """The same, by any approach."""
+        self.plan = approached(Plan.of(reference), here(states(self.plan, t)), t, approach)
+        self.motion.follow(Plan.of(reference), t, approach)
 
 
 def rounding(around: Sequence[tuple[Array, Array, Array]], t: float, within_s: float) -> Array:
@@ -181,13 +190,13 @@ def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
 ) -> None:
     """Of the plan before and the approach, of its two parts where it eases first, and of it and the target."""
     old, target = Plan.of(first), Plan.of(then)
-    here = states(old, t)
-    new = target.joined(Angles(*(part[None] for part in here)), t, within_s, ease_s)
+    now = states(old, t)
+    new = approached(target, here(now), t, Approach(within_s, ease_s=ease_s))
     parts = 2 if ease_s else 1
     assert len(new.starts) == parts + len(target.starts)
     assert new.starts[0] == t
     assert new.starts[parts] == t + ease_s + within_s
-    sides = [(here, piece_states(new, 0, t))]
+    sides = [(now, piece_states(new, 0, t))]
     sides += [
         (piece_states(new, i, new.starts[i + 1]), piece_states(new, i + 1, new.starts[i + 1])) for i in range(parts)
     ]
@@ -214,12 +223,12 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
     for reference, passed, within_s in changes:
         t += passed
         before = followed.at(t)
-        here = states(followed.plan, t)
+        now = states(followed.plan, t)
         followed.follow(reference, t, within_s)
         # At τ = 0 only c₀, c₁ and 2·c₂ count, which are the state itself; the products of three turns round on.
-        tolerance = 100 * EPS * (1 + np.abs(here).max()) ** 2
-        for was, now in zip(before, followed.at(t), strict=True):
-            assert np.abs(was - now).max() <= tolerance
+        tolerance = 100 * EPS * (1 + np.abs(now).max()) ** 2
+        for left, right in zip(before, followed.at(t), strict=True):
+            assert np.abs(left - right).max() <= tolerance
 
 
 @settings(max_examples=75)
@@ -311,35 +320,10 @@ def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> N
     plan = Plan.of(points)
     gaps = np.diff(points.times)
     for i, (start, gap) in enumerate(zip(plan.starts[1:], gaps, strict=True)):
-        here, there = piece_states(plan, i, plan.starts[i]), piece_states(plan, i + 1, start)
-        tolerance = rounding([here, there], float(start), float(gap)) + 1e-300
-        for order, (before, after) in enumerate(zip(piece_states(plan, i, start), there, strict=True)):
-            assert np.abs(before - after).max() <= tolerance[order]
-
-
-@settings(max_examples=75)
-@given(first=references, t=seconds(0, 10), within_s=withins)
-def test_resting_comes_to_rest_where_even_braking_ends(first: Reference, t: float, within_s: float) -> None:
-    followed = Followed(first)
-    angle, rate, _ = states(followed.plan, t)
-    rest = followed.motion.rest(t, within_s)
-    assert rest.attitude is not None
-    # From rate v to 0 at an even rate is ½ v T of way; degrees and back round thrice.
-    assert np.radians(rest.attitude) == pytest.approx(angle + rate * within_s / 2, abs=1e-12)
-    followed.follow(rest, t, within_s)
-    assert not np.any(followed.at(t + within_s)[1])
-    assert not np.any(followed.at(t + within_s + 9.0)[2])
-
-
-def test_resting_from_an_even_turn_only_ever_slows_down() -> None:
-    turning = Sinusoid(amplitude=(0.0, 30.0, 50.0), frequency=(0.0, 0.5, 0.4))
-    followed = Followed(turning)
-    rates = [states(followed.plan, 0.0)[1]]  # at t = 0 every axis is at its crest of rate
-    followed.follow(followed.motion.rest(0.0, 1.5), 0.0, 1.5)
-    rates += [states(followed.plan, t)[1] for t in np.linspace(0, 1.5, 301)]
-    for before, after in pairwise(rates):
-        assert np.all(after <= before + 1e-13)  # rounding of rates below 0.5 rad/s
-        assert np.all(after >= -1e-13)
+        before, there = piece_states(plan, i, plan.starts[i]), piece_states(plan, i + 1, start)
+        tolerance = rounding([before, there], float(start), float(gap)) + 1e-300
+        for order, (left, right) in enumerate(zip(piece_states(plan, i, start), there, strict=True)):
+            assert np.abs(left - right).max() <= tolerance[order]
 
 
 # The loop's function
@@ -438,48 +422,6 @@ def test_a_sinusoid_that_tilts_too_far_at_any_time_is_refused(reference: Sinusoi
         Plan.of(reference).check(BENCH)
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_an_approach_that_overflows_is_refused() -> None:
-    with pytest.raises(FollowError):
-        Motion(Hold()).follow(Plan.of(Hold(attitude=(0.0, 0.0, 1e308))), 0.0, 0.02, BENCH)
-
-
-@pytest.mark.parametrize(
-    ("target", "within_s", "limits", "why"),
-    [
-        (Hold(attitude=(0.0, 0.0, 90.0)), 2.0, BENCH, "max_reference_rate"),
-        (TOO_FAST, 2.0, BENCH, "max_reference_rate"),
-        (Hold(attitude=(0.0, 60.5, 0.0)), 2.0, BENCH._replace(rate=50.0), "max_reference_tilt_deg"),
-        (Hold(attitude=(3.0, 0.0, 0.0)), 2.0, BENCH, "roll"),
-    ],
-)
-def test_a_way_that_goes_too_far_is_refused_and_nothing_changes(
-    target: Reference, within_s: float, limits: Limits, why: str
-) -> None:
-    """It is asked for in the middle of another approach, whose end and what follows must come as before."""
-    followed, left_alone = Followed(Hold()), Followed(Hold())
-    points = Points(times=[0.0, 1.0, 2.5], attitudes=[(0.0, 5.0, 5.0), (0.0, 10.0, -5.0), (0.0, 0.0, 0.0)])
-    for one in (followed, left_alone):
-        one.follow(points, 0.0, 0.5)
-    for t in np.arange(0.0, 4.0, 0.05):
-        with pytest.raises(FollowError, match=why):
-            followed.motion.follow(Plan.of(target), float(t), within_s, limits)
-        for got, expected in zip(followed.at(float(t)), left_alone.at(float(t)), strict=True):
-            assert np.array_equal(got, expected)
-
-
-def test_a_way_within_the_limits_is_the_one_without_any() -> None:
-    limited, unlimited = Followed(Hold()), Followed(Hold())
-    target = Plan.of(Hold(attitude=(0.0, 0.0, 90.0)))
-    limited.motion.follow(target, 1.0, 3.0, BENCH)  # 15/8 · 90° within 3 s: 0.98 rad/s
-    unlimited.motion.follow(target, 1.0, 3.0)
-    with pytest.raises(FollowError, match="max_reference_rate"):
-        Motion(Hold()).follow(target, 1.0, 2.9, BENCH)  # 1.02 rad/s
-    for t in np.linspace(1.0, 5.0, 81):
-        for got, expected in zip(limited.at(float(t)), unlimited.at(float(t)), strict=True):
-            assert np.array_equal(got, expected)
-
-
 DENSE: Final = 30 * 64 + 1
 """Times, among which are the 65 that are sampled."""
 
@@ -493,10 +435,10 @@ direction that is fastest at any time is such a quartic."""
 @given(first=references, target=holds, t=seconds(0, 5), within_s=seconds(0.2, 5.0))
 def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hold, t: float, within_s: float) -> None:
     """Without roll, where Σ rate² is all; from any state, so from any acceleration."""
-    here = [part * [0.0, 1.0, 1.0] for part in states(Plan.of(first), t)]
+    angle, rate, acceleration = (part * [0.0, 1.0, 1.0] for part in states(Plan.of(first), t))
     assert target.attitude is not None
     level = Plan.of(Hold(attitude=(0.0, *target.attitude[1:])))
-    plan = level.joined(Angles(*(part[None] for part in here)), t, within_s)
+    plan = approached(level, here((angle, rate, acceleration)), t, Approach(within_s))
     _, rates, _ = piece_states(plan, 0, t + within_s * np.linspace(0, 1, DENSE)[:, None])
     fastest = np.linalg.norm(rates, axis=1).max()
     # 1e-9: rounding of terms 15 (5/T) times the angles, at most 400, that cancel; in what is hardly moving, too.
@@ -506,8 +448,9 @@ def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hol
 
 def test_the_fastest_is_found_where_it_falls_between_samples() -> None:
     """A turn that brakes hard and comes back; every other sample alone would miss its crest by 0.9 %."""
-    here = Angles(*(np.array([[0.0, 0.0, x]]) for x in (0.0, 0.38, -4.92)))
-    plan = Plan.of(Hold(attitude=(0.0, 0.0, float(np.degrees(0.24))))).joined(here, 0.0, 2.95)
+    braking = Angles(*(np.array([[0.0, 0.0, x]]) for x in (0.0, 0.38, -4.92)))
+    target = Plan.of(Hold(attitude=(0.0, 0.0, float(np.degrees(0.24)))))
+    plan = approached(target, braking, 0.0, Approach(2.95))
     _, rates, _ = piece_states(plan, 0, 2.95 * np.linspace(0, 1, DENSE)[:, None])
     assert np.abs(rates).max() <= plan.fastest() * QUARTIC_BETWEEN_SAMPLES
 
@@ -534,43 +477,6 @@ def test_a_sinusoids_fastest_is_that_of_its_angular_velocity(
     fastest = max(np.linalg.norm(followed.at(t)[1]) for t in np.linspace(0, period, DENSE))
     # 64 samples a period are at most 0.05 rad from a crest, and ω² there has harmonics up to the third or so with roll.
     assert followed.plan.fastest() == pytest.approx(fastest, rel=5e-3, abs=1e-9)
-
-
-@settings(max_examples=75)
-@given(start=holds, target=holds, asked_s=withins, rate=st.integers(1, 40).map(lambda n: n / 10))
-def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
-    start: Hold, target: Hold, asked_s: float, rate: float
-) -> None:
-    followed, plan = Followed(start), Plan.of(target)
-    limits = Limits(rate=rate, tilt=pi, rolls=True)
-    within_s, ease_s = followed.motion.time_to_reach(plan, 0.0, asked_s, limits)
-    assert ease_s == 0.0  # there is no acceleration to let go
-    here = Angles(*(part[None] for part in states(followed.plan, 0.0)))
-    asked = plan.joined(here, 0.0, asked_s).fastest()
-    assert plan.joined(here, 0.0, within_s).fastest() <= rate
-    assert within_s >= asked_s
-    if asked <= rate:
-        assert within_s == asked_s
-    else:
-        # Rates fall as the time grows: the least is asked_s · asked / rate, and 5 % more is what is taken at once.
-        assert within_s == pytest.approx(asked_s * asked / rate * 1.05, rel=1e-9)
-
-
-def test_time_to_reach_changes_nothing() -> None:
-    followed, left_alone = Followed(Sinusoid()), Followed(Sinusoid())
-    followed.motion.time_to_reach(Plan.of(Hold(attitude=(0.0, 0.0, 170.0))), 1.0, 0.2, BENCH)
-    for got, expected in zip(followed.at(1.5), left_alone.at(1.5), strict=True):
-        assert np.array_equal(got, expected)
-
-
-def test_a_far_set_point_in_the_middle_of_a_quick_one_is_reached_within_the_limit() -> None:
-    followed = Followed(Stream())
-    near, far = (Hold(attitude=(0.0, 0.0, yaw)) for yaw in (1.0, 170.0))
-    followed.follow(near, 0.0, *followed.motion.time_to_reach(Plan.of(near), 0.0, 0.2, BENCH))
-    within_s, ease_s = followed.motion.time_to_reach(Plan.of(far), 0.04, 0.2, BENCH)
-    followed.follow(far, 0.04, within_s, ease_s)
-    assert followed.plan.fastest() <= BENCH.rate
-    assert within_s < 60.0
 
 
 # What the verbs refuse

@@ -9,7 +9,7 @@ import pytest
 
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
 from aeroloop.protocol.wire.symbolic import buffer
-from aeroloop.service.control.reference import Motion
+from aeroloop.service.control.motion import Motion
 from tests.support.numpy_twin import Array, Sinusoids
 
 PAPER = Sinusoid()

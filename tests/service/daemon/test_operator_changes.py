@@ -256,7 +256,8 @@ class Loop:
         """From the configuration, the frames and the changes, as the review does: byte for byte."""
         for session, ticks in self.log.items():
             again = self.fresh()
-            changes = [change for change in self.trace.changes if change.session == session]
+            logged = [change.encode() for change in self.trace.changes if change.session == session]
+            changes = [Change.model_validate_json(text) for text in logged]
             for k, frame, command in ticks:
                 while changes and changes[0].tick <= k:
                     again.apply(changes.pop(0))
@@ -411,17 +412,64 @@ def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop
     loop.ask("track", Track(reference=Sinusoid(amplitude=(0.0, 0.0, 20.0), frequency=(0.0, 0.0, 0.4)), within_s=0.5))
     loop.run(1.0)
     before = loop.yaw()
-    asked = loop.ask("track", Track(reference=reference, within_s=0.8))
-    loop.run(1.0)
+    asked = loop.ask("track", Track(reference=reference, within_s=0.02))  # brakes at once, whatever is given
+    loop.run(1.1)
     assert asked.answers[0].done
     rest = loop.changes()[-1].reference
     assert isinstance(rest, Hold)
     assert rest.attitude is not None
-    assert rest.attitude[2] > before + 1.0  # it was turning by 7°/s
+    assert before + 0.4 < rest.attitude[2] < before + 1.0  # 0.75 v² / 1 rad/s² of 6.5 to 8°/s, and a little
     assert loop.yaw() == pytest.approx(rest.attitude[2], abs=1e-12)
     loop.end()
     loop.begin()
     assert loop.changes()[0].reference == rest  # and there the next session begins, not at 0
+
+
+def test_going_back_in_the_middle_of_a_turn_brakes_first_and_never_swings_out(time: FakeTime) -> None:
+    """Yaw 70°, turning by 12°/s, and 40 s to go to 30°: a single quintic would turn on to 115°."""
+    del time
+    loop = Loop(Sinusoid(amplitude=(0.0, 0.0, 100.0), frequency=(0.0, 0.0, 0.17)), ControllerSettings())
+    loop.begin()
+    loop.run(4.56)
+    assert loop.yaw() == pytest.approx(70.0, abs=0.1)
+    asked = loop.ask("track", Track(reference=Hold(attitude=(0.0, 0.0, 30.0)), within_s=40.0))
+    loop.tick()
+    assert asked.answers[0].text == "aero turns to roll 0°, pitch 0°, yaw 30° within 40 s"
+    yaws = [loop.yaw()]
+    for _ in range(round(40.0 / PERIOD)):
+        loop.tick()
+        yaws.append(loop.yaw())
+    assert max(yaws) < 70.0 + 2.2  # 0.75 v² / 1 rad/s² is 1.9°, and it was still speeding up or slowing down
+    assert min(yaws) == yaws[-1] == pytest.approx(30.0, abs=1e-9)
+    loop.assert_it_runs_again()
+
+
+@pytest.mark.parametrize("at_s", [2.0, 7.0, 12.0, 17.0, 22.0, 33.0])
+def test_more_time_than_needed_is_never_too_much(time: FakeTime, at_s: float) -> None:
+    """Going to 0 within 60 s in the middle of the default sinusoid; a single quintic would tilt upside down."""
+    del time
+    loop = Loop(Sinusoid(), ControllerSettings())
+    loop.begin()
+    loop.tick()
+    loop.k = round(at_s / PERIOD)
+    loop.tick()
+    asked = loop.ask("track", Track(reference=LEVEL, within_s=60.0))
+    loop.tick()
+    assert asked.answers[0].done, asked.answers[0].text
+
+
+def test_a_time_that_is_too_short_is_refused_and_the_one_that_is_named_accepted(loop: Loop) -> None:
+    loop.ask("track", Track(reference=SWING, within_s=1.0))
+    loop.run(2.0)
+    refused = loop.ask("track", Track(reference=Hold(attitude=(0.0, 0.0, 60.0)), within_s=0.5))
+    loop.tick()
+    answer = refused.answers[0]
+    assert not answer.done
+    named = float(answer.text.split("; --in ")[1].removesuffix(" would do"))
+    for within_s, done in ((0.9 * named, False), (1.02 * named, True)):  # it has moved on by two ticks meanwhile
+        asked = loop.ask("track", Track(reference=Hold(attitude=(0.0, 0.0, 60.0)), within_s=within_s))
+        loop.tick()
+        assert asked.answers[0].done == done
 
 
 # A stream
@@ -604,6 +652,18 @@ def test_a_session_that_begins_far_from_its_reference_goes_there_from_where_the_
     assert len(loop.changes()) == 2
 
 
+def test_a_session_goes_to_its_reference_by_less_than_a_turn(loop: Loop) -> None:
+    """A body at −60° is at 300°, too; to 350° it goes from there, not the 410° from −60°."""
+    loop.ask("track", Track(reference=Hold(attitude=(0.0, 0.0, 350.0)), within_s=20.0))
+    loop.tick()
+    loop.end()
+    loop.begin()
+    loop.tick(turned(-60.0))
+    way = loop.changes()[-1]
+    assert way.start == pytest.approx((0.0, 0.0, 300.0), abs=1.0)
+    assert way.within_s == pytest.approx(radians(50) * 15 / 8, rel=0.03)
+
+
 def test_a_session_that_begins_near_its_reference_follows_it_at_once(loop: Loop) -> None:
     loop.end()
     loop.begin()
@@ -661,6 +721,13 @@ def test_limits_that_are_read_again_hold_for_what_is_asked_next(loop: Loop) -> N
     loop.tick()
     assert not asked.answers[0].done
     assert "max_reference_tilt_deg = 10" in asked.answers[0].text
+
+
+def test_a_configured_reference_that_is_far_away_is_reached_as_soon_as_the_limits_allow(loop: Loop) -> None:
+    loop.role.later(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 0.0, 170.0))))
+    loop.tick()
+    assert loop.events("fault") == []
+    assert loop.changes()[-1].within_s == pytest.approx(radians(170) * 15 / 8, rel=1e-9)
 
 
 def test_a_configured_reference_beyond_the_limits_is_reported_and_ends_nothing(loop: Loop) -> None:

@@ -92,13 +92,16 @@ class Run:
             C2=tuple(rng.uniform(0.05, 0.3, 3)) if rng.random() < 0.5 else None,
             Gamma=tuple(rng.uniform(0.01, 0.5, 3)),
         )
+        brakes = rng.random() < 0.4
         return Change(
             session="s1",
             tick=k,
             gains=gains if rng.random() < 0.7 else None,
             reference=REFERENCES[rng.integers(len(REFERENCES))],
-            within_s=float(rng.choice([0.0, 0.05, 0.5])),
-            ease_s=float(rng.choice([0.0, 0.1])),
+            within_s=0.5 if brakes else float(rng.choice([0.0, 0.05, 0.5])),
+            brake_s=(0.0, 0.123, 0.2) if brakes else None,
+            run_up_s=(0.0, 0.2, 0.017) if brakes else None,
+            ease_s=0.0 if brakes else float(rng.choice([0.0, 0.1])),
             start=(0.0, 3.0, -7.0) if rng.random() < 0.2 else None,
         )
 
