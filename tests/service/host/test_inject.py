@@ -34,7 +34,9 @@ def plant(capsys: pytest.CaptureFixture[str]) -> Iterator[tuple[Inject, Callable
         thread.start()
 
         def inject(*arguments: str) -> tuple[int, str, str]:
-            code = execute(["op", "inject", *arguments, "--set", f"network.rendezvous=tcp/127.0.0.1:{gathering.ports[0]}"])
+            code = execute(
+                ["op", "inject", *arguments, "--set", f"network.rendezvous=tcp/127.0.0.1:{gathering.ports[0]}"]
+            )
             return code, *capsys.readouterr()
 
         def faults() -> list[str]:
