@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import time
+from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Ask, Message, Points
 from aeroloop.protocol.transport.network import NetworkSettings, join
 
@@ -79,6 +80,30 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         if topic == "arm":
             texts += [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
         return "; ".join(texts)
+
+
+def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> SessionRecord:
+    """Gains and reference of a vehicle's controller: of several, the one with the session, if any.
+
+    With `last`, those of the last session that ended, by the plant's record.
+
+    Raises:
+        NetworkError: The network cannot be joined.
+        OperatorError: No controller answers, or the plant has no record.
+    """
+    found: list[SessionRecord] = []
+    with join(network) as session:
+        deadline = time.monotonic() + GATHER_S
+        while time.monotonic() < deadline and not any(record.session for record in found):
+            for payload in _replies(session, "show", vehicle, Ask()):
+                with suppress(ValidationError):
+                    record = SessionRecord.model_validate_json(payload)
+                    found += [record] if (record.ended is not None) == last else []
+            time.sleep(0.02)
+    if not found:
+        which = f"plant of {vehicle} with a record of a session" if last else f"controller of {vehicle}"
+        raise OperatorError(f"no {which} answers at {network.rendezvous}")
+    return next((record for record in found if record.session), found[0])
 
 
 def read_points(path: Path) -> Points:
@@ -152,7 +177,11 @@ def _query(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic
 
 
 def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:
+    return [Answer.model_validate_json(payload) for payload in _replies(session, topic, vehicle, message)]
+
+
+def _replies(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[bytes]:
     replies = session.get(
         topics.key(topic, vehicle), payload=message.encode(), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL
     )
-    return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]

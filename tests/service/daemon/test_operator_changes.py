@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.models import Event, SessionRecord
 from aeroloop.protocol.messages.operator import (
     Answer,
     Change,
@@ -45,6 +45,8 @@ from aeroloop.service.settings import ControllerSettings
 PERIOD = 0.002
 LAW = LawSettings()
 LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
+CONFIGURED = ControllerSettings(after_restart="configured")
+"""Which session begins with what: test_session_start.py."""
 WIRE = WireSpec(
     attitude=SignalSpec(bits=None, limit=1.0),
     rate=SignalSpec(bits=None, limit=5.0),
@@ -183,12 +185,12 @@ class Loop:
 
     # The loop
 
-    def begin(self) -> None:
-        """A session is granted."""
+    def begin(self, last: SessionRecord | None = None) -> None:
+        """A session is granted, with the plant's record of the one before."""
         self.session = f"s{len(self.log)}"
         self.log[self.session] = []
         self.controller, self.k = self.fresh(), 0
-        self.live.begin(self.controller, self.session)
+        self.live.begin(self.controller, self.session, last)
 
     def end(self) -> None:
         """The session is over."""
@@ -275,7 +277,7 @@ def time(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
 @pytest.fixture
 def loop(time: FakeTime) -> Iterable[Loop]:  # noqa: ARG001  # the clock must stand still before OperatorChanges looks at it
     """A session at tick 0, level; whatever a test does to it, its log must run again."""
-    loop = Loop(LEVEL, ControllerSettings())
+    loop = Loop(LEVEL, CONFIGURED)
     loop.begin()
     yield loop
     loop.assert_it_runs_again()
@@ -680,7 +682,7 @@ def test_whatever_streams_however_quickly_the_limits_hold(
     sent: list[tuple[tuple[float, float, float], int]], within_s: float
 ) -> None:
     """Set-points anywhere, some of them too tilted, up to 0.8 s from each other, most in the middle of the last."""
-    loop = Loop(Stream(within_s=within_s), ControllerSettings())
+    loop = Loop(Stream(within_s=within_s), CONFIGURED)
     loop.begin()
     for attitude, ticks in [*sent, ((0.0, 0.0, 0.0), 1500)]:
         loop.raw(Setpoint(attitude=attitude).encode())
@@ -732,16 +734,18 @@ steps: st.SearchStrategy[tuple[str, Any]] = st.one_of(
 @settings(max_examples=40)
 @given(
     configured=st.one_of(st.just(Sinusoid()), st.just(LEVEL), st.just(Stream())),
+    after_restart=st.sampled_from(["hold", "resume", "configured"]),
     history=st.lists(steps, min_size=4, max_size=25),
 )
 def test_from_the_logged_changes_a_fresh_controller_gives_the_same_commands_byte_for_byte(
-    configured: Reference, history: list[tuple[str, Any]]
+    configured: Reference, after_restart: str, history: list[tuple[str, Any]]
 ) -> None:
     fake = FakeTime()
     with pytest.MonkeyPatch.context() as patch:
         for module in (throttle, role, live):
             patch.setattr(module, "time", fake)
-        loop = Loop(configured, ControllerSettings(max_reference_rate=50.0))
+        given = {"max_reference_rate": 50.0, "after_restart": after_restart}
+        loop = Loop(configured, ControllerSettings.model_validate(given))
         loop.begin()
         for what, value in [*history, ("ticks", [[0.1, 0.0, 0.2, 0.0, 0.1, 0.3]] * 30)]:
             match what:
