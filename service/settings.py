@@ -45,6 +45,12 @@ class ControllerSettings(BaseModel):
         le=360,
         description="a session that begins further than this from its reference first approaches it smoothly [deg]",
     )
+    after_restart: Literal["hold", "resume", "configured"] = Field(
+        default="hold",
+        description="what a session begins with. hold: the attitude found, until `op goto` or `op track`; resume: the "
+        "gains of the vehicle's last session and, unless an operator stopped it, its reference; configured: those of "
+        "the configuration, and after a trip those of the session before",
+    )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is on the network")
     require_certificate: bool = Field(
         default=False,

@@ -15,9 +15,9 @@ except after `stop`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal, SessionRecord
 from aeroloop.protocol.messages.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
 from aeroloop.protocol.messages.trace import Operation, OperationKind, Outcome
 from aeroloop.protocol.wire.loop import FIRST_COMMAND_S
@@ -61,6 +61,7 @@ class Tenancy:
         voltages: In force from the last tick to the next command [V]. Shape (actuators,).
         refused: Malformed frames so far.
         stale: Commands so far that answered a measurement older than the watchdog's time.
+        last: Record of the last session, for the next controller; None if it left none.
         unavailable: Reason set by the owner to refuse every claim, such as a bus fault; None for none.
     """
 
@@ -78,7 +79,9 @@ class Tenancy:
         self.off = (0.0,) * wire.actuators
         self.voltages: tuple[float, ...] = self.off
         self.refused = self.stale = 0
+        self.last: SessionRecord | None = None
         self.unavailable: str | None = None
+        self._record: SessionRecord | None = None  # of the running session
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self.cause: str | None = None if armed else "not armed since it was started"
         self._operator_only = False  # whether only an operator's `arm` clears the latch
@@ -132,14 +135,24 @@ class Tenancy:
         self.operated("claim", claim=claim)
         self._begin()
         self._notice("claimed", f"granted to {claim.controller}")
-        return Grant(session=claim.session)
+        return Grant(session=claim.session, last=self.last)
+
+    def keep(self, record: SessionRecord) -> bool:
+        """Keep the record of the running session, until its end or the next one. False if it is of another session.
+
+        It changes nothing that a tick does, so it is no Operation.
+        """
+        if self.session is None or (record.session, record.controller) != (self.session, self.holder):
+            return False
+        self._record = record
+        return True
 
     def release(self, session: str) -> bool:
         """End the session on its holder's request: 0 V. False if another session or none runs."""
         if session != self.session:
             return False
         self.operated("release", name=session)
-        self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}")
+        self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}", "released")
         return True
 
     def arm(self) -> bool:
@@ -157,6 +170,8 @@ class Tenancy:
         self.operated("stop", cause=cause, reason=reason)
         self._trip(cause, reason)
         self._operator_only = True
+        if self.last is not None:
+            self.last = self.last.model_copy(update={"ended": cause})
 
     def lost(self, controller: str) -> None:
         """Trip if this controller, having lost its liveliness token, holds the plant."""
@@ -193,15 +208,18 @@ class Tenancy:
         """Set 0 V when a session has ended."""
 
     def _trip(self, cause: TripCause, reason: str) -> None:
-        self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V")
+        self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V", cause)
         self.cause, self.trip = f"{reason}: 0 V", cause
 
     def _clear(self) -> None:
         self.cause = self.trip = None
         self._machine.fire(PlantTrigger.ARM)
 
-    def _end(self, trigger: PlantTrigger, kind: EventKind, text: str) -> None:
+    def _end(self, trigger: PlantTrigger, kind: EventKind, text: str, ended: TripCause | Literal["released"]) -> None:
         self._notice(kind, text)
+        if self.session is not None:
+            how = {"ended": ended, "ended_tick": self.event_tick}
+            self.last, self._record = self._record and self._record.model_copy(update=how), None
         self._machine.fire(trigger)
         self.session = self.holder = None
         self._rest()

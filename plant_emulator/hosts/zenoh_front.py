@@ -21,7 +21,7 @@ from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, FaultStatus, Grant, Refusal, Release, Status
+from aeroloop.protocol.messages.models import Claim, FaultStatus, Grant, Refusal, Release, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Ask
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s
@@ -78,6 +78,8 @@ class ZenohFront(Front):
         role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
+        role.serve("record", SessionRecord, lambda record: lambda: self._keep(record))
+        role.serve("show", Ask, lambda _: self._show)
         role.serve("arm", Ask, lambda _: self._arm)
         role.serve("stop", Ask, lambda _: self._stop)
         role.watch_tokens(self._token)
@@ -189,6 +191,13 @@ class ZenohFront(Front):
     def _release(self, release: Release) -> Answer:
         done = self._endpoint.release(release.session)
         return Answer(done=done, text="released" if done else f"no session {release.session} runs here")
+
+    def _keep(self, record: SessionRecord) -> Answer:
+        done = self._endpoint.keep(record)
+        return Answer(done=done, text="kept" if done else f"no session {record.session} of {record.controller} runs")
+
+    def _show(self) -> SessionRecord | Answer:
+        return self._endpoint.last or Answer(done=False, text=f"{self._role.vehicle} has no record of a session")
 
     def _arm(self) -> Answer:
         vehicle = self._role.vehicle

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, PlainSerializer, StringConstraints
 
-from aeroloop.protocol.messages.operator import Message
+from aeroloop.protocol.messages.operator import Gains, Message, Reference
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.spec import WireSpec
 
 PROTOCOL_VERSION: Final = 2
@@ -17,6 +18,10 @@ PROTOCOL_VERSION: Final = 2
 EventKind = Literal[
     "armed", "changed", "claimed", "refused", "released", "tripped", "lost", "started", "stopped", "fault"
 ]
+
+
+Source = Literal["configured", "operator", "resumed", "held"]
+"""Where gains or a reference come from: the configuration, an operator, the session before, or the attitude found."""
 
 
 def _no_other_topics_key(session: str) -> str:
@@ -43,11 +48,29 @@ class Claim(Message):
     wire: Annotated[WireSpec, PlainSerializer(WireSpec.agreed)]
 
 
+class SessionRecord(Message):
+    """Gains and reference of a session. The plant keeps the last one for the next controller, with how it ended."""
+
+    controller: str
+    session: str | None = Field(description="null: none runs, and the next one begins so")
+    gains: Gains = Field(description="all three")
+    gains_from: Source
+    reference: Reference = Field(description="a hold without attitude: the attitude that the session finds")
+    reference_from: Source
+    within_s: float = Field(ge=0, description="time in which the reference was to be reached [s]")
+    since_tick: int = Field(ge=0, description="the session's tick from which the reference applies")
+    ended: TripCause | Literal["released"] | None = Field(
+        default=None, description="how the session ended; an operator's stop since then replaces it"
+    )
+    ended_tick: int | None = Field(default=None, description="the session's last tick")
+
+
 class Grant(Message):
     """The plant's answer to a claim it accepts. The first measurement follows at once."""
 
     granted: Literal[True] = True
     session: str
+    last: SessionRecord | None = Field(default=None, description="the last session's record; null if there is none")
 
 
 class Refusal(Message):
@@ -150,6 +173,10 @@ class Status(Message):
     faults: list[FaultStatus] = Field(
         default_factory=list, description="emulated plant: faults that act, have acted, or are to come"
     )
+    gains: Gains | None = Field(default=None, description="controller: its gains, of the next session if none runs")
+    gains_from: Source | None = None
+    reference: str | None = Field(default=None, description="controller: its reference, in words; likewise")
+    reference_from: Source | None = None
 
 
 class Telemetry(Message):

@@ -105,6 +105,25 @@ class Stream(Message):
 Reference = Annotated[Sinusoid | Hold | Points | Stream, Field(discriminator="kind")]
 
 
+def in_words(reference: Reference) -> str:
+    """A reference in a few words."""
+    match reference:
+        case Sinusoid(amplitude=amplitude):
+            return f"a sinusoid of {_degrees(amplitude)}"
+        case Hold(attitude=None):
+            return "where it is"
+        case Hold(attitude=attitude) if attitude is not None:
+            return _degrees(attitude)
+        case Points(times=times):
+            return f"{len(times)} points over {times[-1]:g} s"
+        case _:
+            return "a stream of set-points"
+
+
+def _degrees(angles: Vector) -> str:
+    return "roll, pitch, yaw " + ", ".join(f"{angle:.4g}°" for angle in angles)
+
+
 class Setpoint(Message):
     """One message of a live stream of set-points."""
 
@@ -126,7 +145,7 @@ class Ask(Message):
 class Track(Message):
     """Follow another reference from the next tick on."""
 
-    reference: Reference
+    reference: Reference | None = Field(description="null: the one that the controller is configured with")
     within_s: float = Field(
         default=2.0,
         ge=0.02,

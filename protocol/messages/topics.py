@@ -10,7 +10,17 @@ import re
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from aeroloop.protocol.messages.models import Claim, Description, Event, Loss, Release, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import (
+    Claim,
+    Description,
+    Event,
+    Loss,
+    Release,
+    SessionRecord,
+    Status,
+    Telemetry,
+    Truth,
+)
 from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Setpoint, Track
 
 ROOT: Final = "aeroloop"
@@ -57,10 +67,12 @@ TOPICS: Final = {
     for topic in (
         Topic("claim", "claim", "query", "controller", "once a session", Claim),
         Topic("release", "release", "query", "controller", "once a session", Release),
+        Topic("record", "record", "query", "controller", "at a session's start and on change", SessionRecord),
         Topic("arm", "arm", "query", "operator", "when needed"),
         Topic("stop", "stop", "query", "operator", "when needed"),
         Topic("stand_down", "stand-down", "query", "operator", "when needed"),
         Topic("recall", "recall", "query", "operator", "when needed"),
+        Topic("show", "show", "query", "operator", "when needed"),
         Topic("set_gains", "set-gains", "query", "operator", "when needed", Gains),
         Topic("track", "track", "query", "operator", "when needed", Track),
         Topic("inject", "inject", "query", "operator", "when needed", Inject),

@@ -66,6 +66,28 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
 
 
 @group.command()
+def show(
+    last: Annotated[bool, typer.Option("--last", help="Of the last session, by the plant's record.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print gains and reference as the commands that set them."""
+    settings = settings_of(config, overrides)
+    from aeroloop.service.host.operator import show as record_of
+
+    with guarded():
+        record = record_of(settings.network, settings.vehicle, last=last)
+    if json:
+        typer.echo(record.model_dump_json(indent=2))
+    else:
+        from aeroloop.service.terminal.as_commands import as_commands
+
+        options = [*(["--config", str(config)] if config else []), *(w for o in overrides or () for w in ("--set", o))]
+        typer.echo("\n".join(as_commands(record, options)))
+
+
+@group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
     """Arm the plant for the next claim, and let controllers that hold or are faulted claim again."""
     _send(settings_of(config, overrides), "arm")
@@ -170,7 +192,8 @@ def goto(
 @group.command()
 def track(
     what: Annotated[
-        str, typer.Argument(help="sinusoid, hold, stream, or a CSV file of time (s), roll, pitch, yaw (deg).")
+        str,
+        typer.Argument(help="configured, sinusoid, hold, stream, or a CSV file of time (s), roll, pitch, yaw (deg)."),
     ],
     within_s: Within = 2.0,
     amplitude: Annotated[
@@ -187,7 +210,7 @@ def track(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Follow another reference: a sinusoid, a file, or set-points on `reference`; `hold` and `stream` brake at once."""
+    """Follow another reference: configured, a sinusoid, a file, or set-points; `hold` and `stream` brake at once."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.host.operator import read_points
 
@@ -198,8 +221,10 @@ def track(
     if misplaced:
         fail(f"{what} takes no --{misplaced.pop().removesuffix('_s')}", 2)
     with checked():
-        reference: Reference
+        reference: Reference | None
         match what:
+            case "configured":
+                reference = None
             case "sinusoid":
                 reference = Sinusoid.model_validate(options)
             case "hold":

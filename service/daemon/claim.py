@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release
+from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, SessionRecord
 from aeroloop.protocol.messages.operator import Answer
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
@@ -36,6 +36,7 @@ class ClaimClient:
     Attributes:
         auto_arm: As given; may change.
         session: The granted session, or None.
+        last: Record of the vehicle's last session, from the last grant; None if the plant has none.
     """
 
     def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
@@ -45,6 +46,8 @@ class ClaimClient:
         self.auto_arm = auto_arm
         self._refusal = ""
         self.session: str | None = None
+        self.last: SessionRecord | None = None
+        self._kept: SessionRecord | None = None  # the last record that the plant has confirmed
 
     def claim(self) -> ZenohLink | None:
         """Claim the vehicle. The link is opened before the query, so that the first measurement is not lost."""
@@ -66,13 +69,30 @@ class ClaimClient:
         )
         answer = self._query(claim)
         if isinstance(answer, Grant):
-            self.session, self._refusal = claim.session, ""
+            self.session, self.last, self._refusal = claim.session, answer.last, ""
             return link
         link.close()
         if answer is not None and answer.reason != self._refusal:
             self._refusal = answer.reason
             role.event("refused", f"{role.vehicle} refuses: {answer.reason}", claim.session)
         return None
+
+    def keep(self, record: SessionRecord) -> None:
+        """Hand the running session's record to the plant, unless it has confirmed it. Waits for nothing."""
+        if self.session is None or record is self._kept:
+            return
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._kept = record
+
+        self._role.zenoh.get(
+            topics.key("record", self._role.vehicle),
+            answered,
+            payload=record.encode(),
+            timeout=ANSWER_WAIT_S,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
 
     def release(self) -> None:
         """Release the session, whether or not the plant still answers."""

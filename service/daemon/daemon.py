@@ -17,8 +17,8 @@ import zenoh
 from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.operator import Answer, Ask, Reference
+from aeroloop.protocol.messages.models import SessionRecord, Status
+from aeroloop.protocol.messages.operator import Answer, Ask, Hold, Reference, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
 from aeroloop.protocol.runtime.realtime import prepare_process
@@ -72,7 +72,8 @@ class Daemon:
         self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
         self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
-        self._gate = CertificateGate(role, wire, law, reference, settings)
+        begins = reference if settings.after_restart == "configured" else Hold()
+        self._gate = CertificateGate(role, wire, law, begins, settings)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
             role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators == 3
@@ -88,6 +89,7 @@ class Daemon:
         self._timing: LoopTiming | None = None
         self._age = RollingHistogram()
         self._status_due = 0
+        self._shown: SessionRecord | None = None  # by the last status
         self._status_ticks = 0
         self._status_time = time.monotonic()
         self._take(settings)
@@ -103,6 +105,7 @@ class Daemon:
         self._changes.serve()
         role.serve("stand_down", Ask, lambda _: self._stand_down)
         role.serve("recall", Ask, lambda _: self._recall)
+        role.serve("show", Ask, lambda _: lambda: self._changes.record)
         role.watch_tokens(self._token)
         role.zenoh.declare_subscriber(topics.key("status", role.vehicle, role="plant"), self._receive_plant)
         role.announce()
@@ -250,7 +253,7 @@ class Daemon:
         self._machine.fire(Trigger.GRANT)
         self._trace.session = session
         self._trace.state = self._controller.state.model_dump(mode="json")
-        self._changes.begin(self._controller, session)
+        self._changes.begin(self._controller, session, self._claims.last)
         return link
 
     def _is_lost(self, silent_s: float) -> str | None:
@@ -343,11 +346,13 @@ class Daemon:
     # ── publications ──
 
     def _publish_when_due(self) -> None:
-        if time.monotonic_ns() >= self._status_due:
+        if time.monotonic_ns() >= self._status_due or self._shown is not self._changes.record:
             self._publish_status()
 
     def _publish_status(self) -> None:
         now = time.monotonic()
+        self._shown = record = self._changes.record
+        self._claims.keep(record)
         self._age.turn_when_due()
         self._role.status(
             Status(
@@ -367,6 +372,10 @@ class Daemon:
                 age_us=summary(self._age.recent()),
                 timing=report(self._timing) if self._timing else None,
                 notes=self._notes,
+                gains=record.gains,
+                gains_from=record.gains_from,
+                reference=in_words(record.reference),
+                reference_from=record.reference_from,
             )
         )
         self._status_ticks, self._status_time = self._ticks, now

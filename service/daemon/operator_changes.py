@@ -2,7 +2,8 @@
 
 Requests arrive in Zenoh's threads. Slow checks run there; what touches the controller is queued for the loop, which
 takes it between two ticks. Every change is in the trace with the tick from which it holds, so that a log can be
-computed again. The next session starts with the gains and the reference of the last.
+computed again. `controller.after_restart` decides what a session begins with; the plant gets a record of both, for the
+controller after this one.
 """
 
 from __future__ import annotations
@@ -16,15 +17,29 @@ import zenoh
 from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.operator import Answer, Change, Gains, Hold, Points, Reference, Setpoint, Stream, Track
+from aeroloop.protocol.messages.models import SessionRecord, Source
+from aeroloop.protocol.messages.operator import (
+    Answer,
+    Change,
+    Gains,
+    Hold,
+    Points,
+    Reference,
+    Setpoint,
+    Stream,
+    Track,
+    in_words,
+)
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.wire.attitude import distance, to_euler
-from aeroloop.service.control.approach import nearest_turn
+from aeroloop.protocol.wire.attitude import distance
+from aeroloop.service.control.approach import Approach, nearest_turn
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import FollowError, Limits, Plan
-from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
+from aeroloop.service.daemon.certificate_gate import CertificateGate, UncertifiedError, gains_of
+from aeroloop.service.daemon.session_start import found, remaining
 from aeroloop.service.settings import ControllerSettings
 
 START_S: Final = 1.0
@@ -58,8 +73,12 @@ class OperatorChanges:
         rolls: Whether the vehicle can roll.
 
     Attributes:
+        record: Gains and reference now, of the next session if none runs; a new object with every change, not with
+            every set-point of a stream.
         refused: Malformed set-points so far.
     """
+
+    record: SessionRecord
 
     def __init__(
         self,
@@ -86,11 +105,17 @@ class OperatorChanges:
         self._stream = reference if isinstance(reference, Stream) else None
         self._last_setpoint_s = 0.0
         self._setpoint: tuple[Hold, Plan] | None = None  # the newest, not yet taken by a tick
+        self._gains_from: Source = "configured"
+        self._reference_from: Source = "configured"
+        self._within_s = 0.0
+        self._since_tick = 0
+        self._last: SessionRecord | None = None  # this controller's own last session
         self.refused = 0
         self.configure(settings)
+        self._note()
 
     def configure(self, settings: ControllerSettings) -> None:
-        """Take over limits."""
+        """Take over limits, and what the next session begins with."""
         self._settings = settings
         self._limits = Limits(
             rate=settings.max_reference_rate,
@@ -98,6 +123,11 @@ class OperatorChanges:
             tilt=radians(settings.max_reference_tilt_deg),
             rolls=self._rolls,
         )
+        if self._controller is None:
+            if settings.after_restart != "configured":
+                self._hold()
+            elif self._reference_from == "held":
+                self._begin_with(self.configured, "configured")
 
     def serve(self) -> None:
         """Serve operators' queries and set-points."""
@@ -111,37 +141,82 @@ class OperatorChanges:
         (gains, configured), new = self._adopted, gains_of(law)
         return new if new != gains else self._gains, reference if reference != configured else self._followed
 
+    @property
+    def configured(self) -> Reference:
+        """The configured reference."""
+        return self._adopted[1]
+
     def adopt(self, law: LawSettings, reference: Reference) -> None:
         """Take over the gains and the reference that changed in a reloaded configuration; others stay as they are."""
         (gains, configured), self._adopted = self._adopted, (gains_of(law), reference)
         if gains_of(law) != gains:
-            self._gains = gains_of(law)
+            self._gains, self._gains_from = gains_of(law), "configured"
             if self._controller is not None:
-                self.set_gains(self._gains)
+                self.set_gains(self._gains, "configured")
         if reference != configured:
-            if self._controller is None:
-                self._reference = reference
-                self._stream = reference if isinstance(reference, Stream) else None
-            else:
+            if self._controller is not None:
                 try:
-                    self.follow(reference, self.plan(reference))
+                    self.follow(reference, self.plan(reference), source="configured")
                 except FollowError as error:
                     self._role.event("fault", f"the configured reference is not followed: {error}", self._session)
+            elif self._settings.after_restart == "configured":
+                self._begin_with(reference, "configured")
+        self._note()
         self.certify()
 
     # ── in the loop ──
 
-    def begin(self, controller: Controller, session: str) -> None:
-        """Begin a session with the present gains and reference; a stream starts at its last set-point."""
+    def begin(self, controller: Controller, session: str, last: SessionRecord | None = None) -> None:
+        """Begin a session as configured; `last` is the plant's record. A stream starts at its last set-point."""
         self._controller, self._session = controller, session
+        self._k = self._since_tick = 0
+        if self._settings.after_restart == "resume":
+            self._resume(last or self._last)
         controller.set_gains(self._gains)
         controller.motion.follow(Plan.of(self._reference), 0.0)
         self._started_near = False
         self._trace.changes.append(Change(session=session, tick=0, gains=self._gains, reference=self._reference))
+        self._note()
+        self.certify()
 
     def end(self) -> None:
         """End the session."""
+        self._last = self.record.model_copy(update={"ended_tick": self._k})
         self._controller = None
+        if self._settings.after_restart == "hold":
+            self._hold()
+        self._note()
+
+    def _resume(self, last: SessionRecord | None) -> None:
+        """Take up the gains of the last session and, unless an operator stopped it since, its reference."""
+        self._hold()
+        if last is None:
+            return
+        reference = remaining(last, self._running().period)
+        try:
+            self.plan(reference)
+            if self._gate is not None:
+                self._gate.admit(last.gains, reference)
+        except (FollowError, UncertifiedError) as error:
+            self._role.event("fault", f"the last session is not resumed: {error}", self._session)
+            return
+        self._gains, self._gains_from = last.gains, "resumed"
+        if last.ended is TripCause.OPERATOR or reference == Hold():
+            return
+        if isinstance(reference, Stream):
+            self._stream, self._reference_from = reference, "resumed"
+        else:
+            self._begin_with(reference, "resumed")
+        self._within_s = last.within_s
+
+    def _hold(self) -> None:
+        """Begin the next session with the attitude found."""
+        self._begin_with(Hold(), "held")
+
+    def _begin_with(self, reference: Reference, source: Source) -> None:
+        self._reference, self._reference_from, self._within_s = reference, source, 0.0
+        self._stream = reference if isinstance(reference, Stream) else None
+        self._setpoint = None  # one from before the session is no longer of now
 
     def before_tick(self, k: int, frame: bytes) -> None:
         """Apply the changes received since the last tick, from tick k on. The frame is the measurement of that tick."""
@@ -153,27 +228,33 @@ class OperatorChanges:
             self._follow_stream(self._stream)
 
     def _start_near(self, frame: bytes) -> None:
-        """Start the reference at the body's attitude and approach from there, if the body is far from it.
+        """Hold the attitude found, or approach the reference from there.
 
         A session that was lost in flight begins again with the reference's time at 0; a jump there would hold the
-        motors at their limit until the plant trips.
+        motors at their limit until the plant trips. A configured reference that is near is followed at once.
         """
         controller = self._running()
         attitude = controller.attitude_of(frame)
         if attitude is None:
             return
         self._started_near = True
-        roll, pitch, yaw = (degrees(angle) for angle in to_euler(attitude))
-        target, t = Plan.of(self._reference), self._time
-        start = nearest_turn((roll if self._rolls else 0.0, pitch, yaw), target)
-        away = degrees(distance(attitude, controller.motion.attitude(t)))
-        if away <= self._settings.start_within_deg:
-            return
-        approach = controller.motion.shortest(target, t, self._limits._replace(tilt=pi), start)
-        approach = approach.at_least(START_S)
-        controller.motion.follow(target, t, approach)
+        start, t, source = found(attitude, rolls=self._rolls), self._time, self._reference_from
+        if source != "configured" and self._reference == Hold():
+            self._reference, approach = Hold(attitude=start), Approach(start=start)
+            text = f"holds the attitude found, {in_words(self._reference)}; `aeroloop op track configured` moves it"
+        else:
+            away = degrees(distance(attitude, controller.motion.attitude(t)))
+            if self._settings.after_restart == "configured" and away <= self._settings.start_within_deg:
+                return
+            target = Plan.of(self._reference)
+            limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
+            approach = controller.motion.shortest(target, t, limits, nearest_turn(start, target))
+            approach = approach.at_least(max(START_S, self._within_s))
+            text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
+        controller.motion.follow(Plan.of(self._reference), t, approach)
+        self._within_s, self._since_tick = approach.within_s, self._k
         self._record(reference=self._reference, **approach._asdict())
-        text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
+        self._note()
         self._role.event("changed", text, self._session, self._k)
 
     # ── requests ──
@@ -197,15 +278,16 @@ class OperatorChanges:
 
     @property
     def _followed(self) -> Reference:
-        """The reference to certify: the stream itself, not its last set-point."""
-        return self._stream or self._reference
+        """The reference to certify: the stream itself, not its last set-point; of what is held no angle matters."""
+        return self._stream or (Hold() if self._reference_from == "held" else self._reference)
 
-    def set_gains(self, gains: Gains) -> Answer:
+    def set_gains(self, gains: Gains, source: Source = "operator") -> Answer:
         """Use other gains from this tick on."""
         controller = self._running()
         controller.set_gains(gains)
-        self._gains = controller.gains
+        self._gains, self._gains_from = controller.gains, source
         self._record(gains=gains)
+        self._note()
         text = ", ".join(f"{name} = {list(value)}" for name, value in gains if value is not None)
         self._role.event("changed", f"gains set: {text or 'nothing'}", self._session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle}: {text or 'no gain was given, so none has changed'}")
@@ -216,7 +298,9 @@ class OperatorChanges:
         plan.check(self._limits)
         return plan
 
-    def follow(self, reference: Reference, plan: Plan, within_s: float | None = None) -> Answer:
+    def follow(
+        self, reference: Reference, plan: Plan, within_s: float | None = None, source: Source = "operator"
+    ) -> Answer:
         """Follow a planned reference from this tick on, reached in `within_s`; None for as long as it takes.
 
         Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
@@ -230,11 +314,13 @@ class OperatorChanges:
         approach = motion.shortest(target, t, self._limits)
         approach = approach.at_least(START_S) if within_s is None else approach.lasting(within_s, self._limits)
         motion.follow(target, t, approach)
-        self._reference = held
+        self._reference, self._reference_from = held, source
+        self._within_s, self._since_tick = approach.within_s, self._k
         self._stream = reference if isinstance(reference, Stream) else None
         self._setpoint = None  # of the previous stream
         self._last_setpoint_s = time.monotonic()
         self._record(reference=held, **approach._asdict())
+        self._note()
         text = f"{_action_text(reference)} within {approach.within_s:g} s"
         self._role.event("changed", text, self._session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
@@ -286,6 +372,19 @@ class OperatorChanges:
     def _record(self, **change: Any) -> None:
         self._trace.changes.append(Change(session=self._session, tick=self._k, **change))
 
+    def _note(self) -> None:
+        """Make the record anew."""
+        self.record = SessionRecord(
+            controller=self._role.name,
+            session=self._session if self._controller is not None else None,
+            gains=self._gains,
+            gains_from=self._gains_from,
+            reference=self._stream or self._reference,
+            reference_from=self._reference_from,
+            within_s=self._within_s,
+            since_tick=self._since_tick,
+        )
+
 
 class GainsChange:
     """An operator's new gains. `prepare` runs in any thread, `apply` between two ticks.
@@ -320,17 +419,19 @@ class ReferenceChange:
     """
 
     def __init__(self, changes: OperatorChanges, track: Track) -> None:
-        self._changes, self._track = changes, track
+        self._changes, self._within_s = changes, track.within_s
+        self._source: Source = "operator" if track.reference is not None else "configured"
+        self._reference: Reference = track.reference or changes.configured
 
     def prepare(self) -> Callable[[], Answer]:
         """Plan and check the reference, which takes time. Raises FollowError or UncertifiedError if it is refused."""
-        self._plan = self._changes.plan(self._track.reference)
-        self._changes.admit(reference=self._track.reference)
+        self._plan = self._changes.plan(self._reference)
+        self._changes.admit(reference=self._reference)
         return self.apply
 
     def apply(self) -> Answer:
         """Follow the reference from this tick on."""
-        self._changes.admit(reference=self._track.reference)
-        answer = self._changes.follow(self._track.reference, self._plan, self._track.within_s)
+        self._changes.admit(reference=self._reference)
+        answer = self._changes.follow(self._reference, self._plan, self._within_s, self._source)
         self._changes.certify()
         return answer

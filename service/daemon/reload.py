@@ -23,6 +23,7 @@ LIVE: Final = {
         "controller.max_reference_braking",
         "controller.max_reference_tilt_deg",
         "controller.auto_arm",
+        "controller.after_restart",
         "controller.require_certificate",
     ),
     "plant": ("plant.limits", "plant.watchdog_s", "plant.truth_rate_hz"),

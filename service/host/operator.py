@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Ask, Message, Points
 from aeroloop.protocol.runtime.processes import listener
 from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, visit
@@ -158,6 +158,27 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
     if not answers and not failures:
         failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
     return Stopped([text for texts in answers.values() for text in texts], failures)
+
+
+def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> SessionRecord:
+    """Gains and reference of a vehicle's controller: of several, the one with the session, if any.
+
+    With `last`, those of the last session that ended, by the plant's record.
+
+    Raises:
+        OperatorError: No controller answers, or the plant has no record.
+    """
+    found: list[SessionRecord] = []
+    with visit(network) as here:
+        here.settle()
+        for reply in _get(here.session, topics.key("show", vehicle), Ask().encode(), ANSWER_S):
+            with suppress(ValidationError):  # a plant without a record answers so
+                record = SessionRecord.model_validate_json(reply.ok.payload.to_bytes() if reply.ok else b"")
+                found += [record] if (record.ended is not None) == last else []
+    if not found:
+        which = f"no plant of {vehicle} with a record of a session" if last else f"no controller of {vehicle}"
+        raise OperatorError(_nobody(network, which))
+    return next((record for record in found if record.session), found[0])
 
 
 def read_points(path: Path) -> Points:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Loss, Status
-from aeroloop.protocol.messages.operator import Change, Hold, Points, Reference, Sinusoid
+from aeroloop.protocol.messages.operator import Change, in_words
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.timing import Histogram
 from aeroloop.service.logs.runs import Taker
@@ -184,23 +184,5 @@ def described(change: Change) -> str:
         parts.append(", ".join(f"{name} = diag({', '.join(f'{x:g}' for x in xs)})" for name, xs in diagonals.items()))
     if change.reference is not None:
         within = f" within {change.within_s:g} s" if change.within_s else ""
-        parts.append(f"follows {_reference(change.reference)}{within}")
+        parts.append(f"follows {in_words(change.reference)}{within}")
     return "; ".join(parts)
-
-
-def _reference(reference: Reference) -> str:
-    match reference:
-        case Sinusoid(amplitude=amplitude):
-            return f"a sinusoid of {_degrees(amplitude)}"
-        case Hold(attitude=None):
-            return "where it is"
-        case Hold(attitude=attitude) if attitude is not None:
-            return _degrees(attitude)
-        case Points(times=times):
-            return f"{len(times)} points over {times[-1]:g} s"
-        case _:
-            return "a stream of set-points"
-
-
-def _degrees(angles: tuple[float, float, float]) -> str:
-    return "roll, pitch, yaw " + ", ".join(f"{angle:.4g}°" for angle in angles)

@@ -192,7 +192,13 @@ def status_table(found: Statuses) -> None:
             )
             notes = [*([status.cause] if status.cause else []), *status.notes]
             table.add_row(vehicle, role, status.state, *figures, "; ".join(notes))
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    for vehicle, roles in sorted(found.items()):
+        if (driver := roles.get("controller")) is not None and driver.gains is not None:
+            gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in driver.gains if gain)
+            console.print(f"{vehicle}: reference {driver.reference} ({driver.reference_from})")
+            console.print(f"{vehicle}: gains {gains} ({driver.gains_from})")
 
 
 @contextmanager

@@ -143,7 +143,8 @@ class Hil:
 
         Args:
             config: A TOML file, as for `--config`.
-            settings: Overrides as for `--set`: section.key to value.
+            settings: Overrides as for `--set`: section.key to value. Without one of `controller.after_restart` the
+                controller follows the configured reference from the start.
             drive: Whether to start a controller and wait for it.
 
         Raises:
@@ -158,6 +159,7 @@ class Hil:
             "recorder.max_file_mb": 1e6,  # a test reads one file
             "recorder.max_file_s": 1e6,
             "controller.require_recorder": True,
+            "controller.after_restart": "configured",
             "loop.lockstep": self._lockstep,
             "plant.steps_on_request": self._lockstep and self._via == "emulator",
             "plant.via": self._via,

@@ -75,14 +75,14 @@ def private_bus(can: CanSettings) -> CanSettings:
 
 
 def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
-    """The settings of a loop that arms by itself and records to a new log, on a free rendezvous and bus.
+    """The settings of a loop that arms and moves by itself and records to a new log, on a free rendezvous and bus.
 
     Raises:
         ProcessGroupError: The log exists.
     """
     if parts(log):
         raise ProcessGroupError(f"{log} exists, and a log is never written over; name another with --log PATH")
-    controller |= {"require_recorder": True, "auto_arm": True}
+    controller |= {"require_recorder": True, "auto_arm": True, "after_restart": "configured"}
     return settings.model_copy(
         update={
             "network": settings.network.model_copy(update={"rendezvous": [free_rendezvous()]}),

@@ -218,6 +218,7 @@ def test_a_plant_whose_controller_is_killed_goes_to_zero_volts_within_the_watchd
             f"recorder.path={log}",
             "controller.require_recorder=true",
             "controller.auto_arm=true",
+            "controller.after_restart=configured",
             "plant.truth_rate_hz=500",
         ]
     )

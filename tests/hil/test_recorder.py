@@ -33,7 +33,8 @@ from tests.support.zenoh_network import free_port
 RATE = 100
 """Slow, so that several of these tests run beside each other: most of their time they wait."""
 
-PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 12, "loop.rate_hz": RATE}
+PATIENT = {"plant.watchdog_s": 2, "controller.stale_s": 2, "wire.counter_bits": 12, "loop.rate_hz": RATE,
+           "controller.after_restart": "configured"}  # fmt: skip
 """As in test_processes.py: a machine that stalls for over 100 ms must not end the session."""
 
 SLACK_S = 1.0

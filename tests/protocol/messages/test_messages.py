@@ -21,6 +21,7 @@ from aeroloop.protocol.messages.models import (
     Percentiles,
     Refusal,
     Release,
+    SessionRecord,
     Status,
     Telemetry,
     Timing,
@@ -41,6 +42,7 @@ from aeroloop.protocol.messages.operator import (
     Stream,
     Track,
 )
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Operation, Tail
 from aeroloop.protocol.runtime.timing import Histogram, summary
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
@@ -49,6 +51,11 @@ LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
 FAULT = FaultStatus(
     fault="command:drop=0.1@2", source="injected", begin_tick=1001, end_tick=None, changed=7, effect="commands dropped"
 )
+RECORD = SessionRecord(
+    controller="c1", session="5f0b", gains=Gains(C1=(0.3, 0.3, 0.3), C2=(0.15, 0.15, 0.15), Gamma=(0.03, 0.03, 0.03)),
+    gains_from="operator", reference=Hold(attitude=(0.0, -10.0, 90.0)), reference_from="resumed", within_s=5.0,
+    since_tick=12, ended=TripCause.HOLDER_GONE, ended_tick=700,
+)  # fmt: skip
 
 MESSAGES: list[Message] = [
     Claim(controller="c1", session="5f0c", period_ns=2_000_000, lockstep=False, wire=WireSpec()),
@@ -59,7 +66,9 @@ MESSAGES: list[Message] = [
         lockstep=True,
         wire=WireSpec(attitude=SignalSpec(bits=None, limit=1.0), rate=SignalSpec(bits=10, limit=2.0, deadzone=0.1)),
     ),
+    RECORD,
     Grant(session="5f0c"),
+    Grant(session="5f0c", last=RECORD),
     Refusal(reason="held by c2 since 3 s", holder="c2", differences=["rate.bits: 8, not 10"]),
     Refusal(reason="not now"),
     Release(session="5f0c"),

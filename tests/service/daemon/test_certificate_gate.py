@@ -26,7 +26,7 @@ class Certified(Loop):
     """A loop whose OperatorChanges asks for certificates."""
 
     def __init__(self, *, required: bool, reference: Reference | None = None) -> None:
-        settings = ControllerSettings(require_certificate=required)
+        settings = ControllerSettings(require_certificate=required, after_restart="configured")
         super().__init__(reference or Sinusoid(), settings, wire=WIRE)
 
     @property

@@ -1,0 +1,300 @@
+"""What a session begins with: nothing jumps, and nothing moves that was not asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import cos, degrees, radians, sin
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.models import SessionRecord
+from aeroloop.protocol.messages.operator import (
+    Gains,
+    Hold,
+    Points,
+    Reference,
+    Sinusoid,
+    Stream,
+    Track,
+)
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, distance, received_quaternion
+from aeroloop.service.daemon.session_start import remaining
+from aeroloop.service.settings import ControllerSettings
+from tests.service.daemon.test_operator_changes import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, turned
+from tests.service.daemon.test_operator_changes import time as time  # the fixture
+
+GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
+TARGET = Hold(attitude=(0.0, 0.0, 60.0))
+POINTS = Points(times=[0.0, 1.0, 2.0, 4.0], attitudes=[(0.0, 0.0, yaw) for yaw in (0.0, 10.0, 20.0, 40.0)])
+
+
+def of(after_restart: str, reference: Reference = SWING) -> Loop:
+    """A controller that starts; its configured reference moves."""
+    return Loop(reference, ControllerSettings.model_validate({"after_restart": after_restart}))
+
+
+def record(reference: Reference, *, ended: TripCause = TripCause.HOLDER_GONE) -> SessionRecord:
+    """What the plant has of the session before."""
+    return SessionRecord(
+        controller="controller-6", session="s", gains=GAINS, gains_from="operator", reference=reference,
+        reference_from="operator", within_s=2.0, since_tick=0, ended=ended, ended_tick=5000,
+    )  # fmt: skip
+
+
+def asked(loop: Loop, reference: Reference = TARGET) -> None:
+    """An operator sets gains and a reference, and it is reached."""
+    loop.ask("set_gains", GAINS)
+    loop.ask("track", Track(reference=reference, within_s=3.0))
+    loop.run(4.0)
+
+
+def upright(pitch: float, yaw: float) -> Quaternion:
+    """An attitude without roll; angles in deg."""
+    p, y = radians(pitch) / 2, radians(yaw) / 2
+    return cos(y) * cos(p), -sin(y) * sin(p), cos(y) * sin(p), sin(y) * cos(p)
+
+
+def codes(attitude: Quaternion) -> list[float]:
+    """A measurement of a body at rest."""
+    level = WIRE.attitude.quantizer()
+    return [*(level.encode(x) for x in attitude[1:]), *[0.0] * 3]
+
+
+def start(loop: Loop, yaw: float, last: SessionRecord | None = None) -> float:
+    """Begin a session with the body at a yaw [deg]; that of the reference at the first tick."""
+    loop.begin(last)
+    loop.tick(turned(yaw))
+    return loop.yaw()
+
+
+def reached(loop: Loop, yaw: float) -> float:
+    """The reference's yaw after seven seconds with the body at a yaw [deg]."""
+    for _ in range(3500):
+        loop.tick(turned(yaw))
+    return loop.yaw()
+
+
+@pytest.fixture(autouse=True)
+def _still(time: FakeTime) -> Iterable[None]:  # the clock moves only when set
+    del time
+    return iter([None])
+
+
+# ── hold ──
+
+
+@settings(max_examples=15)
+@given(pitch=st.floats(-60, 60), yaw=st.floats(-179, 179))
+def test_held_is_the_attitude_found_and_it_stays_there_until_an_operator_moves_it(pitch: float, yaw: float) -> None:
+    loop = of("hold")
+    frame = codes(upright(pitch, yaw))
+    measured = received_quaternion(frame[0], frame[1], frame[2], IDENTITY)  # unquantized
+    loop.begin()
+    for _ in range(100):
+        loop.tick(frame)
+        assert degrees(distance(loop.controller.desired, measured)) < 0.01
+        assert max(map(abs, loop.controller.rate_error)) == 0.0
+    held = loop.live.record.reference
+    assert isinstance(held, Hold)
+    assert held.attitude is not None
+    assert (loop.live.record.reference_from, loop.live.record.gains_from) == ("held", "configured")
+    loop.assert_it_runs_again()
+
+
+def test_after_a_trip_too_the_vehicle_is_held_where_it_is_found_with_the_operators_gains() -> None:
+    loop = of("hold")
+    loop.begin()
+    asked(loop)
+    loop.end()
+    assert (loop.live.record.session, loop.live.record.reference) == (None, Hold())
+    assert start(loop, 30.0, record(TARGET)) == pytest.approx(30.0, abs=1.0)
+    assert reached(loop, 25.0) == pytest.approx(30.0, abs=1.0)  # where it was found first
+    assert loop.controller.gains == GAINS
+    assert (loop.live.record.reference_from, loop.live.record.gains_from) == ("held", "operator")
+    loop.assert_it_runs_again()
+
+
+def test_nothing_is_held_before_there_is_a_valid_measurement() -> None:
+    loop = of("hold")
+    loop.begin()
+    for _ in range(3):
+        loop.tick([WIRE.attitude.quantizer().invalid] * 6)
+    loop.tick(turned(40.0))
+    assert loop.yaw() == pytest.approx(40.0, abs=1.0)
+    assert [(change.tick, change.start is not None) for change in loop.changes()] == [(0, False), (3, True)]
+    loop.assert_it_runs_again()
+
+
+def test_the_configured_reference_is_followed_when_an_operator_asks_for_it() -> None:
+    loop = of("hold", Hold(attitude=(0.0, 0.0, 15.0)))
+    start(loop, 0.0)
+    query = loop.ask("track", Track(reference=None))
+    assert reached(loop, 0.0) == pytest.approx(15.0)
+    assert query.answers[0].done
+    assert loop.live.record.reference_from == "configured"
+
+
+def test_a_setting_read_again_holds_for_the_next_session() -> None:
+    loop = of("configured")
+    start(loop, 0.0)
+    loop.live.configure(ControllerSettings(after_restart="hold"))
+    loop.end()
+    assert start(loop, 30.0) == pytest.approx(30.0, abs=1.0)
+    loop.end()
+    loop.live.configure(ControllerSettings(after_restart="configured"))
+    start(loop, 0.0)
+    assert (loop.live.record.reference, loop.live.record.reference_from) == (SWING, "configured")
+
+
+def test_a_configuration_read_again_moves_nothing_before_a_session_and_moves_one_that_runs() -> None:
+    loop = of("hold")
+    loop.live.adopt(LAW, LEVEL)
+    assert loop.live.record.reference == Hold()
+    assert start(loop, 30.0) == pytest.approx(30.0, abs=1.0)
+    loop.live.adopt(LAW, Hold(attitude=(0.0, 0.0, 20.0)))
+    assert reached(loop, 30.0) == pytest.approx(20.0)
+
+
+# ── resume ──
+
+
+def test_a_restarted_controller_resumes_gains_and_reference_and_goes_there_from_where_the_body_is() -> None:
+    before = of("resume")
+    before.begin()
+    asked(before)
+    kept = before.live.record.model_copy(update={"ended": TripCause.HOLDER_GONE, "ended_tick": before.k})
+    loop = of("resume")
+    assert start(loop, 30.0, kept) == pytest.approx(30.0, abs=1.0)
+    assert loop.controller.gains == GAINS
+    way = loop.changes()[-1]
+    assert way.start is not None
+    assert way.within_s >= 3.0  # no faster than the operator asked for
+    reached(loop, 30.0)
+    assert loop.live.record.reference == TARGET
+    assert (loop.live.record.reference_from, loop.live.record.gains_from) == ("resumed", "resumed")
+    loop.assert_it_runs_again()
+
+
+@pytest.mark.parametrize("away", [0.5, 15.0, 90.0])
+def test_nothing_jumps_when_a_reference_is_resumed_however_near_it_is(away: float) -> None:
+    loop = of("resume")
+    first = start(loop, away, record(LEVEL))
+    assert first == pytest.approx(away, abs=1.0)  # a level of ε is 0.9° wide
+    before, fastest = first, 0.0
+    for _ in range(3500):
+        loop.tick(turned(away))
+        fastest, before = max(fastest, abs(loop.yaw() - before) / PERIOD), loop.yaw()
+    assert fastest <= degrees(1.0) * 1.004  # the limit, whose ways are sampled
+    assert loop.yaw() == pytest.approx(0.0)
+
+
+def test_a_vehicle_that_an_operator_stopped_is_held_with_its_gains() -> None:
+    loop = of("resume")
+    start(loop, 30.0, record(TARGET, ended=TripCause.OPERATOR))
+    assert reached(loop, 30.0) == pytest.approx(30.0, abs=1.0)
+    assert (loop.controller.gains, loop.live.record.reference_from) == (GAINS, "held")
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        None,
+        record(Hold()),
+        record(Hold(attitude=(0.0, 70.0, 0.0))),  # tilts too far
+        record(Hold(attitude=(5.0, 0.0, 0.0))),  # rolls what cannot roll
+        record(Sinusoid(amplitude=(0.0, 0.0, 100.0), frequency=(0.0, 0.0, 3.0))),  # turns too fast
+    ],
+)
+def test_what_cannot_be_resumed_is_held(last: SessionRecord | None) -> None:
+    loop = of("resume")
+    if last is not None:  # its own last session is not what the plant has as the last one
+        loop.begin()
+        asked(loop)
+        loop.end()
+    start(loop, 30.0, last)
+    assert reached(loop, 30.0) == pytest.approx(30.0, abs=1.0)
+    assert loop.live.record.reference_from == "held"
+    assert len(loop.events("fault")) == (last is not None and last.reference != Hold())
+
+
+def test_a_controller_whose_plant_was_restarted_resumes_its_own_session() -> None:
+    loop = of("resume")
+    start(loop, 0.0)
+    asked(loop)
+    loop.end()
+    start(loop, 0.0)
+    reached(loop, 0.0)
+    assert (loop.live.record.reference, loop.controller.gains) == (TARGET, GAINS)
+
+
+def test_a_stream_is_resumed_at_rest_where_the_body_is() -> None:
+    loop = of("resume")
+    assert start(loop, 30.0, record(Stream(within_s=0.5))) == pytest.approx(30.0, abs=1.0)
+    assert reached(loop, 30.0) == pytest.approx(30.0, abs=1.0)
+    loop.stream(yaw=33.0)
+    assert reached(loop, 30.0) == pytest.approx(33.0)
+    assert (loop.live.record.reference, loop.live.record.reference_from) == (Stream(within_s=0.5), "resumed")
+
+
+def test_a_set_point_from_before_the_session_moves_nothing() -> None:
+    loop = of("resume")
+    loop.begin(record(Stream(within_s=0.5)))
+    loop.tick(turned(0.0))
+    loop.end()
+    loop.stream(yaw=33.0)
+    start(loop, 0.0)
+    assert reached(loop, 0.0) == pytest.approx(0.0, abs=1.0)
+
+
+@given(
+    gaps=st.lists(st.integers(1, 3000), min_size=1, max_size=8),
+    since=st.integers(0, 2000),
+    followed=st.integers(0, 30_000),
+    within=st.integers(0, 10),
+)
+def test_points_go_on_with_the_first_that_was_not_reached(
+    gaps: list[int], since: int, followed: int, within: int
+) -> None:
+    times = [0.0]
+    for gap in gaps:
+        times.append(times[-1] + gap / 1000)
+    points = Points(times=times, attitudes=[(0.0, 0.0, float(i)) for i in range(len(times))])
+    times_of_it = {"since_tick": since, "ended_tick": since + followed, "within_s": float(within)}
+    last = record(points).model_copy(update=times_of_it)
+    left = remaining(last, PERIOD)
+    reached_s = followed * PERIOD - within
+    ahead = [attitude for t, attitude in zip(times, points.attitudes, strict=True) if t >= reached_s]
+    if isinstance(left, Points):
+        assert left.attitudes == ahead
+        later = [t for t in times if t >= reached_s]
+        assert left.times == pytest.approx([t - later[0] for t in later])
+    else:
+        assert left == Hold(attitude=points.attitudes[-1])
+        assert len(ahead) < 2
+
+
+def test_a_goto_of_almost_a_full_turn_is_not_turned_back_to_be_resumed() -> None:
+    loop = of("resume")
+    loop.begin(record(Hold(attitude=(0.0, 0.0, 350.0))))
+    loop.tick(turned(-20.0))  # that is at 340°
+    way = loop.changes()[-1]
+    assert way.start is not None
+    assert way.start[2] == pytest.approx(340.0, abs=1.0)
+
+
+# ── configured ──
+
+
+def test_configured_follows_the_configuration_at_first_and_then_what_the_last_session_followed() -> None:
+    loop = of("configured")
+    start(loop, 0.0, record(TARGET))
+    assert (loop.live.record.reference, loop.live.record.reference_from) == (SWING, "configured")
+    asked(loop)
+    loop.end()
+    start(loop, 0.0, record(LEVEL))
+    assert (loop.live.record.reference, loop.live.record.reference_from) == (TARGET, "operator")
+    assert loop.controller.gains == GAINS
+    loop.assert_it_runs_again()
