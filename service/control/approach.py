@@ -61,7 +61,10 @@ class Approach(NamedTuple):
         """
         if within_s * _SLACK >= self.within_s:
             return self.at_least(within_s)
-        parts = {"braking": max(self.brake_s or (0.0,)), "running up to the reference": max(self.run_up_s or (0.0,))}
+        parts = {
+            "braking alone": max(self.brake_s or (0.0,)),
+            "running up to the reference": max(self.run_up_s or (0.0,)),
+        }
         turn_s = within_s - sum(parts.values())
         if turn_s < LEAST_TURN_S:
             why = " and ".join(f"{part} takes {seconds:g} s" for part, seconds in parts.items() if seconds)

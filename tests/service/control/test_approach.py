@@ -188,6 +188,23 @@ def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
     assert max(turning) <= BODY.rate * SAMPLED
 
 
+@pytest.mark.parametrize(
+    ("pitch", "rate", "acceleration"),
+    [
+        (0.0, 0.95, 2.0),  # braking no harder than it gathers speed, it would first reach 1.1 rad/s
+        (57.0, 0.5, -2.0),  # it would tilt by 62°
+        (50.0, 0.5, 0.0),  # it would tilt by 60.7°
+    ],
+)
+def test_near_the_limits_of_rate_and_tilt_it_brakes_harder(pitch: float, rate: float, acceleration: float) -> None:
+    start = Angles(*(np.array([[0.0, x, 0.0]]) for x in (radians(pitch), rate, acceleration)))
+    target = Plan.of(Hold())
+    approach = shortest(target, start, BENCH)
+    angles, rates, _ = way(approached(target, start, 0.0, approach), target, approach.within_s)
+    assert np.abs(rates).max() <= BENCH.rate * SAMPLED
+    assert np.abs(angles).max() <= BENCH.tilt * SAMPLED
+
+
 @settings(max_examples=75)
 @given(start=any_states(), reference=tracked, longer_s=seconds(0, 60), t=seconds(0, 20))
 def test_neither_angle_nor_rate_nor_acceleration_jumps(
@@ -263,12 +280,12 @@ def test_the_time_that_is_named_would_do_and_so_does_any_longer_and_a_twentieth_
             2.0,
             "in 2 s it would turn at 1.48 rad/s, more than controller.max_reference_rate = 1 rad/s; --in 2.95 would do",
         ),
-        (Hold(attitude=(0.0, 0.0, 20.0)), 0.5, 0.7, "braking takes 0.75 s; --in 1.06 would do"),
+        (Hold(attitude=(0.0, 0.0, 20.0)), 0.5, 0.7, "braking alone takes 0.75 s; --in 1.06 would do"),
         (
             Sinusoid(amplitude=(0.0, 0.0, 50.0), frequency=(0.0, 0.0, 0.2)),
             0.5,
             0.7,
-            "braking takes 0.75 s and running up to the reference takes 0.262 s; --in 1.41 would do",
+            "braking alone takes 0.75 s and running up to the reference takes 0.262 s; --in 1.41 would do",
         ),
         (Hold(attitude=(0.0, 0.0, 1e6)), 0.0, 600.0, "1 rad/s; even 600 s would be"),
     ],
