@@ -6,8 +6,9 @@ experiment.
 
 from __future__ import annotations
 
+import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -147,6 +148,17 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         raise ConfigError(f"{error}: write its keys one by one, as {ENV_PREFIX}SECTION__KEY") from None
     except ValidationError as error:
         raise _config_error(error) from None
+
+
+def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
+    """Settings as `load` takes them: `section.key` to value, nested by section, or both."""
+    words: list[str] = []
+    for name, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            words += as_overrides(value, f"{section}{name}.")
+        else:
+            words.append(f"{section}{name}={json.dumps(value, ensure_ascii=False, default=str)}")
+    return words
 
 
 def from_description(config: dict[str, Any]) -> Settings:

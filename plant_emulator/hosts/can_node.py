@@ -7,21 +7,19 @@ commands, and trips on its own watchdog and limits. The node's own heartbeat car
 
 from __future__ import annotations
 
-import logging
 import time
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.endpoint.front import Front
-from aeroloop.protocol.messages.models import Claim
+from aeroloop.protocol.messages.models import Claim, Event, EventKind
 from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
-
-log: Final = logging.getLogger("aeroloop")
 
 MASTER: Final = "the controller's side"
 
@@ -52,7 +50,8 @@ class CanFront(Front):
 
     def serve(self) -> None:
         """Send the first heartbeat."""
-        log.info("node %d waits on %s:%s", self._settings.node, self._settings.interface, self._settings.channel)
+        bus = self._settings
+        self._log("started", f"node {bus.node} waits on {bus.interface}:{bus.channel}")
         self.publish_status()
 
     def take_inbox(self) -> None:
@@ -60,7 +59,7 @@ class CanFront(Front):
         bus, endpoint = self._bus, self._endpoint
         if bus.fault is not None:
             if self._throttle.let_pass("bus") is not None:
-                log.warning("node: %s; trying again twice a second", bus.fault)
+                self._log("fault", f"{bus.fault}; trying again twice a second")
             bus.mend()
         peer = bus.peer
         gone = peer is None or bus.silent
@@ -86,7 +85,7 @@ class CanFront(Front):
     def follow_session(self) -> None:
         """Log events, and send a heartbeat at once if the state has changed."""
         for notice in self._endpoint.notices:
-            log.log(logging.WARNING if notice.kind == "tripped" else logging.INFO, "node: %s", notice.text)
+            self._log(*notice)
         self._endpoint.notices.clear()
         self._endpoint.operations.clear()  # the bridge writes the trace
         if self._endpoint.state is not self._sent_state:
@@ -117,10 +116,14 @@ class CanFront(Front):
         self.follow_session()
         self._bus.close()
 
+    def _log(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Log an event; on the bus there is no place for its text, and none for the vehicle's name."""
+        log_event(Event(role="node", kind=kind, text=text, session=session, tick=tick), None)
+
     def _begin(self, peer: Heartbeat) -> None:
         if peer.fingerprint != self._fingerprint:
             if self._throttle.let_pass("fingerprint") is not None:
-                log.warning("node: the controller's side has another wire spec, so it is not followed")
+                self._log("refused", "the controller's side has another wire spec, so it is not followed")
             return
         self._number = peer.number
         self._bus.take()  # drop a frame from before the session

@@ -127,6 +127,8 @@ class Timing(Message):
     recent_wake: Percentiles | None = Field(description="`wake`, last 10 s")
     recent_busy: Percentiles | None = Field(description="`busy`, last 10 s")
     recent_period: Percentiles | None = Field(description="`period`, last 10 s")
+    minor_faults: int = Field(default=0, description="page faults of the loop's thread without input, since warm-up")
+    major_faults: int = Field(default=0, description="page faults of the loop's thread that read a file, since warm-up")
 
 
 class FaultStatus(Message):

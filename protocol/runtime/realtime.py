@@ -1,10 +1,16 @@
-"""Real-time set-up of a process: scheduling class, locked memory, CPU affinity, no garbage collection."""
+"""Real-time set-up of a process: scheduling class, locked memory, CPU affinity, no garbage collection.
+
+Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
+second, which is warm-up, and stay. Without `MCL_ONFAULT`, every thread's stack and malloc's arenas are made resident in
+full, three times what is used.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
+from errno import EINVAL
 from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
@@ -13,6 +19,7 @@ from aeroloop.protocol.wire.loop import LoopSettings
 _PR_SET_TIMERSLACK: Final = 29
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
+_MCL_ONFAULT: Final = 4
 
 
 class RealtimeError(AeroloopError):
@@ -40,7 +47,8 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0):
         refused.append("timer slack stays at the system's default")
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+    everything = _MCL_CURRENT | _MCL_FUTURE
+    if libc.mlockall(everything | _MCL_ONFAULT) and (ctypes.get_errno() != EINVAL or libc.mlockall(everything)):
         refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
     try:
         # Every thread: Zenoh's, which carry the frames, must not wait for other work any more than the loop.

@@ -7,7 +7,6 @@ Python process would not end.
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import socket
@@ -25,6 +24,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
 from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
@@ -32,8 +32,6 @@ from aeroloop.protocol.transport.network import VISIT_S, NetworkSettings, join, 
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
-
-log: Final = logging.getLogger("aeroloop")
 
 M = TypeVar("M", bound=Message)
 _SELDOM_PER_S: Final = 8.0
@@ -248,8 +246,9 @@ class Role:
 
     def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
         """Publish and log an event, with the session's tick if there is one."""
-        log.log(logging.WARNING if kind in ("tripped", "lost", "fault") else logging.INFO, "%s: %s", self.role, text)
-        self.publish("event", Event(role=self.role, kind=kind, text=text, session=session, tick=tick))
+        event = Event(role=self.role, kind=kind, text=text, session=session, tick=tick)
+        log_event(event, self.vehicle)
+        self.publish("event", event)
 
     def warn(self, about: str, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
         """Publish an event that may recur for long: at most once in ten seconds for each `about`."""

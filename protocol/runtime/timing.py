@@ -1,7 +1,8 @@
-"""Timing statistics of a loop: wake-up latency, tick duration and period, in histograms of fixed size."""
+"""Timing statistics of a loop: wake-up latency, tick duration and period, in histograms of fixed size; page faults."""
 
 from __future__ import annotations
 
+import resource
 import time
 from collections import deque
 from math import exp2, log2
@@ -85,22 +86,28 @@ class RollingHistogram:
 
 
 class LoopTiming:
-    """Timing of a loop: wake-up latency, duration of a tick, period between ticks.
+    """Timing of a loop: wake-up latency, duration of a tick, period between ticks; page faults of its thread.
 
-    The start-up of `warm_up_ns` [ns] is left out: caches are cold, and code runs for the first time.
+    The first `warm_up_ns` [ns] of ticks are left out: caches are cold, and code and memory are used for the first time.
     """
 
     def __init__(self, warm_up_ns: int = 1_000_000_000) -> None:
         self.wake = RollingHistogram()
         self.busy = RollingHistogram()
         self.period = RollingHistogram()
-        self._warm_at = time.monotonic_ns() + warm_up_ns
+        self._warm_up_ns = warm_up_ns
+        self._warm_at: int | None = None
+        self._faults_before: tuple[int, int] | None = None
         self._woke_at = 0
 
     def woke(self, due_ns: int) -> None:
         """Count the start of a tick that was due at `due_ns` on `time.monotonic_ns()`."""
         now = time.monotonic_ns()
+        if self._warm_at is None:
+            self._warm_at = now + self._warm_up_ns
         if now >= self._warm_at:
+            if self._faults_before is None:
+                self._faults_before = _faults()
             self.wake.add(now - due_ns)
             if self._woke_at:
                 self.period.add(now - self._woke_at)
@@ -115,10 +122,23 @@ class LoopTiming:
         """Pause: the time until the next tick is no period."""
         self._woke_at = 0
 
+    @property
+    def faults(self) -> tuple[int, int]:
+        """Minor and major page faults of the calling thread, the loop's, since the warm-up."""
+        if self._faults_before is None:
+            return 0, 0
+        minor, major = _faults()
+        return minor - self._faults_before[0], major - self._faults_before[1]
+
     def turn(self) -> None:
         """End a one-second window."""
         for histogram in (self.wake, self.busy, self.period):
             histogram.turn_when_due()
+
+
+def _faults() -> tuple[int, int]:
+    usage = resource.getrusage(resource.RUSAGE_THREAD)
+    return usage.ru_minflt, usage.ru_majflt
 
 
 def summary(durations: Histogram) -> Percentiles | None:
@@ -137,6 +157,7 @@ def summary(durations: Histogram) -> Percentiles | None:
 def report(timing: LoopTiming) -> Timing:
     """End a one-second window of a loop's timing, and return its percentiles."""
     timing.turn()
+    minor, major = timing.faults
     return Timing(
         wake=summary(timing.wake.total),
         busy=summary(timing.busy.total),
@@ -144,4 +165,6 @@ def report(timing: LoopTiming) -> Timing:
         recent_wake=summary(timing.wake.recent()),
         recent_busy=summary(timing.busy.recent()),
         recent_period=summary(timing.period.recent()),
+        minor_faults=minor,
+        major_faults=major,
     )

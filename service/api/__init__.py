@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from aeroloop.service.control.controller import Controller
     from aeroloop.service.figures import Figures
     from aeroloop.service.logs.ticks import Ticks
+    from aeroloop.service.testing.hil import Hil
     from aeroloop.service.theorem.certificate import Certificate
 
 _HOMES: Final = {
@@ -35,6 +36,7 @@ _HOMES: Final = {
     "Certificate": "aeroloop.service.theorem.certificate",
     "Controller": "aeroloop.service.control.controller",
     "Figures": "aeroloop.service.figures",
+    "Hil": "aeroloop.service.testing.hil",
     "HysteresisQuantizer": "aeroloop.protocol.wire.hysteresis",
     "LogarithmicQuantizer": "aeroloop.protocol.wire.logarithmic",
     "Measurement": "aeroloop.plant_emulator.plant",
@@ -57,6 +59,7 @@ __all__ = [
     "Certificate",
     "Controller",
     "Figures",
+    "Hil",
     "HysteresisQuantizer",
     "LogarithmicQuantizer",
     "Measurement",

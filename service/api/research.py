@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aeroloop.plant_emulator.plant import Plant
-from aeroloop.service.config import Settings, load
+from aeroloop.service.config import Settings, as_overrides, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import experiment
@@ -26,13 +25,12 @@ def load_settings(file: Path | str | None = None, overrides: Mapping[str, Any] |
 
     Args:
         file: A TOML file, as for `--config`.
-        overrides: `section.key` to value, as for `--set`; `"cont"` for bits that are not quantized.
+        overrides: `section.key` to value, as for `--set`, or nested by section; `"cont"` for bits without a quantizer.
 
     Raises:
         AeroloopError: What is wrong and where, in one line.
     """
-    settings = [f"{key}={json.dumps(value)}" for key, value in (overrides or {}).items()]
-    return load(Path(file) if file is not None else None, settings)
+    return load(Path(file) if file is not None else None, as_overrides(overrides or {}))
 
 
 def run_experiment(

@@ -6,7 +6,7 @@ import logging
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
+from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, NoReturn, TypeVar, get_type_hints
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.config import Settings
 
+log: Final = logging.getLogger("aeroloop")
+
 # Heavy modules (casadi, zenoh) are imported where they are used: `--help` must not wait for them.
 
 _PR_SET_PDEATHSIG: Final = 1
@@ -31,6 +33,8 @@ PAPER_DURATION_S: Final = 50.0
 Result = TypeVar("Result", bound="BaseModel")
 
 state = {"debug": False}
+logged_as: list[str] = []
+"""The role of a daemon that logs JSON, so that its last error is a line of JSON, too; empty in other commands."""
 
 Config = Annotated[
     Path | None, typer.Option("--config", "-c", help="TOML file with the configuration.", show_default=False)
@@ -60,15 +64,24 @@ class DaemonOptions(NamedTuple):
     with_parent: WithParent = 0
 
 
-def daemon(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of every daemon to a command, which takes them as its first argument."""
+def daemon(role: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add the options of every daemon to the command of a role, which takes them as its first argument."""
+    return partial(_as_daemon, role)
+
+
+def _as_daemon(role: str, command: Callable[..., None]) -> Callable[..., None]:
     own = list(signature(command).parameters.values())[1:]
     shared = [Parameter(name, Parameter.KEYWORD_ONLY, default=value) for name, value in _DEFAULTS.items()]
     hints = get_type_hints(command, include_extras=True) | get_type_hints(DaemonOptions, include_extras=True)
 
     @wraps(command)
     def with_options(**arguments: Any) -> None:
-        command(DaemonOptions(**{name: arguments.pop(name) for name in _DEFAULTS}), **arguments)
+        options = DaemonOptions(**{name: arguments.pop(name) for name in _DEFAULTS})
+        from aeroloop.service.terminal.log_lines import set_up_logging
+
+        set_up_logging(logging.WARNING if options.quiet else logging.INFO, as_json=options.log_format == "json")
+        logged_as[:] = [role] if options.log_format == "json" else []
+        command(options, **arguments)
 
     parameters = [each.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[each.name]) for each in (*own, *shared)]
     with_options.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
@@ -81,8 +94,16 @@ _DEFAULTS: Final = DaemonOptions()._asdict()
 
 def fail(message: str, code: int) -> NoReturn:
     """End the command with one line on stderr."""
-    typer.echo(f"aeroloop: {message}", err=True)
+    report(message)
     raise typer.Exit(code)
+
+
+def report(message: str) -> None:
+    """Print an error as one line on stderr, or log it where a daemon logs JSON."""
+    if logged_as:
+        log.critical(message, extra={"event": "failed", "role": logged_as[0]})
+    else:
+        typer.echo(f"aeroloop: {message}", err=True)
 
 
 def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
@@ -151,7 +172,7 @@ def checked() -> Iterator[None]:
 
 def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:
     """Join the network as a role and run until SIGTERM or SIGINT."""
-    _prepare(options)
+    _follow_parent(options)
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.daemon.claim import controller_name
 
@@ -165,7 +186,7 @@ def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
     """Run a process that is no role on the network until SIGTERM or SIGINT."""
     from threading import Event
 
-    _prepare(options)
+    _follow_parent(options)
     stop = Event()
     for which in (signal.SIGTERM, signal.SIGINT):
         signal.signal(which, lambda *_: stop.set())
@@ -173,10 +194,7 @@ def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
         run(stop)
 
 
-def _prepare(options: DaemonOptions) -> None:
-    from aeroloop.service.terminal.log_lines import set_up_logging
-
-    set_up_logging(logging.WARNING if options.quiet else logging.INFO, as_json=options.log_format == "json")
+def _follow_parent(options: DaemonOptions) -> None:
     if options.with_parent:
         import ctypes
         import os

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, fail, guarded, settings_of, show
+from aeroloop.service.cli.common import Config, Json, Overrides, guarded, settings_of, show
 
 group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
 
@@ -39,7 +38,7 @@ def soak(
     settings = settings_of(config, overrides)
     from datetime import datetime
 
-    from aeroloop.service.host.soak import run_soak
+    from aeroloop.service.lab.soak import run_soak
     from aeroloop.service.terminal.display import progress_bar, soak_table
 
     path = log or settings.recorder.directory / datetime.now().strftime("soak-%Y%m%d-%H%M%S.mcap")
@@ -55,20 +54,25 @@ def units(
     install: Annotated[
         Path | None, typer.Option("--install", help="Write the units into this folder instead.", show_default=False)
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace units that exist.")] = False,
+    config: Config = None,
+    overrides: Overrides = None,
 ) -> None:
-    """Print systemd units for the daemons, or install them."""
-    from shutil import which
+    """Print systemd units for the daemons of this configuration, or install them; ends with the commands to start them.
 
-    from aeroloop.service.host.units import UNITS, unit
-    from aeroloop.service.host.units import install as install_units
+    The configuration is /etc/aeroloop/aeroloop.toml unless --config names another.
+    """
+    from aeroloop.service.host import units
 
-    executable = which("aeroloop") or str(Path(sys.argv[0]).absolute())
+    file = config or (units.CONFIG if units.CONFIG.exists() else None)
+    source = units.Source(file or units.CONFIG, overrides or [], settings_of(file, overrides))
     if install is None:
-        for name in UNITS:
-            typer.echo(f"# aeroloop-{name}.service\n{unit(name, executable)}")
-        return
-    try:
-        for path in install_units(install, executable):
-            typer.echo(path)
-    except OSError as error:
-        fail(f"cannot write into {install}: {error.strerror}", 1)
+        for name in units.UNITS:
+            typer.echo(f"# ── aeroloop-{name}.service ──\n{units.unit(name, source)}")
+    else:
+        with guarded():
+            for path in units.install(install, source, force=force):
+                typer.echo(path)
+    typer.echo("# next:")
+    for step in units.next_steps(install, source):
+        typer.echo(f"#   {step}" if install is None else step)

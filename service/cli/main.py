@@ -14,7 +14,7 @@ import typer
 from typer.exceptions import TyperException
 
 from aeroloop.service.cli import host, lab, log, op, run, show
-from aeroloop.service.cli.common import state
+from aeroloop.service.cli.common import logged_as, report, state
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,6 +50,7 @@ def main() -> None:
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code. Any error is one line on stderr."""
     state["debug"] = False
+    logged_as.clear()
     try:
         return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
@@ -69,7 +70,7 @@ def execute(arguments: Sequence[str]) -> int:
             )
             return 1
         text = f"{type(error).__name__}: {error}".splitlines()[0]
-        typer.echo(f"aeroloop: unexpected {text}; `aeroloop --debug …` shows where", err=True)
+        report(f"unexpected {text}; `aeroloop --debug …` shows where")
         return 1
 
 

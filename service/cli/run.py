@@ -82,7 +82,7 @@ def demo(
 
 
 @group.command()
-@daemon
+@daemon("controller")
 def controller(
     options: DaemonOptions,
     duration: Annotated[
@@ -121,28 +121,28 @@ def controller(
 
 
 @group.command()
-@daemon
+@daemon("plant")
 def emulator(options: DaemonOptions, faults: Faults = None) -> None:
     """Run the emulated plant until SIGTERM."""
     _run_plant(options, "plant.via=emulator", *_fault_options(faults))
 
 
 @group.command()
-@daemon
+@daemon("plant")
 def plant(options: DaemonOptions) -> None:
     """Run the plant end that `plant.via` names until SIGTERM: emulator, CAN bridge or Quanser's board."""
     _run_plant(options)
 
 
 @group.command()
-@daemon
+@daemon("plant")
 def bridge(options: DaemonOptions) -> None:
     """Run the bridge to a plant on the configured CAN bus until SIGTERM."""
     _run_plant(options, "plant.via=can")
 
 
 @group.command("can-node")
-@daemon
+@daemon("node")
 def can_node(options: DaemonOptions, faults: Faults = None) -> None:
     """Run the emulated plant as a node on the configured CAN bus until SIGTERM."""
     settings = settings_of(options.config, options.overrides, *_fault_options(faults))
@@ -173,7 +173,7 @@ def _run_plant(options: DaemonOptions, *overrides: str) -> None:
 
 
 @group.command()
-@daemon
+@daemon("recorder")
 def recorder(
     options: DaemonOptions,
     log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,

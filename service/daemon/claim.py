@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import uuid
 from contextlib import suppress
@@ -13,15 +12,14 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, SessionRecord
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord
 from aeroloop.protocol.messages.operator import Answer
+from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
-
-log: Final = logging.getLogger("aeroloop")
 
 ANSWER_WAIT_S: Final = 1.0
 
@@ -104,7 +102,10 @@ class ClaimClient:
             for _ in self._role.zenoh.get(key, payload=release.encode(), timeout=ANSWER_WAIT_S):
                 pass
         except zenoh.ZError as error:
-            log.warning("controller: could not release the session: %s", error)
+            lost = Event(
+                role=self._role.role, kind="fault", text=f"could not release the session: {error}", session=self.session
+            )
+            log_event(lost, self._role.vehicle)  # not published: Zenoh has just failed
         self.session = None
 
     def _query(self, claim: Claim) -> Grant | Refusal | None:

@@ -146,7 +146,10 @@ class Daemon:
             elif (reason := self._is_lost(time.monotonic() - last)) is not None:
                 return self._lose(reason)
             if now is None:
+                if lockstep:  # a plant may pause for any time, and a request does not wait for its next step
+                    changes.between_ticks(k + 1)
                 self._publish_trace_when_due()
+                self._publish_when_due()
                 continue
             if now.received_as is Received.LATE or now.tick == k:
                 self._take_late(now)
@@ -251,6 +254,7 @@ class Daemon:
         assert session is not None
         self._granted = self._plant is not None and self._plant.session == session
         self._machine.fire(Trigger.GRANT)
+        self._status_due = 0
         self._trace.session = session
         self._trace.state = self._controller.state.model_dump(mode="json")
         self._changes.begin(self._controller, session, self._claims.last)

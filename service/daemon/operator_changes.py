@@ -227,6 +227,11 @@ class OperatorChanges:
         if self._stream is not None:
             self._follow_stream(self._stream)
 
+    def between_ticks(self, k: int) -> None:
+        """Apply the changes received while the plant pauses, from its next tick k on."""
+        self._k = k
+        self._role.take_inbox()
+
     def _start_near(self, frame: bytes) -> None:
         """Hold the attitude found, or approach the reference from there.
 

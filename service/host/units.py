@@ -1,22 +1,36 @@
-"""systemd units for the daemons, written from one template, so that the three stay alike.
+"""systemd units for the daemons, written from one template for the configured plant.
 
 `Type=notify`: a daemon notifies systemd when it is ready, once a second while it runs, and when it stops. The sandbox
-allows the network, the configuration and, for the recorder, its logs.
+allows what the configuration needs: the network, the plant's bus or device, the folders of interpreter and
+configuration, and the recorder's logs.
 """
 
 from __future__ import annotations
 
+import shlex
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.config import Settings
+
+CONFIG: Final = Path("/etc/aeroloop/aeroloop.toml")
+SYSTEM_FOLDER: Final = Path("/etc/systemd/system")
 UNITS: Final = {
-    "controller": ("the adaptive attitude controller", "controller", True),
-    "plant": ("the plant end that plant.via names", "plant", True),
-    "recorder": ("the recorder of everything on the network", "recorder --set recorder.directory=%L/aeroloop", False),
+    "recorder": "the recorder of everything on the network",
+    "plant": "the plant end that plant.via names",
+    "controller": "the adaptive attitude controller",
 }
-"""By unit: description, command, and whether its loop is timed."""
+"""Daemon to description, in the order of start."""
+_HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
+"""What `ProtectHome=` hides."""
+_WITHOUT_DEVICE: Final = ("socketcan", "socketcand", "udp_multicast", "virtual")
+"""python-can's interfaces that open no device file."""
 
 _TEMPLATE: Final = """\
+# For plant.via = "{via}", by `aeroloop host units`; make it again when that changes.
 [Unit]
 Description=aeroloop: {what}
 After=network-online.target
@@ -24,23 +38,19 @@ Wants=network-online.target
 
 [Service]
 Type=notify
-ExecStart={executable} {command} --config /etc/aeroloop/aeroloop.toml --log-format json
+ExecStart={command}
 ExecReload=/bin/kill -HUP $MAINPID
 Restart=on-failure
 RestartSec=1
 WatchdogSec=5
 TimeoutStopSec=10
-DynamicUser=yes
 {rights}
 NoNewPrivileges=yes
 ProtectSystem=strict
-ProtectHome=yes
 PrivateTmp=yes
-PrivateDevices=yes
 ProtectKernelTunables=yes
 ProtectKernelModules=yes
 ProtectControlGroups=yes
-RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX
 RestrictNamespaces=yes
 LockPersonality=yes
 SystemCallArchitectures=native
@@ -48,19 +58,130 @@ SystemCallArchitectures=native
 [Install]
 WantedBy=multi-user.target
 """
-_TIMED: Final = "LimitRTPRIO=20\nLimitMEMLOCK=infinity\nCapabilityBoundingSet=CAP_SYS_NICE CAP_IPC_LOCK"
-_UNTIMED: Final = "LogsDirectory=aeroloop\nCapabilityBoundingSet="
 
 
-def unit(name: str, executable: str) -> str:
+class UnitError(AeroloopError):
+    """The units cannot be written; one line."""
+
+
+class Source(NamedTuple):
+    """How the daemons are started.
+
+    Attributes:
+        config: Their configuration file.
+        overrides: `--set` words beside it.
+        settings: The configuration that both make.
+    """
+
+    config: Path
+    overrides: Sequence[str]
+    settings: Settings
+
+    @property
+    def options(self) -> list[str]:
+        """The options that name both on a command line."""
+        return ["--config", str(self.config.absolute()), *(word for each in self.overrides for word in ("--set", each))]
+
+
+def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
-    what, command, timed = UNITS[name]
-    return _TEMPLATE.format(what=what, executable=executable, command=command, rights=_TIMED if timed else _UNTIMED)
+    words = [*_executable(), name, *source.options]
+    rights = _user(source.config)
+    if name == "recorder":
+        words += ["--set", "recorder.directory=%L/aeroloop"]
+        rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]
+    else:
+        priority = source.settings.loop.priority
+        rights += [
+            f"LimitRTPRIO={priority}",
+            "LimitMEMLOCK=infinity",
+            "CapabilityBoundingSet=CAP_SYS_NICE CAP_IPC_LOCK",
+        ]
+    families, devices = _access(source.settings) if name == "plant" else ([], [])
+    rights += devices or ["PrivateDevices=yes"]
+    # Netlink lists this host's addresses, for peers on other hosts.
+    rights.append(" ".join(["RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK", *families]))
+    return _TEMPLATE.format(
+        via=source.settings.plant.via,
+        what=UNITS[name],
+        command=" ".join(_quoted(word) for word in [*words, "--log-format", "json"]),
+        rights="\n".join(rights),
+    )
 
 
-def install(folder: Path, executable: str) -> list[Path]:
-    """Write every unit into a folder and return their paths. Raises OSError if it cannot be written."""
+def install(folder: Path, source: Source, *, force: bool = False) -> list[Path]:
+    """Write every unit into a folder and return their paths.
+
+    Raises:
+        UnitError: A unit exists and `force` is false, or the folder cannot be written.
+    """
     paths = {name: folder / f"aeroloop-{name}.service" for name in UNITS}
-    for name, path in paths.items():
-        path.write_text(unit(name, executable))
+    existing = [str(path) for path in paths.values() if path.exists()]
+    if existing and not force:
+        raise UnitError(f"not written over without --force: {', '.join(existing)}")
+    try:
+        for name, path in paths.items():
+            path.write_text(unit(name, source))
+    except OSError as error:
+        raise UnitError(f"cannot write into {folder}: {error.strerror}") from None
     return list(paths.values())
+
+
+def next_steps(folder: Path | None, source: Source) -> list[str]:
+    """Commands that remain after `install` into a folder (None: the units were printed) until the daemons run."""
+    steps = []
+    if not source.config.exists():
+        steps.append(f"sudo mkdir -p {source.config.parent}")
+        steps.append(f"aeroloop show config | sudo tee {source.config} >/dev/null")
+    if folder is None:
+        command = [*_executable(), "host", "units", "--install", str(SYSTEM_FOLDER), *source.options]
+        steps.append(f"sudo {shlex.join(command)}")
+    elif folder.absolute() != SYSTEM_FOLDER:
+        steps.append(f"sudo cp {shlex.quote(str(folder))}/aeroloop-*.service {SYSTEM_FOLDER}/")
+    names = " ".join(f"aeroloop-{name}" for name in UNITS)
+    return [*steps, "sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
+
+
+def _executable() -> list[str]:
+    """The command of the interpreter that runs now."""
+    script = Path(sys.executable).with_name("aeroloop")
+    return [str(script)] if script.exists() else [sys.executable, "-P", "-m", "aeroloop"]
+
+
+def _quoted(word: str) -> str:
+    """A word of ExecStart=: systemd.service(5) expands $ and splits at blanks; `%L` alone is meant as a specifier."""
+    escaped = word.replace("$", "$$")
+    if "%L" not in word:
+        escaped = escaped.replace("%", "%%")
+    if escaped == word and not set(word) & set(" \t\"'\\;"):
+        return escaped
+    return '"' + escaped.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _user(config: Path) -> list[str]:
+    """Lines on the user: one of systemd's own, unless interpreter or configuration is in a home."""
+    needed = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve(), config.absolute())
+    homes = [path for path in needed if any(path.is_relative_to(home) for home in _HOMES)]
+    if not homes:
+        return ["DynamicUser=yes", "ProtectHome=yes"]
+    return [
+        f"# {homes[0]} is in a home, so its owner runs the daemon; installed under /opt, it gets a user of its own.",
+        f"User={homes[0].owner()}",
+        "ProtectHome=read-only",
+    ]
+
+
+def _access(settings: Settings) -> tuple[list[str], list[str]]:
+    """Address families and lines on devices that the plant end needs besides the network's."""
+    via, can = settings.plant.via, settings.can
+    on_bus = via == "can" and can.interface not in _WITHOUT_DEVICE
+    if via == "can" and can.interface == "socketcan":
+        return ["AF_CAN"], []
+    if on_bus and can.channel.startswith("/dev/"):
+        device = Path(can.channel.partition("@")[0])
+        group = device.group() if device.exists() else "dialout"
+        return [], ["DevicePolicy=closed", f"DeviceAllow={device} rw", f"SupplementaryGroups={group}"]
+    if on_bus or via == "quanser":
+        comment = "# USB; its user also needs write access to /dev/bus/usb, as a udev rule gives it."
+        return [], [comment, "DevicePolicy=closed", "DeviceAllow=char-usb_device rw"]
+    return [], []

@@ -31,9 +31,9 @@ from aeroloop.service.lab import paper
 if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis
     from aeroloop.service.host.operator import Statuses
-    from aeroloop.service.host.soak import Soak
     from aeroloop.service.lab.calibrate import Calibration
     from aeroloop.service.lab.demo import Progress as DemoProgress
+    from aeroloop.service.lab.soak import Soak
     from aeroloop.service.lab.tables import Tables
 
 LABELS: Final = 22

@@ -1,31 +1,32 @@
-"""Hardware-in-the-loop tests: runs controller, plant and recorder as a process group and injects faults.
+"""Hardware-in-the-loop tests: runs controller, plant and recorder as a process group, operates it and injects faults.
 
 The `hil` fixture of the pytest plugin is a `Hil`; it works without pytest, too. In real time `run` sleeps; in lockstep
-the plant takes an exact number of steps, so a test repeats bit for bit on a busy machine.
+the plant takes an exact number of steps, and what an operator requests between two of them holds from the next tick on,
+so a test repeats bit for bit on a busy machine.
 """
 
 from __future__ import annotations
 
-import json
 import signal
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Condition
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Self
 
 import zenoh
-from mcap.reader import make_reader
+from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
-from aeroloop.protocol.messages.operator import Advance, Answer, Ask, Change, Inject, Message
+from aeroloop.protocol.messages.operator import Advance, Answer, Ask, Gains, Hold, Inject, Message, Reference, Track
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
-from aeroloop.service.config import Settings, load
-from aeroloop.service.figures import Figures
-from aeroloop.service.review.review import review
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.service.config import Settings, as_overrides, load
+from aeroloop.service.host.operator import read_points, send, stop
+from aeroloop.service.testing.hil_log import HilError as HilError
+from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
 
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
@@ -33,68 +34,6 @@ PATIENCE_S: Final = 30.0
 """Timeout for another process: one starts in about a second here, and CI machines are busy."""
 PATIENCE_PER_STEP_S: Final = 0.02
 """Timeout per step in lockstep: a hundred times what a step takes here."""
-
-
-class HilError(AeroloopError):
-    """The loop did not reach a state that the test requires; one line."""
-
-
-class HilLog:
-    """The log of a run.
-
-    Attributes:
-        path: The MCAP file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    @property
-    def figures(self) -> Figures:
-        """Every figure of merit, from the log alone. Raises ReviewError if it holds no session."""
-        return review(self.path)
-
-    @property
-    def events(self) -> list[Event]:
-        """Events in order."""
-        return [message for _, message in self.messages("event") if isinstance(message, Event)]
-
-    @property
-    def trips(self) -> list[str]:
-        """Cause of each trip of the plant, in order."""
-        return [event.text for event in self.events if event.kind == "tripped"]
-
-    def batches(self, end: End) -> list[Batch]:
-        """Trace batches of one end, in the order of recording."""
-        read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
-        return [batch for batch in read if batch is not None and batch.header.end == end]
-
-    def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
-        """Times at which one end received or sent frames, on its wall clock [ns since 1970]."""
-        frame = Received.FRAME if (end, column) == ("controller", "received") else Sent.FRAME
-        return [
-            at_ns + batch.header.wall_ns - batch.header.monotonic_ns
-            for batch in self.batches(end)
-            for at_ns, kind in zip(batch.times_ns(column).tolist(), batch.columns[f"{column}_as"].tolist(), strict=True)
-            if at_ns >= 0 and kind == frame
-        ]
-
-    @property
-    def changes(self) -> list[Change]:
-        """Changes of references and gains that controllers applied, in order."""
-        return [change for batch in self.batches("controller") for change in batch.tail.changes]
-
-    def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
-        """Time of publication [ns] and content of every message of one topic; frames and traces are bytes."""
-        found: list[tuple[int, Message | bytes]] = []
-        topic = topics.TOPICS[name]
-        with self.path.open("rb") as file:
-            for _, channel, message in make_reader(file).iter_messages():
-                address = topics.read_key(channel.topic)
-                if address is not None and address.topic is topic:
-                    content = topic.model.model_validate_json(message.data) if topic.model else message.data
-                    found.append((message.publish_time, content))
-        return found
 
 
 class Hil:
@@ -108,12 +47,7 @@ class Hil:
 
     Attributes:
         events: Events received so far.
-        settings: The configuration, once started.
-        processes: The process group, once started.
     """
-
-    settings: Settings
-    processes: ProcessGroup
 
     def __init__(
         self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
@@ -123,6 +57,8 @@ class Hil:
         self._private_bus = plant == "can-node"
         self._config = config
         self._lockstep = lockstep
+        self._settings: Settings | None = None
+        self._processes: ProcessGroup | None = None
         self._running = False
         self._logs: list[HilLog] = []
         self._changed = Condition()
@@ -143,8 +79,8 @@ class Hil:
 
         Args:
             config: A TOML file, as for `--config`.
-            settings: Overrides as for `--set`: section.key to value. Without one of `controller.after_restart` the
-                controller follows the configured reference from the start.
+            settings: Overrides: `{"loop.rate_hz": 200}`, as for `--set`, or nested, `{"loop": {"rate_hz": 200}}`. Without
+                one of `controller.after_restart` the controller follows the configured reference from the start.
             drive: Whether to start a controller and wait for it.
 
         Raises:
@@ -164,14 +100,15 @@ class Hil:
             "plant.steps_on_request": self._lockstep and self._via == "emulator",
             "plant.via": self._via,
         }
-        overrides = [f"{key}={json.dumps(value)}" for key, value in {**ours, **(settings or {})}.items()]
-        self.settings = load(Path(config) if config else self._config, overrides)
+        overrides = as_overrides(ours) + as_overrides(settings or {})  # a later one wins
+        loaded = load(Path(config) if config else self._config, overrides)
         if self._private_bus:
-            self.settings = self.settings.model_copy(update={"can": private_bus(self.settings.can)})
+            loaded = loaded.model_copy(update={"can": private_bus(loaded.can)})
+        self._settings = loaded
         self.events.clear()
         self._statuses.clear()
         self._requested_ticks = 0
-        self.processes = ProcessGroup(self.settings)
+        self._processes = ProcessGroup(loaded, log.with_suffix(""))
         self._running = True
         self._logs.append(HilLog(log))
         for name, receive in (("event", self._receive_event), ("status", self._receive_status)):
@@ -183,8 +120,7 @@ class Hil:
         for role in ROLES:
             self.processes.await_role(role)
         if drive:
-            ready = {PlantState.GRANTED, PlantState.DRIVEN} if self._lockstep else {PlantState.DRIVEN}
-            self.eventually("the controller drives the plant", lambda: self.state("plant") in ready)
+            self.eventually("the controller drives the plant", self._closed)
 
     def run(self, seconds: float) -> None:
         """Run the loop for a time; in lockstep for that many steps, or until the session ends.
@@ -195,6 +131,7 @@ class Hil:
             ProcessGroupError: A process has failed.
             HilError: In lockstep, the plant does not step in time.
         """
+        self._check_running()
         if not self._lockstep:
             time.sleep(seconds)
             self.processes.check()
@@ -221,13 +158,39 @@ class Hil:
         """
         self._query("inject", Inject(clear=True) if fault is None else Inject(faults=[fault]))
 
-    def arm(self) -> None:
-        """Arm the plant, as `aeroloop op arm`."""
-        self._query("arm", Ask())
+    def arm(self) -> str:
+        """Arm the plant and recall controllers, as `aeroloop op arm`. Returns what was done; HilError if refused."""
+        return self._operate("arm", Ask())
 
-    def stop(self) -> None:
-        """Stop the plant, as `aeroloop op stop`."""
-        self._query("stop", Ask())
+    def stop(self) -> str:
+        """Stop the plant, as `aeroloop op stop`. Returns what was done; HilError if refused."""
+        self._check_running()
+        answers, failures = stop(self.settings.network, self.settings.vehicle)
+        if failures:
+            raise HilError("; ".join(failures))
+        return "; ".join(answers)
+
+    def release(self) -> str:
+        """Make the controller release the vehicle, as `aeroloop op release`. Returns and raises as `arm`."""
+        return self._operate("stand_down", Ask())
+
+    def goto(self, roll: float, pitch: float, yaw: float, within_s: float) -> str:
+        """Turn to an attitude [deg] within a time [s], as `aeroloop op goto`. Returns and raises as `arm`."""
+        return self.track(Hold(attitude=(roll, pitch, yaw)), within_s)
+
+    def track(self, reference: Reference | Mapping[str, Any] | Path, within_s: float = 2.0) -> str:
+        """Follow another reference, as `aeroloop op track`. Returns and raises as `arm`.
+
+        Args:
+            reference: A reference, a table as of `[reference]` (`{"kind": "sinusoid", …}`), or a CSV file of points.
+            within_s: Time to reach it [s].
+        """
+        followed = read_points(reference) if isinstance(reference, Path) else reference
+        return self._operate("track", self._made(Track, reference=followed, within_s=within_s))
+
+    def set_gains(self, *, C1: Vector | None = None, C2: Vector | None = None, Gamma: Vector | None = None) -> str:
+        """Change the law's gains, as `aeroloop op set-gains`; None keeps one. Returns and raises as `arm`."""
+        return self._operate("set_gains", self._made(Gains, C1=C1, C2=C2, Gamma=Gamma))
 
     def kill(self, role: RoleName) -> None:
         """Kill a role with SIGKILL."""
@@ -288,15 +251,68 @@ class Hil:
             self._running = False
             self.processes.__exit__(None, None, None)
 
+    def evidence(self) -> list[str]:
+        """Stop all processes and write what explains a failure beside each log: page and events.
+
+        Returns:
+            A line for each file: its path and what it is. Configuration and output of the daemons are there already.
+        """
+        self.finish()
+        lines = [line for log in self._logs for line in log.evidence(self.events if log is self._logs[-1] else [])]
+        outputs = sorted(output for log in self._logs for output in log.path.with_suffix("").glob("*.txt"))
+        return [*lines, *(f"{output}: output of the {output.stem}" for output in outputs if output.stat().st_size)]
+
+    @property
+    def settings(self) -> Settings:
+        """The configuration. Raises HilError before `start`."""
+        if self._settings is None:
+            raise HilError("nothing was started: call `hil.start()` first")
+        return self._settings
+
+    @property
+    def processes(self) -> ProcessGroup:
+        """The process group. Raises HilError before `start`."""
+        if self._processes is None:
+            raise HilError("nothing was started: call `hil.start()` first")
+        return self._processes
+
     @property
     def log(self) -> HilLog:
         """The log since `start`, or since the recorder's last restart. Reading it ends the run."""
         self.finish()
         if not self._logs:
-            raise HilError("nothing was started, so there is no log")
+            raise HilError("nothing was started, so there is no log: call `hil.start()` first")
         return self._logs[-1]
 
+    def _closed(self) -> bool:
+        """Whether the controller drives the plant; in lockstep, whether both ends have begun a session."""
+        plant, controller = self._statuses.get("plant"), self._statuses.get("controller")
+        if not self._lockstep or plant is None or controller is None:
+            return plant is not None and plant.state == PlantState.DRIVEN
+        return plant.session is not None and plant.session == controller.session
+
+    def _check_running(self) -> None:
+        if self.processes and not self._running:
+            raise HilError("the run has ended, as reading `hil.log` ends it: call `hil.start()` for another")
+
+    def _made(self, model: type[Message], **values: Any) -> Message:
+        try:
+            return model.model_validate(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise HilError(f"{where}: {first['msg'].removeprefix('Value error, ')}, not {first['input']!r}") from None
+
+    def _operate(self, topic: str, message: Message) -> str:
+        self._check_running()
+        try:
+            return send(self.settings.network, self.settings.vehicle, topic, message)
+        except AeroloopError as error:
+            raise HilError(str(error)) from None
+
     def _query(self, topic: str, message: Message) -> None:
+        """Query the emulator, whose queries for tests are no operator's."""
+        self._check_running()
         key = topics.key(topic, self.settings.vehicle)
         for reply in self.processes.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
             if reply.ok is not None:

@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from random import randrange
 from typing import Any, Final, Literal, Self, get_args
@@ -43,7 +43,7 @@ STOP_WAIT_S: Final = 10.0
 
 
 class ProcessGroupError(AeroloopError):
-    """A process did not start or ended early; one line with its last log line."""
+    """A process did not start or ended early; one line with its last warning or error."""
 
 
 def free_rendezvous() -> str:
@@ -96,14 +96,20 @@ def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
 class ProcessGroup:
     """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
+    Args:
+        settings: The configuration.
+        folder: Folder to keep their configuration and output in, a text file each; None: they are not kept.
+
     Attributes:
         zenoh: A session on their network.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, folder: Path | None = None) -> None:
         self._settings = settings
-        self._folder = tempfile.TemporaryDirectory(prefix="aeroloop-")
-        self._config = Path(self._folder.name) / "aeroloop.toml"
+        self._cleanup = ExitStack()
+        self._folder = folder or Path(self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="aeroloop-")))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._config = self._folder / "aeroloop.toml"
         self._config.write_text(settings.toml())
         self._children: dict[str, Child] = {}
         self._alive: set[str] = set()
@@ -120,7 +126,7 @@ class ProcessGroup:
             if role in self._children:
                 self.stop(role)
         self.zenoh.close()
-        self._folder.cleanup()
+        self._cleanup.close()
 
     def start_plant(self) -> None:
         """Start the configured plant end, and a node on the bus where the bus is software."""
@@ -140,7 +146,7 @@ class ProcessGroup:
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(ENV_PREFIX)}
         server = None if environment else fork_server()
         parent = server.pid if server else os.getpid()
-        words = [role, "--config", str(self._config), f"--with-parent={parent}", "--quiet", *arguments]
+        words = [role, "--config", str(self._config), f"--with-parent={parent}", *arguments]
         with self._log(role).open("ab") as stderr:
             if server:
                 child: Child = server.start(words, inherited, stderr.fileno())
@@ -203,7 +209,7 @@ class ProcessGroup:
         self._config.write_text(self._settings.toml())
 
     def check(self) -> None:
-        """Raise ProcessGroupError, with its last log line, if any process has failed."""
+        """Raise ProcessGroupError, with its last warning or error, if any process has failed."""
         for role in self._children:
             self._check(role)
 
@@ -211,10 +217,11 @@ class ProcessGroup:
         code = self._children[role].poll()
         if code and role not in self._killed:
             lines = self._log(role).read_text(errors="replace").strip().splitlines()
-            raise ProcessGroupError(f"the {role} ended with exit code {code}" + (f": {lines[-1]}" if lines else ""))
+            last = next((f": {line}" for line in reversed(lines) if " INFO " not in line), "")
+            raise ProcessGroupError(f"the {role} ended with exit code {code}{last}")
 
     def _log(self, role: str) -> Path:
-        return Path(self._folder.name) / f"{role}.stderr"
+        return self._folder / f"{role}.txt"
 
     def _token(self, sample: zenoh.Sample) -> None:
         address = topics.read_key(str(sample.key_expr))

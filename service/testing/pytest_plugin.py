@@ -1,13 +1,14 @@
 """Pytest plugin: provides the `hil` fixture, a closed loop of real processes.
 
-Active once the package is installed. It imports the loop's modules only when a test uses the fixture.
+Active once the package is installed. It imports the loop's modules only when a test uses the fixture. The report of a
+failed test names the files that explain it: log, page, events and the daemons' output, in the test's temporary folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 PLANTS = ("emulator", "can", "can-node", "quanser", "quanser-fake")
 SOFTWARE = ("emulator", "can-node", "quanser-fake")
 """Plant ends without hardware: the defaults of the conformance suite."""
+_LOOP: Final = pytest.StashKey["Hil"]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -60,4 +62,17 @@ def hil(request: pytest.FixtureRequest, tmp_path: Path, hil_plant: str) -> Itera
 
     option = request.config.getoption
     with Hil(tmp_path, lockstep=option("--hil-lockstep"), plant=hil_plant, config=option("--hil-config")) as loop:
+        request.node.stash[_LOOP] = loop
         yield loop
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)  # outermost: sees the outcome after `xfail` has changed it
+def pytest_runtest_makereport(
+    item: pytest.Item,
+    call: pytest.CallInfo[None],  # noqa: ARG001  # the hook's argument
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Add the evidence of a failed test's loop to its report, while the loop's folder is still there."""
+    report = yield
+    if report.when == "call" and report.failed and (loop := item.stash.get(_LOOP, None)) is not None:
+        report.sections.append(("hil", "\n".join(loop.evidence())))
+    return report

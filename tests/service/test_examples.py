@@ -52,7 +52,7 @@ def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
 
 
 PUBLIC = {
-    *("AeroloopError", "Certificate", "Controller", "Figures", "HysteresisQuantizer", "LogarithmicQuantizer"),
+    *("AeroloopError", "Certificate", "Controller", "Figures", "Hil", "HysteresisQuantizer", "LogarithmicQuantizer"),
     *("Measurement", "Plant", "RecordedRun", "Settings", "SignalSpec", "Ticks", "UniformQuantizer", "WireSpec"),
     *("certify", "load_settings", "read_run", "run_experiment"),
 }

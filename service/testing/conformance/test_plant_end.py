@@ -39,13 +39,10 @@ def test_it_measures_at_its_rate_and_the_loop_tracks(hil: Hil) -> None:
     rate = hil.settings.loop.rate_hz
     # A plant end skips ticks in a stall and never makes up for them; how many depends on the machine: on two shared
     # cores 296 of 500 a second arrived once. Most measurements and commands must arrive, and none faster than the rate.
-    assert figures.measurement.frames_per_s is not None
     assert rate / 2 < figures.measurement.frames_per_s < 1.01 * rate
-    assert figures.command.frames_per_s is not None
     assert figures.command.frames_per_s > rate / 2
-    assert figures.max_error_deg is not None
     assert figures.max_error_deg < 10
-    assert figures.latency_us is not None
+    assert figures.latency_us.count > 0
 
 
 def test_the_first_measurement_of_a_session_has_counter_0_and_the_next_ones_count(hil: Hil) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import json
+import mmap
 import os
 import subprocess
 import sys
+import time
 from itertools import pairwise
 from math import isnan
 
@@ -20,7 +23,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.runtime import tick_grid, timing
 from aeroloop.protocol.runtime.realtime import RealtimeError, prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
-from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram
+from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, report
 from aeroloop.protocol.wire.loop import LoopSettings
 
 START = 123_456_789_012_345
@@ -49,10 +52,10 @@ class FakeTime:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
     """The fake clock in place of the module's `time`."""
-    time = FakeTime()
+    clock = FakeTime()
     for module in (tick_grid, timing):
-        monkeypatch.setattr(module, "time", time)
-    return time
+        monkeypatch.setattr(module, "time", clock)
+    return clock
 
 
 def test_tick_0_is_due_at_once_or_at_the_start_that_is_given(fake: FakeTime) -> None:
@@ -228,24 +231,34 @@ def test_a_histogram_is_of_fixed_size_however_long_it_runs() -> None:
 
 
 PREPARED = """
-import ctypes, gc, json, os
+import ctypes, gc, json, mmap, os
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.wire.loop import LoopSettings
 refused = prepare_process(LoopSettings())
 slack = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK [ns]
-print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, os.sched_getscheduler(0) == os.SCHED_FIFO]))
+
+def kilobytes(name):
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(name))
+
+before = kilobytes("VmRSS")
+untouched = mmap.mmap(-1, 64 << 20)
+memory = [kilobytes("VmLck"), kilobytes("VmRSS") - before]
+realtime = os.sched_getscheduler(0) == os.SCHED_FIFO
+print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, realtime, memory]))
 """
 
 
 def test_a_prepared_process_is_as_it_reports() -> None:
     # In a process of its own: collector and scheduler are the process's, and pytest needs its own as they are.
     done = subprocess.run([sys.executable, "-c", PREPARED], capture_output=True, text=True, timeout=60, check=True)
-    refused, collects, frozen, slack, realtime = json.loads(done.stdout)
+    refused, collects, frozen, slack, realtime, (locked_kb, grown_kb) = json.loads(done.stdout)
     assert not collects
     assert frozen > 0
     reported = "\n".join(refused)
     assert ("timer slack" in reported) == (slack > 1)  # a real-time process may be shown 0
     assert ("SCHED_FIFO" in reported) == (not realtime)
+    assert ("memory lock" in reported) == (locked_kb == 0)
+    assert grown_kb < 32 << 10  # half of what was mapped and not touched: locked, but not resident
     assert len(refused) == (slack > 1) + (not realtime) + ("memory lock" in reported)
 
 
@@ -274,6 +287,33 @@ def test_loop_timing_measures_from_when_a_tick_was_due_and_leaves_the_start_out(
     assert [h.total.max_us for h in (timing.wake, timing.busy, timing.period)] == [30.0, 100.0, PERIOD / 1000]
 
 
+def test_the_warm_up_begins_with_the_first_tick_however_long_the_loop_waited_for_it(fake: FakeTime) -> None:
+    timing = LoopTiming(warm_up_ns=10 * PERIOD)
+    fake.now = START + 1000 * PERIOD
+    timing.woke(START)
+    timing.turn()
+    assert timing.wake.total.count == 0
+
+
+def test_page_faults_are_counted_from_the_end_of_the_warm_up() -> None:
+    pages = 100
+    kept: list[mmap.mmap] = []
+
+    def touch() -> None:
+        kept.append(mmap.mmap(-1, pages * mmap.PAGESIZE))
+        for page in range(pages):
+            kept[-1][page * mmap.PAGESIZE] = 1
+
+    loop = LoopTiming(warm_up_ns=10**12)
+    loop.woke(time.monotonic_ns())
+    touch()
+    assert loop.faults == (0, 0)
+    loop = LoopTiming(warm_up_ns=0)
+    loop.woke(time.monotonic_ns())
+    touch()
+    assert report(loop).minor_faults >= pages
+
+
 def test_a_pause_is_no_period(fake: FakeTime) -> None:
     timing = LoopTiming(warm_up_ns=0)
     timing.woke(START)
@@ -282,6 +322,29 @@ def test_a_pause_is_no_period(fake: FakeTime) -> None:
     timing.woke(START + 1000 * PERIOD)
     timing.turn()
     assert timing.period.total.count == 0
+
+
+@pytest.mark.parametrize(("known", "called"), [(True, [7]), (False, [7, 3])])
+def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_than_4_4(
+    monkeypatch: pytest.MonkeyPatch, known: bool, called: list[int]
+) -> None:
+    flags: list[int] = []
+
+    class Libc:
+        prctl = staticmethod(lambda *_: 0)
+
+        @staticmethod
+        def mlockall(value: int) -> int:
+            flags.append(value)
+            ctypes.set_errno(0 if known or value < 4 else errno.EINVAL)
+            return 0 if known or value < 4 else -1
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
+    monkeypatch.setattr(gc, "disable", lambda: None)
+    monkeypatch.setattr(gc, "freeze", lambda: None)
+    assert prepare_process(LoopSettings(realtime="try")) == []
+    assert flags == called
 
 
 def test_strict_names_what_is_refused_and_off_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

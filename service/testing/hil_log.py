@@ -1,0 +1,158 @@
+"""Log of a hardware-in-the-loop run: figures, events, trips and messages, and the evidence of a failure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mcap.reader import make_reader
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, Percentiles
+from aeroloop.protocol.messages.operator import Change, Message
+from aeroloop.protocol.messages.trace import Batch, End, Received, Sent, read_batch
+from aeroloop.service.figures import Figures, StreamFigures
+from aeroloop.service.review.review import report, review
+
+
+class HilError(AeroloopError):
+    """The loop did not reach a state that the test requires; one line."""
+
+
+class _Present:
+    """A model each of whose values is read as present: one that the log lacks raises HilError with the reason."""
+
+    if not TYPE_CHECKING:  # declared attributes keep their types, and others are still errors
+
+        def __getattribute__(self, name: str) -> Any:
+            value = super().__getattribute__(name)
+            if value is None and name in type(self).model_fields:
+                why = getattr(self, "reasons", {}).get(name, "no tick was recorded")
+                raise HilError(f"the log gives no {name}: {why}")
+            return value
+
+
+class RunStream(_Present, StreamFigures):
+    """Traffic in one direction of a run that has ended."""
+
+    frames_per_s: float
+    bits_per_s: float
+
+
+class RunFigures(_Present, Figures):
+    """Figures of merit of a run that has ended; reading one that its log lacks raises HilError."""
+
+    z_track: float
+    u_total: float
+    max_error_deg: float
+    final_error_deg: float
+    measurement: RunStream
+    command: RunStream
+    skipped_ticks: int
+    latency_us: Percentiles
+    log: str
+
+    @classmethod
+    def of(cls, figures: Figures) -> RunFigures:
+        """The same figures."""
+        streams = {
+            name: RunStream.model_construct(**dict(getattr(figures, name))) for name in ("measurement", "command")
+        }
+        return cls.model_construct(**{**dict(figures), **streams})
+
+
+class HilLog:
+    """The log of a run.
+
+    Attributes:
+        path: The MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def figures(self) -> RunFigures:
+        """Every figure of merit, from the log alone. Raises ReviewError if it holds no session."""
+        return RunFigures.of(review(self._existing()))
+
+    @property
+    def events(self) -> list[Event]:
+        """Events in order."""
+        return [message for _, message in self.messages("event") if isinstance(message, Event)]
+
+    @property
+    def trips(self) -> list[str]:
+        """Cause of each trip of the plant, in order."""
+        return [event.text for event in self.events if event.kind == "tripped"]
+
+    def batches(self, end: End) -> list[Batch]:
+        """Trace batches of one end, in the order of recording."""
+        read = [read_batch(content) for _, content in self.messages("trace") if isinstance(content, bytes)]
+        return [batch for batch in read if batch is not None and batch.header.end == end]
+
+    def times(self, end: End, column: Literal["received", "sent"]) -> list[int]:
+        """Times at which one end received or sent frames, on its wall clock [ns since 1970]."""
+        frame = Received.FRAME if (end, column) == ("controller", "received") else Sent.FRAME
+        return [
+            at_ns + batch.header.wall_ns - batch.header.monotonic_ns
+            for batch in self.batches(end)
+            for at_ns, kind in zip(batch.times_ns(column).tolist(), batch.columns[f"{column}_as"].tolist(), strict=True)
+            if at_ns >= 0 and kind == frame
+        ]
+
+    @property
+    def changes(self) -> list[Change]:
+        """Changes of references and gains that controllers applied, in order."""
+        return [change for batch in self.batches("controller") for change in batch.tail.changes]
+
+    def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
+        """Time of publication [ns] and content of every message of one topic; frames and traces are bytes."""
+        found: list[tuple[int, Message | bytes]] = []
+        topic = topics.TOPICS[name]
+        with self._existing().open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                address = topics.read_key(channel.topic)
+                if address is not None and address.topic is topic:
+                    content = topic.model.model_validate_json(message.data) if topic.model else message.data
+                    found.append((message.publish_time, content))
+        return found
+
+    def evidence(self, received: Sequence[Event]) -> Iterator[str]:
+        """Write page and events beside the log; yield a line for each file, or the reason why there is none.
+
+        Args:
+            received: Events received while the loop ran, for a log that cannot be read.
+        """
+        if not self.path.exists():
+            yield f"{self.path}: no log was written"
+            return
+        yield f"{self.path}: the log"
+        events, page = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
+        try:
+            timed = [(at, event) for at, event in self.messages("event") if isinstance(event, Event)]
+            lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
+        except Exception:  # whatever a broken log makes its reader raise
+            lines = [_line(event) for event in received]
+        events.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        yield f"{events}: {len(lines)} events"
+        try:
+            from aeroloop.service.report.page.page import write_page
+
+            write_page([report([self.path])], page)
+        except Exception as error:  # the same; and without the extra `review` there is no page
+            yield f"no page: {type(error).__name__}: {error}".splitlines()[0]
+        else:
+            yield f"{page}: the review as a page"
+
+    def _existing(self) -> Path:
+        if not self.path.exists():
+            raise HilError(f"no log was written at {self.path}")
+        return self.path
+
+
+def _line(event: Event) -> str:
+    tick = "" if event.tick is None else f"  (tick {event.tick})"
+    return f"{event.role:<10}  {event.kind:<8}  {event.text}{tick}"

@@ -1,0 +1,128 @@
+"""systemd units: what each configuration's plant needs, no overwriting, next steps, and systemd's own check."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import load
+from aeroloop.service.host import units
+from aeroloop.service.host.units import UNITS, Source, unit
+
+SLCAN = ("plant.via=can", "can.interface=slcan", "can.channel=/dev/ttyACM0@115200")
+VIAS = {
+    "emulator": (),
+    "quanser-fake": ("plant.via=quanser-fake",),
+    "quanser": ("plant.via=quanser",),
+    "udp_multicast": ("plant.via=can",),
+    "socketcan": ("plant.via=can", "can.interface=socketcan", "can.channel=can0"),
+    "slcan": SLCAN,
+    "gs_usb": ("plant.via=can", "can.interface=gs_usb", 'can.channel="0"'),
+}
+USB = {"DevicePolicy": "closed", "DeviceAllow": "char-usb_device rw"}
+SERIAL = {"DevicePolicy": "closed", "DeviceAllow": "/dev/ttyACM0 rw"}
+NONE = {"PrivateDevices": "yes"}
+
+
+def made(name: str, *overrides: str) -> dict[str, str]:
+    """Directives of a unit."""
+    text = unit(name, Source(units.CONFIG, overrides, load(overrides=overrides)))
+    lines = [line for line in text.splitlines() if "=" in line and not line.startswith("#")]
+    return {key: value for key, _, value in (line.partition("=") for line in lines)}
+
+
+@pytest.mark.parametrize(
+    ("via", "devices"),
+    [
+        ("emulator", NONE), ("quanser-fake", NONE), ("udp_multicast", NONE), ("socketcan", NONE),
+        ("slcan", SERIAL), ("gs_usb", USB), ("quanser", USB),
+    ],
+)  # fmt: skip
+def test_the_plants_unit_may_use_its_bus_or_device_and_the_others_may_not(via: str, devices: dict[str, str]) -> None:
+    plant = made("plant", *VIAS[via])
+    assert {name: plant[name] for name in plant if name.startswith("Device") or name == "PrivateDevices"} == devices
+    assert ("AF_CAN" in plant["RestrictAddressFamilies"].split()) == (via == "socketcan")
+    assert ("SupplementaryGroups" in plant) == (via == "slcan")
+    for name in ("controller", "recorder"):
+        assert made(name, *VIAS[via])["PrivateDevices"] == "yes"
+        assert "AF_CAN" not in made(name, *VIAS[via])["RestrictAddressFamilies"]
+
+
+def test_homes_are_hidden_unless_interpreter_or_configuration_lies_in_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def directives(config: Path) -> tuple[str | None, ...]:
+        text = unit("plant", Source(config, [], load()))
+        found = dict(line.split("=", 1) for line in text.splitlines() if "=" in line and not line.startswith("#"))
+        return found.get("User"), found.get("DynamicUser"), found["ProtectHome"]
+
+    home, config = tmp_path / "home", tmp_path / "home/ann/aeroloop.toml"
+    config.parent.mkdir(parents=True)
+    config.touch()
+    monkeypatch.setattr(units, "_HOMES", (home,))
+    assert directives(units.CONFIG) == (None, "yes", "yes")
+    assert directives(config) == (config.owner(), None, "read-only")
+    monkeypatch.setattr(sys, "prefix", str(home / "ann"))
+    assert directives(units.CONFIG) == (config.owner(), None, "read-only")
+
+
+def test_units_are_not_replaced_unless_forced_and_the_next_steps_start_every_daemon(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    install = ["host", "units", "--install", str(tmp_path)]
+    assert run(install) == 0
+    printed = capfd.readouterr().out
+    *_, reload, enable, look = printed.splitlines()
+    assert reload == "sudo systemctl daemon-reload"
+    assert enable == "sudo systemctl enable --now " + " ".join(f"aeroloop-{name}" for name in UNITS)
+    assert look == "aeroloop op status"
+    assert f"sudo cp {tmp_path}/aeroloop-*.service /etc/systemd/system/" in printed
+    mine = tmp_path / "aeroloop-plant.service"
+    mine.write_text("mine")
+    assert run(install) == 1
+    assert str(mine) in capfd.readouterr().err
+    assert mine.read_text() == "mine"
+    assert run([*install, "--force"]) == 0
+    capfd.readouterr()
+    assert run(["host", "units"]) == 0
+    assert mine.read_text() in capfd.readouterr().out
+    assert run(["host", "units", "--install", str(tmp_path / "nowhere")]) == 1
+
+
+@pytest.mark.parametrize("via", VIAS)
+def test_systemd_finds_nothing_wrong_with_any_unit(via: str, tmp_path: Path) -> None:
+    systemd = shutil.which("systemd-analyze")
+    if systemd is None:
+        pytest.skip("systemd-analyze is not installed")
+    config = tmp_path / "aero loop.toml"
+    config.touch()
+    source = Source(config, VIAS[via], load(overrides=VIAS[via]))
+    paths = units.install(tmp_path, source)
+    checked = subprocess.run(
+        [systemd, "verify", "--man=no", *paths], capture_output=True, text=True, timeout=60, check=False
+    )
+    about_ours = [line for line in checked.stderr.splitlines() if "aeroloop" in line]
+    assert (checked.returncode, about_ours) == (0, [])
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("name", UNITS)
+def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, tmp_path: Path) -> None:
+    """The words of ExecStart, with a configuration that makes the daemon end at once, in a line of JSON."""
+    config = tmp_path / "aero loop.toml"
+    config.write_text('[network]\nrendezvous = ""\nlisten = ["tcp/192.0.2.1:1"]\n')  # an address that is not ours
+    overrides = ['network.connect=["tcp/127.0.0.1:9?a=$%"]']
+    text = unit(name, Source(config, overrides, load(config, overrides)))
+    start = next(line for line in text.splitlines() if line.startswith("ExecStart=")).removeprefix("ExecStart=")
+    words = shlex.split(start.replace("%L", str(tmp_path)).replace("%%", "%").replace("$$", "$"))
+    assert overrides[0] in words
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert '"event": "failed"' in done.stderr
+    assert "cannot listen on tcp/192.0.2.1:1" in done.stderr

@@ -1,0 +1,114 @@
+"""`hil` without processes: errors before `start`, settings, figures of an ended run, evidence of a failure, types."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from aeroloop.protocol.messages.models import Event
+from aeroloop.service.config import as_overrides, load
+from aeroloop.service.review.review import review
+from aeroloop.service.testing import hil as hil_module
+from aeroloop.service.testing.hil import Hil, HilError, HilLog
+from aeroloop.service.testing.hil_log import RunFigures
+from tests.support.made_log import make_log
+
+ROOT = Path(__file__).parents[3]
+README = Path(hil_module.__file__).with_name("README.md")
+
+VERBS = {
+    "run": (1.0,),
+    "inject": ("rate:off",),
+    "arm": (),
+    "stop": (),
+    "release": (),
+    "goto": (0.0, 0.0, 10.0, 2.0),
+    "track": ({"kind": "sinusoid"},),
+    "set_gains": (),
+    "kill": ("plant",),
+    "pause": ("plant",),
+    "resume": ("plant",),
+    "restart": ("plant",),
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_before_start_says_what_to_call_first(verb: str, tmp_path: Path) -> None:
+    with pytest.raises(HilError, match=r"call `hil\.start\(\)` first"):
+        getattr(Hil(tmp_path), verb)(*VERBS[verb])
+
+
+@pytest.mark.parametrize("attribute", ["settings", "processes", "log"])
+def test_an_attribute_before_start_says_what_to_call_first(attribute: str, tmp_path: Path) -> None:
+    with pytest.raises(HilError, match=r"call `hil\.start\(\)` first"):
+        getattr(Hil(tmp_path), attribute)
+
+
+def test_settings_may_be_nested_or_dotted_or_both() -> None:
+    dotted = {"vehicle": "b", "loop.rate_hz": 200, "wire.rate.bits": 10, "can.options": {"port": 7}}
+    nested = {"vehicle": "b", "loop": {"rate_hz": 200}, "wire": {"rate.bits": 10}, "can": {"options.port": 7}}
+    loaded = load(overrides=as_overrides(nested))
+    assert (loaded.loop.rate_hz, loaded.wire.rate.bits, loaded.can.options) == (200, 10, {"port": 7})
+    assert loaded.description() == load(overrides=as_overrides(dotted)).description()
+
+
+def test_a_figure_that_the_log_lacks_is_an_error_with_its_reason(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 20)
+    judged = review(tmp_path / "a.mcap")
+    figures = RunFigures.of(judged)
+    assert figures.z_track == judged.z_track
+    assert figures.command.frames_per_s == judged.command.frames_per_s
+    assert figures.model_dump() == judged.model_dump()
+    lacking = RunFigures.of(judged.model_copy(update={"z_track": None, "reasons": {"z_track": "nothing answered"}}))
+    with pytest.raises(HilError, match="the log gives no z_track: nothing answered"):
+        _ = lacking.z_track
+
+
+def test_evidence_is_a_page_and_the_events_beside_the_log(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 50)
+    lines = list(HilLog(tmp_path / "a.mcap").evidence([]))
+    paths = [Path(line.partition(": ")[0]) for line in lines]
+    assert [path.name for path in paths] == ["a.mcap", "a-events.txt", "a.html"]
+    assert all(path.stat().st_size for path in paths)
+    assert "</html>" in (tmp_path / "a.html").read_text()
+
+
+def test_evidence_of_a_log_that_cannot_be_read_names_the_reason_and_has_the_events_received(tmp_path: Path) -> None:
+    event = Event(role="plant", kind="tripped", text="no command for 100 ms: 0 V", session="s1", tick=7)
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n")
+    lines = list(HilLog(tmp_path / "a.mcap").evidence([event]))
+    assert lines[-1].startswith("no page: ReviewError: ")
+    assert (tmp_path / "a-events.txt").read_text().split() == [
+        "plant",
+        "tripped",
+        "no",
+        "command",
+        "for",
+        "100",
+        "ms:",
+        "0",
+        "V",
+        "(tick",
+        "7)",
+    ]
+    assert list(HilLog(tmp_path / "b.mcap").evidence([event])) == [f"{tmp_path / 'b.mcap'}: no log was written"]
+
+
+def test_the_readmes_example_passes_strict_mypy(tmp_path: Path) -> None:
+    examples = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    assert examples
+    (tmp_path / "test_example.py").write_text("\n\n".join(examples))
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--config-file",
+        "pyproject.toml",
+        str(tmp_path / "test_example.py"),
+    ]  # strict
+    checked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stdout
