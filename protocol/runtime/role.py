@@ -31,6 +31,7 @@ from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, j
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wording import problems
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -171,7 +172,7 @@ class Role:
             try:
                 action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
             except ValidationError as error:
-                text = f"not a {model.__name__}: {error.errors()[0]['msg']}"
+                text = f"not a {model.__name__}: {problems(error, model)[0]}"
                 guarded(query, lambda: Answer(done=False, text=text))
             except AeroloopError as error:
                 refusal = Answer(done=False, text=str(error))

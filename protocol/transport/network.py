@@ -8,11 +8,12 @@ next process to start listens on the address, and the others connect to it withi
 from __future__ import annotations
 
 import json
+import re
 import time
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import zenoh
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
 
@@ -37,18 +38,27 @@ class NetworkError(AeroloopError):
     """The network cannot be joined; one line with the reason and what to do."""
 
 
-class NetworkSettings(BaseModel, extra="forbid"):
+def _endpoint(text: str) -> str:
+    if text and re.fullmatch(r"[a-z][a-z0-9-]*/\S+", text) is None:
+        raise ValueError("must be a Zenoh endpoint, PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447")
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+
+
+class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """Zenoh endpoints of this process and its peers."""
 
-    rendezvous: str = Field(
+    rendezvous: Endpoint = Field(
         default="tcp/127.0.0.1:7447",
         description="Zenoh endpoint every process connects to; the first one started listens there; '' for none",
     )
-    listen: list[str] = Field(
+    listen: list[Endpoint] = Field(
         default=["tcp/127.0.0.1:0"],
         description="Zenoh endpoints this process can be reached at; port 0 is any free one",
     )
-    connect: list[str] = Field(default=[], description="Zenoh endpoints to reach besides the rendezvous")
+    connect: list[Endpoint] = Field(default=[], description="Zenoh endpoints to reach besides the rendezvous")
     gossip: bool = Field(
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )

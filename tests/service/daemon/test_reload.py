@@ -13,7 +13,7 @@ from aeroloop.protocol.messages.operator import Points
 from aeroloop.protocol.runtime.role import Action, Role
 from aeroloop.service.config import Settings, load
 from aeroloop.service.daemon.reload import LIVE, differences, reload_on_hangup
-from aeroloop.service.host.operator import OperatorError, read_points
+from aeroloop.service.points_file import PointsError, read_points
 
 ROLES = ("controller", "plant", "recorder")
 
@@ -273,7 +273,7 @@ def test_a_table_of_points_is_read_with_or_without_a_heading(file: File, content
 )
 def test_a_row_that_is_none_is_reported_with_file_and_line(file: File, content: str, line: int) -> None:
     path = file(content)
-    with pytest.raises(OperatorError) as refused:
+    with pytest.raises(PointsError) as refused:
         read_points(path)
     text = str(refused.value)
     assert text.startswith(f"{path}, line {line}: expected four numbers (time [s], roll, pitch, yaw [deg])")
@@ -298,7 +298,7 @@ def test_a_table_that_makes_no_sense_is_reported_with_file_and_reason(
     file: File, content: str, why: str, _line: int | None
 ) -> None:
     path = file(content)
-    with pytest.raises(OperatorError, match=why) as refused:
+    with pytest.raises(PointsError, match=why) as refused:
         read_points(path)
     assert str(path) in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
@@ -306,26 +306,26 @@ def test_a_table_that_makes_no_sense_is_reported_with_file_and_reason(
 
 @pytest.mark.parametrize(("content", "why", "line"), [case for case in BAD_TABLES if case.values[2] is not None])
 def test_a_table_that_makes_no_sense_is_reported_with_its_line(file: File, content: str, why: str, line: int) -> None:
-    with pytest.raises(OperatorError, match=f"line {line}: .*{why}"):
+    with pytest.raises(PointsError, match=f"line {line}: .*{why}"):
         read_points(file(content))
 
 
 def test_a_file_that_is_not_there_or_cannot_be_read_is_named(tmp_path: Path, file: File) -> None:
     missing = tmp_path / "missing.csv"
     for path, why in [(missing, "No such file"), (tmp_path, "directory"), (file(b"0,0,0,0\n\xff\xfe,0,0,0\n"), "text")]:
-        with pytest.raises(OperatorError, match=why) as refused:
+        with pytest.raises(PointsError, match=why) as refused:
             read_points(path)
         assert str(path) in str(refused.value)
         assert len(str(refused.value).splitlines()) == 1
 
 
 def test_a_cell_without_end_is_reported(file: File) -> None:
-    with pytest.raises(OperatorError, match="line 2"):
+    with pytest.raises(PointsError, match="line 2"):
         read_points(file("0,0,0,0\n1,0,0," + "1" * 200_000 + "\n"))
 
 
 def test_a_row_is_named_by_its_line_in_the_file(file: File) -> None:
-    with pytest.raises(OperatorError, match="line 4"):
+    with pytest.raises(PointsError, match="line 4"):
         read_points(file('"time\n[s]",roll,pitch,yaw\n0,0,0,0\n1,0,0\n'))
 
 
