@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from difflib import SequenceMatcher
+from functools import cache
 from typing import Any, Final
 
 from pydantic import BaseModel, ValidationError
@@ -20,8 +21,8 @@ Shape = dict[str, Any]
 SHOWN: Final = 60
 """Characters of a refused value that are shown."""
 
-_ALIKE: Final = 0.59
-"""Likeness of two keys, 0…1, above which one may be a slip of the other: `C3` for `C1` in the same section is 0.6."""
+_ALIKE: Final = 0.6
+"""Likeness of two keys, 0…1, above which one may be a slip of the other: `C3` for `C1` in the same section is 0.67."""
 
 _COUNTS: Final = ("no", "one", "two", "three", "four", "five", "six")
 
@@ -34,7 +35,7 @@ class Shapes:
     """
 
     def __init__(self, model: type[BaseModel]) -> None:
-        self.root: Shape = model.model_json_schema()
+        self.root = _schema(model)
 
     def resolved(self, shape: Shape) -> Shape:
         """The node that a reference stands for, under the referring field's description."""
@@ -77,14 +78,19 @@ class Shapes:
         return key, shape
 
 
+@cache
+def _schema(model: type[BaseModel]) -> Shape:
+    return model.model_json_schema()
+
+
 def words(shape: Shape) -> str:
     """What a value must be, such as `a number from 1 to 10000`; empty if anything will do."""
     if choices := shape.get("enum", [shape["const"]] if "const" in shape else []):
-        return _either([_shown(choice) for choice in choices])
+        return either([_shown(choice) for choice in choices])
     if kinds := shape.get("discriminator", {}).get("mapping"):
-        return f"a section whose kind is {_either([_shown(kind) for kind in kinds])}"
+        return f"a section whose kind is {either([_shown(kind) for kind in kinds])}"
     if options := shape.get("anyOf"):
-        return _either([words(option) for option in options if option.get("type") != "null"])
+        return either([words(option) for option in options if option.get("type") != "null"])
     match shape.get("type"):
         case "number" | "integer" as kind:
             return f"a{' whole' * (kind == 'integer')} number{_bounds(shape)}"
@@ -92,8 +98,8 @@ def words(shape: Shape) -> str:
             return "true or false"
         case "string":
             if "pattern" in shape:
-                return f"text of the form {shape['pattern'].strip('^$')}"
-            return "a path" if shape.get("format") == "path" else "text"
+                return f"a string of the form {shape['pattern'].strip('^$')}"
+            return "a path" if shape.get("format") == "path" else "a string"
         case "array":
             return _elements(shape)
         case "object":
@@ -114,12 +120,14 @@ def problems(error: ValidationError, *models: type[BaseModel]) -> list[str]:
 
 
 def closest(key: str, known: Iterable[str]) -> str | None:
-    """The known key that is most like an unknown one: first in its last part, then in its section. None if none is."""
+    """The known key that is most like an unknown one: in its last part and in its section. None if none is."""
     section, _, name = key.rpartition(".")
     best, found = _ALIKE, None
     for other in known:
         its_section, _, its_name = other.rpartition(".")
-        likeness = (4 * _likeness(name, its_name) + _likeness(section, its_section)) / 5
+        likeness = _likeness(name, its_name)
+        if section:
+            likeness = (2 * likeness + _likeness(section, its_section)) / 3
         if other == key:
             return None
         if likeness > best:
@@ -144,7 +152,7 @@ def _problem(shapes: Shapes, error: dict[str, Any]) -> str:
     if kind == "json_invalid":
         return f"{key}: it is not JSON" if key else "it is not JSON"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        expected = _either([_shown(kind) for kind in shapes.kinds(shape)])
+        expected = either([_shown(kind) for kind in shapes.kinds(shape)])
         tag = error["ctx"].get("tag")
         return f"{key}.kind must be {expected}{'' if tag is None else f', not {_shown(tag)}'}"
     expected = words(shape) or "another value"
@@ -184,11 +192,12 @@ def _many(one: str, shape: Shape) -> str:
     """The plural of what `words` gives."""
     if shape.get("type") == "array":
         return f"lists of {one.removeprefix('a list of ')}"
-    plural, found = re.subn(r"^a (whole number|number|path|section)", r"\1s", one)
-    return plural if found else "texts" if one == "text" else f"values, each {one}" if one else "values"
+    plural, found = re.subn(r"^a (whole number|number|path|section|string)", r"\1s", one)
+    return plural if found else f"values, each {one}" if one else "values"
 
 
-def _either(options: Sequence[str]) -> str:
+def either(options: Sequence[str]) -> str:
+    """Choices in words: `a, b or c`."""
     *most, last = dict.fromkeys(options)
     return f"{', '.join(most)} or {last}" if most else last
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-import tomli_w
 from pydantic import BaseModel, BeforeValidator, Field, StringConstraints, ValidationError, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
@@ -26,6 +25,7 @@ from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wording import Shapes, closest, problems
+from aeroloop.service.config_text import toml
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
@@ -70,15 +70,17 @@ class Settings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     vehicle: Annotated[str, StringConstraints(pattern=f"^{topics.NAME}$")] = Field(
         default="aero", description="name of the vehicle, one chunk of every key"
     )
-    loop: LoopSettings = LoopSettings()
-    wire: WireSpec = WireSpec()
-    reference: OneReference = Sinusoid()
-    law: LawSettings = LawSettings()
-    controller: ControllerSettings = ControllerSettings()
-    plant: PlantSettings = PlantSettings()
-    can: CanSettings = CanSettings()
-    recorder: RecorderSettings = RecorderSettings()
-    network: NetworkSettings = NetworkSettings()
+    loop: LoopSettings = Field(default=LoopSettings(), description="tick grid and process set-up of both ends")
+    wire: WireSpec = Field(default=WireSpec(), description="quantizers and frames, on which both ends must agree")
+    reference: OneReference = Field(default=Sinusoid(), description="attitude to follow over time")
+    law: LawSettings = Field(default=LawSettings(), description="model of the plant and gains of the law")
+    controller: ControllerSettings = Field(default=ControllerSettings(), description="the controller daemon")
+    plant: PlantSettings = Field(default=PlantSettings(), description="the plant end: plant, sensors, faults, limits")
+    can: CanSettings = Field(default=CanSettings(), description="the CAN bus, for plant.via = 'can'")
+    recorder: RecorderSettings = Field(default=RecorderSettings(), description="the recorder")
+    network: NetworkSettings = Field(
+        default=NetworkSettings(), description="Zenoh endpoints of this process and of others"
+    )
 
     @model_validator(mode="after")
     def _heartbeat_keeps_both_ends_alive(self) -> Settings:
@@ -125,9 +127,9 @@ class Settings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         """The effective configuration, for a role's description."""
         return self.model_dump(mode="json")
 
-    def toml(self) -> str:
-        """The effective configuration as a TOML file that loads to the same."""
-        return tomli_w.dumps(_for_toml(self.description()))
+    def toml(self, *, comments: bool = False) -> str:
+        """The effective configuration as a TOML file that loads to the same, if wanted with a comment on every key."""
+        return toml(self.description(), Shapes(type(self)) if comments else None)
 
 
 def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
@@ -249,19 +251,6 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-
-
-def _for_toml(tree: dict[str, Any]) -> dict[str, Any]:
-    """Replace null, which TOML lacks: bits become "cont", other unset values are left out."""
-    out: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            out[name] = _for_toml(value)
-        elif value is not None:
-            out[name] = value
-        elif name == "bits":
-            out[name] = "cont"
-    return out
 
 
 def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
