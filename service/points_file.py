@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Points
+from aeroloop.protocol.messages.operator import MAX_POINTS, Points
 from aeroloop.protocol.wording import problems
 
 
@@ -42,6 +42,8 @@ def read_points(path: Path) -> Points:
                 time_s, roll, pitch, yaw = (float(cell) for cell in row)
                 times.append(time_s)
                 attitudes.append((roll, pitch, yaw))
+        if not 2 <= len(times) <= MAX_POINTS:
+            raise PointsError(f"{path} has {len(times)} points, and a reference 2 to {MAX_POINTS}")
         return Points(times=times, attitudes=attitudes)
     except csv.Error as error:
         raise PointsError(f"{path}, line {number}: {error}") from None

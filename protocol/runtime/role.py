@@ -28,7 +28,7 @@ from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join
-from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wording import problems
@@ -225,7 +225,11 @@ class Role:
         self.publish_bytes(topic, message.encode())
 
     def publish_bytes(self, topic: str, payload: bytes) -> None:
-        """Publish on one of the table's topics of JSON or traces."""
+        """Publish on one of the table's topics of JSON or traces; what exceeds the topic's limit is not published."""
+        limit = topics.TOPICS[topic].limit - ATTACHMENT_BYTES
+        if len(payload) > limit:
+            self.warn(topic, "fault", f"a {topic} of {len(payload)} bytes is not published: at most {limit} may be")
+            return
         if topic not in self._publishers:
             self.declare(topic, _SELDOM_PER_S)
         self._publishers[topic].put(payload)

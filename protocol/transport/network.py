@@ -16,6 +16,7 @@ import zenoh
 from pydantic import AfterValidator, BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
 
 _PEER_TIMEOUT_S: Final = 2.0
 QUEUE: Final = 16
@@ -74,6 +75,17 @@ def _zenoh_config(settings: NetworkSettings, listen: list[str], connect: list[st
             "exit_on_failure": False,
             "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
+        # Before it is queued, parsed or stored: what waits in memory is bounded, whoever publishes.
+        "low_pass_filter": [
+            {
+                "id": topic.name,
+                "flows": ["ingress"],
+                "messages": ["put", "query", "reply"],
+                "key_exprs": [topics.key(topic.name, "*")],
+                "size_limit": topic.limit,
+            }
+            for topic in topics.TOPICS.values()
+        ],
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "transport": {
             # No use for frames of seven bytes, and a killed process leaves its files behind.

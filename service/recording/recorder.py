@@ -10,6 +10,7 @@ A crash costs the open chunk and 0.5 s; the restarted recorder recovers them fro
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections import Counter
 from functools import lru_cache
@@ -45,6 +46,9 @@ QUIET_S: Final = 0.3
 ANSWER_S: Final = 5.0
 """Longest wait for a role's answer at the end; after it recording ends without the role's last messages [s]."""
 
+TRIM_BYTES: Final = 32_000_000
+"""After so many bytes of messages at once, free memory goes back to the system; malloc would keep it."""
+
 GOES_ON_S: Final = 1.0
 """Longest wait for a quiet network at the end [s]."""
 
@@ -67,6 +71,7 @@ class Recorder:
         self._backlog = Backlog()
         self._lost: Counter[str] = Counter()  # by reason
         self._status_due = 0.0
+        self._to_trim = 0  # bytes taken since memory was last given back
         self._status_written = 0
         self._status_at = time.monotonic()
         self.log = RollingLog(settings, self._report)
@@ -137,10 +142,15 @@ class Recorder:
             address = _address(received.key)
             if address is not None and address.topic.name == "description":
                 self._configure(received)  # at once: other messages are decoded by it
+            self._to_trim += len(received.payload)
             if not self._backlog.room(received):
                 self._write()
             self._backlog.put(received, now)
+            del received
         self._write()
+        if self._to_trim > TRIM_BYTES and not len(self._backlog):
+            ctypes.CDLL(None).malloc_trim(0)
+            self._to_trim = 0
         return count
 
     def _write(self) -> None:
@@ -194,11 +204,12 @@ class Recorder:
         notes = [f"{count} messages lost: {reason}" for reason, count in sorted(self._lost.items())]
         if log.trouble:
             notes.append(f"{log.trouble}; {len(self._backlog)} messages wait")
-        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "waiting for the disk"
+        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "not recording"
         self._role.status(
             Status(
                 role=self._role.role,
                 state=state,
+                cause=log.trouble or None,
                 uptime_s=self._role.uptime_s,
                 ticks=0,
                 rate_hz=(written - self._status_written) / max(now - self._status_at, 1e-3),

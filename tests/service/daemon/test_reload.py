@@ -281,15 +281,20 @@ def test_a_row_that_is_none_is_reported_with_file_and_line(file: File, content: 
 
 
 BAD_TABLES = [
-    pytest.param("", "at least 2 items", None, id="empty"),
-    pytest.param("time,roll,pitch,yaw\n", "at least 2 items", None, id="a heading and no more"),
-    pytest.param("0,0,0,0\n", "at least 2 items", None, id="one point"),
+    pytest.param("", "has 0 points, and a reference 2 to", None, id="empty"),
+    pytest.param("time,roll,pitch,yaw\n", "has 0 points, and a reference 2 to", None, id="a heading and no more"),
+    pytest.param("0,0,0,0\n", "has 1 points, and a reference 2 to", None, id="one point"),
     pytest.param("1,0,0,0\n2,0,0,0\n", "the first time must be 0", 1, id="begins later"),
     pytest.param("0,0,0,0\n2,0,0,0\n1,0,0,0\n", "must rise", 3, id="falls"),
     pytest.param("0,0,0,0\n0,0,0,0\n", "must rise", 2, id="stands still"),
     pytest.param("0,0,0,0\nnan,0,0,0\n", "number", 2, id="a time that is no number"),
     pytest.param("0,0,0,0\n1,0,inf,0\n", "number", 2, id="an angle that is none"),
-    pytest.param("".join(f"{n},0,0,0\n" for n in range(10_001)), "at most 10000", None, id="too many"),
+    pytest.param(
+        "".join(f"{n},0,0,0\n" for n in range(10_001)),
+        "has 10001 points, and a reference 2 to 10000",
+        None,
+        id="too many",
+    ),
 ]
 
 
