@@ -47,10 +47,13 @@ ANSWER_S: Final = 5.0
 """Longest wait for a role's answer at the end; after it recording ends without the role's last messages [s]."""
 
 TRIM_BYTES: Final = 32_000_000
-"""After so many bytes of messages at once, free memory goes back to the system; malloc would keep it."""
+"""After so many bytes are written, freed memory goes back to the system: after a flood, malloc would keep it."""
 
 GOES_ON_S: Final = 1.0
 """Longest wait for a quiet network at the end [s]."""
+
+_malloc_trim: Final = getattr(ctypes.CDLL(None), "malloc_trim", None)
+"""Of glibc; other C libraries have none."""
 
 _address = lru_cache(maxsize=4096)(topics.read_key)
 
@@ -71,7 +74,7 @@ class Recorder:
         self._backlog = Backlog()
         self._lost: Counter[str] = Counter()  # by reason
         self._status_due = 0.0
-        self._to_trim = 0  # bytes taken since memory was last given back
+        self._written_bytes = 0  # since memory was last given back
         self._status_written = 0
         self._status_at = time.monotonic()
         self.log = RollingLog(settings, self._report)
@@ -142,24 +145,24 @@ class Recorder:
             address = _address(received.key)
             if address is not None and address.topic.name == "description":
                 self._configure(received)  # at once: other messages are decoded by it
-            self._to_trim += len(received.payload)
             if not self._backlog.room(received):
                 self._write()
             self._backlog.put(received, now)
-            del received
         self._write()
-        if self._to_trim > TRIM_BYTES and not len(self._backlog):
-            ctypes.CDLL(None).malloc_trim(0)
-            self._to_trim = 0
         return count
 
     def _write(self) -> None:
         """Write the oldest messages, at most `AT_ONCE`, unless the disk refuses."""
         for _ in range(AT_ONCE):
             if not self.log.writable or (entry := self._backlog.next()) is None:
-                return
+                break
             received, at_ns = entry
             self.log.add(received, at_ns, self._decode(received, at_ns))
+            self._written_bytes += len(received.payload)
+        if self._written_bytes > TRIM_BYTES:
+            self._written_bytes = 0
+            if _malloc_trim is not None:
+                _malloc_trim(0)
 
     def _decode(self, received: Delivery, at_ns: int) -> list[Decoded]:
         address = _address(received.key)
