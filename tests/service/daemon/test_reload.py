@@ -113,6 +113,14 @@ def test_another_kind_of_reference_is_reported_key_by_key_and_takes_effect_at_on
     assert not any("restart" in line for line in lines)
 
 
+def test_the_points_of_a_reference_are_counted_not_listed() -> None:
+    times, attitudes = list(range(9)), [[0, 0, 0]] * 9
+    lines = changed(
+        "controller", "reference.kind=points", f"reference.times={times}", f"reference.attitudes={attitudes}"
+    )
+    assert "reference.times: None → 9 values" in lines
+
+
 def test_several_differences_are_reported_a_line_each_in_order_and_each_for_itself() -> None:
     lines = changed("controller", "law.mass=2", "law.C1=[1.0, 1.0, 1.0]", "controller.stale_s=0.2")
     assert lines == [
