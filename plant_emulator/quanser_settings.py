@@ -14,7 +14,7 @@ CardType: TypeAlias = Literal["quanser_aero2_usb", "quanser_aero_usb"]
 PITCH_COUNTS: Final[Mapping[str, int]] = {"quanser_aero2_usb": 2880, "quanser_aero_usb": 2048}
 
 
-class QuanserSettings(BaseModel, extra="forbid"):
+class QuanserSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """The board, and how its channels map to the body. Verify the signs and the gyro's axes on the bench."""
 
     card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name")
@@ -30,7 +30,7 @@ class QuanserSettings(BaseModel, extra="forbid"):
     yaw_counts: int = Field(default=4096, gt=0, description="yaw encoder's counts a turn")
     encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
     bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
-    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter")
+    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter [1]")
     gyro_axes: tuple[int, int, int] = Field(
         default=(0, 1, 2), description="which of the gyro's channels 0, 1, 2 measures the body's x, y, z"
     )

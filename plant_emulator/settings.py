@@ -63,14 +63,22 @@ class PlantSettings(BaseModel, extra="forbid"):
     steps_on_request: bool = Field(
         default=False, description="lockstep only: step only when an `advance` query requests it, for tests"
     )
-    limits: LimitSettings = LimitSettings()
-    aero: AeroSettings = AeroSettings()
-    rigid_body: RigidBodySettings = RigidBodySettings()
-    quanser: QuanserSettings = QuanserSettings()
-    rotor: RotorSettings = RotorSettings()
-    friction: FrictionSettings = FrictionSettings()
-    wind: WindSettings = WindSettings()
-    sensors: SensorSettings = SensorSettings()
+    limits: LimitSettings = Field(default=LimitSettings(), description="beyond any of these the plant trips")
+    aero: AeroSettings = Field(default=AeroSettings(), description="body of the Aero, for kind = 'aero'")
+    rigid_body: RigidBodySettings = Field(default=RigidBodySettings(), description="free body, for kind = 'rigid_body'")
+    quanser: QuanserSettings = Field(
+        default=QuanserSettings(),
+        description="Quanser's board, for via = 'quanser'",
+    )
+    rotor: RotorSettings = Field(
+        default=RotorSettings(), description="lag and dead zone; lags of 0 leave the rotors out"
+    )
+    friction: FrictionSettings = Field(
+        default=FrictionSettings(),
+        description="about pitch and yaw of the Aero, or x, y, z of a free body",
+    )
+    wind: WindSettings = Field(default=WindSettings(), description="wind on the plant")
+    sensors: SensorSettings = Field(default=SensorSettings(), description="sensors of attitude and angular velocity")
 
     @field_validator("faults")
     @classmethod

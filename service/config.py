@@ -7,20 +7,13 @@ experiment.
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
 
-import tomli_w
-from pydantic import Field, StringConstraints, ValidationError, model_validator
-from pydantic_settings import (
-    BaseSettings,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    SettingsError,
-    TomlConfigSettingsSource,
-)
+from pydantic import BaseModel, BeforeValidator, Field, StringConstraints, ValidationError, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
@@ -32,47 +25,63 @@ from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wording import Shapes, closest, problems
+from aeroloop.service.config_text import toml
 from aeroloop.service.control.law import LawSettings
+from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
 
-ENV_PREFIX = "AEROLOOP_"
+ENV_PREFIX: Final = "AEROLOOP_"
+"""Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
 
 
 class ConfigError(AeroloopError):
     """The configuration is wrong; one line with the key and its allowed values."""
 
 
-class Settings(BaseSettings):
-    """Everything that can be configured; sections as in the TOML file."""
+class PointsFile(BaseModel, extra="forbid"):
+    """Points of a CSV file. It is read with the configuration; descriptions and logs hold the points themselves."""
 
-    model_config = SettingsConfigDict(
-        env_prefix=ENV_PREFIX, env_nested_delimiter="__", extra="forbid", nested_model_default_partial_update=True
+    kind: Literal["file"] = Field(default="file", description="which reference")
+    path: Path = Field(
+        description="CSV file of time [s], roll, pitch, yaw [deg]; in a TOML file, relative to that file's folder"
     )
+
+
+def _points_of(reference: Any) -> Any:
+    if not (isinstance(reference, dict) and reference.get("kind") == "file"):
+        return reference
+    try:
+        return read_points(PointsFile.model_validate(reference).path)
+    except ValidationError as error:
+        raise ValueError("; ".join(problems(error, PointsFile))) from None
+    except PointsError as error:
+        raise ValueError(str(error)) from None
+
+
+OneReference = Annotated[
+    Reference,
+    BeforeValidator(_points_of, json_schema_input_type=Annotated[Reference | PointsFile, Field(discriminator="kind")]),
+]
+
+
+class Settings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
+    """Everything that can be configured; sections as in the TOML file."""
 
     vehicle: Annotated[str, StringConstraints(pattern=f"^{topics.NAME}$")] = Field(
         default="aero", description="name of the vehicle, one chunk of every key"
     )
-    loop: LoopSettings = LoopSettings()
-    wire: WireSpec = WireSpec()
-    reference: Reference = Sinusoid()
-    law: LawSettings = LawSettings()
-    controller: ControllerSettings = ControllerSettings()
-    plant: PlantSettings = PlantSettings()
-    can: CanSettings = CanSettings()
-    recorder: RecorderSettings = RecorderSettings()
-    network: NetworkSettings = NetworkSettings()
-
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the library's argument names
-        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003  # the same
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """`--set` over environment over file."""
-        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+    loop: LoopSettings = Field(default=LoopSettings(), description="tick grid and process set-up of both ends")
+    wire: WireSpec = Field(default=WireSpec(), description="quantizers and frames, on which both ends must agree")
+    reference: OneReference = Field(default=Sinusoid(), description="attitude to follow over time")
+    law: LawSettings = Field(default=LawSettings(), description="model of the plant and gains of the law")
+    controller: ControllerSettings = Field(default=ControllerSettings(), description="the controller daemon")
+    plant: PlantSettings = Field(default=PlantSettings(), description="the plant end: plant, sensors, faults, limits")
+    can: CanSettings = Field(default=CanSettings(), description="the CAN bus, for plant.via = 'can'")
+    recorder: RecorderSettings = Field(default=RecorderSettings(), description="the recorder")
+    network: NetworkSettings = Field(
+        default=NetworkSettings(), description="Zenoh endpoints of this process and of others"
+    )
 
     @model_validator(mode="after")
     def _heartbeat_keeps_both_ends_alive(self) -> Settings:
@@ -119,9 +128,9 @@ class Settings(BaseSettings):
         """The effective configuration, for a role's description."""
         return self.model_dump(mode="json")
 
-    def toml(self) -> str:
-        """The effective configuration as a TOML file that loads to the same."""
-        return tomli_w.dumps(_for_toml(self.description()))
+    def toml(self, *, comments: bool = False) -> str:
+        """The effective configuration as a TOML file that loads to the same, if wanted with a comment on every key."""
+        return toml(self.description(), Shapes(type(self)) if comments else None)
 
 
 def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
@@ -134,20 +143,12 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
     Raises:
         ConfigError: The configuration is wrong.
     """
-    if file is not None and not file.is_file():
-        raise ConfigError(f"no configuration file at {file}")
-
-    class Configured(Settings):
-        model_config = SettingsConfigDict(toml_file=file)
-
-    try:
-        return Configured(**_tree(overrides))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file} is not TOML: {error}") from None
-    except SettingsError as error:  # a section in the environment is JSON
-        raise ConfigError(f"{error}: write its keys one by one, as {ENV_PREFIX}SECTION__KEY") from None
-    except ValidationError as error:
-        raise _config_error(error) from None
+    tree = Settings().description()
+    if file is not None:
+        _merge(tree, _read(file))
+    _merge(tree, _environment())
+    _merge(tree, _tree(overrides))
+    return from_description(tree)
 
 
 def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
@@ -170,7 +171,7 @@ def from_description(config: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(config)
     except ValidationError as error:
-        raise _config_error(error) from None
+        raise ConfigError("; ".join(problems(error, Settings))) from None
 
 
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
@@ -181,10 +182,59 @@ def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     return from_description(tree)
 
 
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        tree = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"no configuration file at {file}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{file} is not TOML: {error}") from None
+    reference = tree.get("reference")
+    if isinstance(reference, dict) and isinstance(reference.get("path"), str):
+        reference["path"] = str(file.parent / reference["path"])
+    return tree
+
+
+def _environment() -> dict[str, Any]:
+    given = {name: text for name, text in os.environ.items() if name.upper().startswith(ENV_PREFIX)}
+    known = {_variable(key): key for key, _ in Shapes(Settings).every_key()} if given else {}
+    tree: dict[str, Any] = {}
+    for name, text in sorted(given.items()):
+        variable, _, option = name.upper().partition(_OPTIONS)
+        if option:
+            _merge(tree, {"can": {"options": {option.lower(): _value(text)}}})
+        elif variable in known:
+            _put(tree, known[variable], _value(text))
+        else:
+            found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
+            hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"
+            raise ConfigError(f"{name} in the environment is no setting: {hint}")
+    return tree
+
+
+def _variable(key: str) -> str:
+    return ENV_PREFIX + key.upper().replace(".", "__")
+
+
+_OPTIONS: Final = _variable("can.options.")
+"""What follows it names an option of the CAN interface; any may be given."""
+
+
 def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
+    value: Any
+    present: Any
     for name, value in changes.items():
-        if isinstance(value, dict) and isinstance(tree.get(name), dict):
-            _merge(tree[name], value)
+        present = tree.get(name)
+        # A reference of another kind has other keys; the kinds of a quantizer share theirs.
+        other_kind = name == "reference" and isinstance(value, dict) and "kind" in value
+        if (
+            isinstance(value, dict)
+            and isinstance(present, dict)
+            and not (other_kind and value["kind"] != present["kind"])
+        ):
+            _merge(present, value)
         else:
             tree[name] = value
 
@@ -192,17 +242,20 @@ def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
 def _tree(overrides: Sequence[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for override in overrides:
-        path, equals, text = override.partition("=")
-        if not equals or not path:
+        key, equals, text = override.partition("=")
+        if not equals or not key:
             raise ConfigError(f"--set takes section.key=value, not {override!r}")
-        *sections, name = path.strip().split(".")
-        branch = tree
-        for section in sections:
-            branch = branch.setdefault(section, {})
-            if not isinstance(branch, dict):
-                raise ConfigError(f"--set gives {section} a value, and then {path.strip()}: set its keys one by one")
-        branch[name] = _value(text.strip())
+        _put(tree, key.strip(), _value(text.strip()))
     return tree
+
+
+def _put(tree: dict[str, Any], key: str, value: Any) -> None:
+    *sections, name = key.split(".")
+    for section in sections:
+        tree = tree.setdefault(section, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{section} is given a value, and then {key}: set its keys one by one")
+    tree[name] = value
 
 
 def _value(text: str) -> Any:
@@ -210,34 +263,6 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-
-
-def _config_error(error: ValidationError, section: str = "") -> ConfigError:
-    return ConfigError("; ".join(section + _explain(dict(e)) for e in error.errors(include_url=False)))
-
-
-def _explain(error: dict[str, Any]) -> str:
-    where = ".".join(str(part) for part in error["loc"]) or "the configuration"
-    if error["type"] == "extra_forbidden":
-        return f"unknown configuration key {where}; `aeroloop show config` lists the known ones"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    text = f"{where}: {message[0].lower()}{message[1:]}"
-    if error["type"] == "value_error" and isinstance(error["input"], dict):  # of a section; names its values
-        return text
-    return f"{text}, not {error['input']!r}"
-
-
-def _for_toml(tree: dict[str, Any]) -> dict[str, Any]:
-    """Replace null, which TOML lacks: bits become "cont", other unset values are left out."""
-    out: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            out[name] = _for_toml(value)
-        elif value is not None:
-            out[name] = value
-        elif name == "bits":
-            out[name] = "cont"
-    return out
 
 
 def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
@@ -256,4 +281,4 @@ def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> 
     try:
         return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
     except ValidationError as error:  # some kinds of quantizer allow other numbers of bits
-        raise _config_error(error, "wire.") from None
+        raise ConfigError("; ".join(f"wire.{problem}" for problem in problems(error, WireSpec))) from None

@@ -65,7 +65,9 @@ class RecorderSettings(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     directory: Path = Field(default=Path("logs"), description="folder of logs without a given path")
-    path: Path | None = Field(default=None, description="the log's first file; named by the time if left out")
+    path: Path | None = Field(
+        default=None, description="the log's first file, or a folder; named by the time if left out"
+    )
     chunk_s: float = Field(
         default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut loses [s]"
     )

@@ -33,7 +33,7 @@ class SensorSettings(BaseModel, extra="forbid"):
         default="derivative", description="derivative: of the encoders' angles, filtered"
     )
     bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
-    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter")
+    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter [1]")
     gyro_noise: float = Field(default=0.0, ge=0, description="standard deviation of a gyro sample [rad/s]")
     gyro_bias: Vector = Field(default=(0.0, 0.0, 0.0), description="constant error of the gyro, body frame [rad/s]")
     seed: int = Field(default=0, ge=0, description="of the encoders' zeros and of the gyro's noise")

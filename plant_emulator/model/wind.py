@@ -28,7 +28,7 @@ class WindSettings(BaseModel, extra="forbid"):
         default=0.2,
         ge=0,
         le=10,
-        description="standard deviation of gusts, all axes together, as a part of the steady torque; assumed",
+        description="standard deviation of gusts, all axes together, as a part of the steady torque [1]; assumed",
     )
     gust_time_s: float = Field(default=1.0, gt=0, le=1000, description="time constant of a gust [s]")
     seed: int = Field(default=0, ge=0, description="of the gusts' random numbers")

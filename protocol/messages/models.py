@@ -149,7 +149,9 @@ class Status(Message):
     state: str
     session: str | None = None
     cause: str | None = Field(
-        default=None, description="plant: why it is not armed; controller: why it claims no vehicle; null otherwise"
+        default=None,
+        description="plant: why it is not armed; controller: why it claims no vehicle; recorder: why nothing is "
+        "written; null otherwise",
     )
     process: str = Field(default="", description="host and process id of the role")
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")

@@ -60,7 +60,7 @@ Frequency = Annotated[float, Field(ge=0, le=100)]
 class Sinusoid(Message):
     """amplitude · sin(frequency · t) on each of roll, pitch and yaw. The default is the paper's experiment, C.5."""
 
-    kind: Literal["sinusoid"] = "sinusoid"
+    kind: Literal["sinusoid"] = Field(default="sinusoid", description="which reference")
     amplitude: Angles = Field(default=(0.0, 40.0, 100.0), description="of roll, pitch, yaw [deg]")
     frequency: tuple[Frequency, Frequency, Frequency] = Field(
         default=(0.0, 0.1 * pi, 0.05 * pi), description="of roll, pitch, yaw [rad/s]"
@@ -70,7 +70,7 @@ class Sinusoid(Message):
 class Hold(Message):
     """One constant attitude."""
 
-    kind: Literal["hold"] = "hold"
+    kind: Literal["hold"] = Field(default="hold", description="which reference")
     attitude: Angles | None = Field(
         default=None, description="roll, pitch, yaw [deg]; null: where the body is brought to rest, or 0 at the start"
     )
@@ -79,7 +79,7 @@ class Hold(Message):
 class Points(Message):
     """Attitudes at given times, joined smoothly, from rest to rest; the last one is held."""
 
-    kind: Literal["points"] = "points"
+    kind: Literal["points"] = Field(default="points", description="which reference")
     times: list[float] = Field(min_length=2, max_length=MAX_POINTS, description="rising, from 0 [s]")
     attitudes: list[Angles] = Field(min_length=2, max_length=MAX_POINTS, description="roll, pitch, yaw each [deg]")
 
@@ -97,7 +97,7 @@ class Points(Message):
 class Stream(Message):
     """Set-points received on the `reference` topic; the last one is held until the next."""
 
-    kind: Literal["stream"] = "stream"
+    kind: Literal["stream"] = Field(default="stream", description="which reference")
     timeout_s: float = Field(default=0.5, gt=0, le=60, description="a stream silent longer is reported and held [s]")
     within_s: float = Field(default=0.2, ge=0.02, le=60, description="time to reach each set-point [s]")
 

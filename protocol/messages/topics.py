@@ -28,6 +28,18 @@ NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
 
 
+FRAME_BYTES: Final = 256
+"""More than the longest frame: six elements of 64 bits and a counter."""
+MESSAGE_BYTES: Final = 16_384
+"""Enough for an event of many lines."""
+STATUS_BYTES: Final = 65_536
+"""Enough for a status with all notes and twice as many faults as may act at a time."""
+SAMPLE_BYTES: Final = 2048
+"""Enough for one tick's telemetry or truth."""
+POINTS_BYTES: Final = 2_097_152
+"""Enough for what may hold references of `MAX_POINTS` points: descriptions, requests to track, tails of traces."""
+
+
 @dataclass(frozen=True)
 class Topic:
     """One row of the table.
@@ -41,6 +53,7 @@ class Topic:
         rate: How often.
         model: Model of its messages or requests; None of frames, traces and tokens, and where a request is empty.
         decoded: For viewers: `always` or at most at the `limited` rate; None where nothing is shown.
+        limit: Most bytes of payload and attachment. What is longer is neither published nor received.
     """
 
     name: str
@@ -50,6 +63,7 @@ class Topic:
     rate: str
     model: type[Message] | None = None
     decoded: Literal["always", "limited"] | None = None
+    limit: int = MESSAGE_BYTES
 
     @property
     def recorded(self) -> bool:
@@ -65,26 +79,42 @@ class Topic:
 TOPICS: Final = {
     topic.name: topic
     for topic in (
-        Topic("claim", "claim", "query", "controller", "once a session", Claim),
+        Topic("claim", "claim", "query", "controller", "once a session", Claim, limit=POINTS_BYTES),
         Topic("release", "release", "query", "controller", "once a session", Release),
-        Topic("record", "record", "query", "controller", "at a session's start and on change", SessionRecord),
+        Topic(
+            "record",
+            "record",
+            "query",
+            "controller",
+            "at a session's start and on change",
+            SessionRecord,
+            limit=POINTS_BYTES,
+        ),
         Topic("arm", "arm", "query", "operator", "when needed"),
         Topic("stop", "stop", "query", "operator", "when needed"),
         Topic("stand_down", "stand-down", "query", "operator", "when needed"),
         Topic("recall", "recall", "query", "operator", "when needed"),
-        Topic("show", "show", "query", "operator", "when needed"),
+        Topic("show", "show", "query", "operator", "when needed", limit=POINTS_BYTES),
         Topic("set_gains", "set-gains", "query", "operator", "when needed", Gains),
-        Topic("track", "track", "query", "operator", "when needed", Track),
+        Topic("track", "track", "query", "operator", "when needed", Track, limit=POINTS_BYTES),
         Topic("inject", "inject", "query", "operator", "when needed", Inject),
         Topic("advance", "advance", "query", "operator", "when needed", Advance),
-        Topic("description", "description/{role}", "json", "every role", "at start and on change", Description),
-        Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session"),
-        Topic("command", "{session}/command", "frame", "controller", "answers a measurement"),
-        Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", Telemetry, "limited"),
-        Topic("trace", "trace/{role}", "trace", "plant, controller", "trace_s"),
-        Topic("reference", "reference", "json", "operator", "as it streams", Setpoint, "limited"),
-        Topic("truth", "truth", "json", "plant", "truth_rate", Truth, "limited"),
-        Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", Status, "always"),
+        Topic(
+            "description",
+            "description/{role}",
+            "json",
+            "every role",
+            "at start and on change",
+            Description,
+            limit=POINTS_BYTES,
+        ),
+        Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", limit=FRAME_BYTES),
+        Topic("command", "{session}/command", "frame", "controller", "answers a measurement", limit=FRAME_BYTES),
+        Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", Telemetry, "limited", SAMPLE_BYTES),
+        Topic("trace", "trace/{role}", "trace", "plant, controller", "trace_s", limit=POINTS_BYTES),
+        Topic("reference", "reference", "json", "operator", "as it streams", Setpoint, "limited", SAMPLE_BYTES),
+        Topic("truth", "truth", "json", "plant", "truth_rate", Truth, "limited", SAMPLE_BYTES),
+        Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", Status, "always", STATUS_BYTES),
         Topic("event", "event", "json", "every role", "when it happens", Event, "always"),
         Topic("loss", "loss", "json", "recorder", "when it is found", Loss, "always"),
         Topic("alive", "alive/{role}", "token", "every role", "while it runs"),

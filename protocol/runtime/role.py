@@ -29,9 +29,10 @@ from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.network import VISIT_S, NetworkSettings, join, visit
-from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wording import problems
 
 M = TypeVar("M", bound=Message)
 _SELDOM_PER_S: Final = 8.0
@@ -186,7 +187,7 @@ class Role:
             try:
                 action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
             except ValidationError as error:
-                text = f"not a {model.__name__}: {error.errors()[0]['msg']}"
+                text = f"not a {model.__name__}: {problems(error, model)[0]}"
                 guarded(query, lambda: Answer(done=False, text=text))
             except AeroloopError as error:
                 refusal = Answer(done=False, text=str(error))
@@ -239,7 +240,11 @@ class Role:
         self.publish_bytes(topic, message.encode())
 
     def publish_bytes(self, topic: str, payload: bytes) -> None:
-        """Publish on one of the table's topics of JSON or traces."""
+        """Publish on one of the table's topics of JSON or traces; what exceeds the topic's limit is not published."""
+        limit = topics.TOPICS[topic].limit - ATTACHMENT_BYTES
+        if len(payload) > limit:
+            self.warn(topic, "fault", f"a {topic} of {len(payload)} bytes is not published: at most {limit} may be")
+            return
         if topic not in self._publishers:
             self.declare(topic, _SELDOM_PER_S)
         self._publishers[topic].put(payload)

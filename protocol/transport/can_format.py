@@ -47,7 +47,7 @@ class CanError(AeroloopError):
     """The bus cannot be used; one line with the reason and what to do."""
 
 
-class CanSettings(BaseModel, extra="forbid"):
+class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """The CAN bus, and which node of it is the plant. `options` go to python-can's interface as they are."""
 
     interface: str = Field(

@@ -19,12 +19,13 @@ import struct
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import zenoh
-from pydantic import BaseModel, Field, field_validator
+from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
 
 QUEUE: Final = 16
 """Batches that may wait to be sent on a link, per priority; the most that Zenoh allows."""
@@ -55,10 +56,19 @@ class NetworkError(AeroloopError):
     """The network cannot be joined; one line with the reason and what to do."""
 
 
-class NetworkSettings(BaseModel, extra="forbid"):
+def _endpoint(text: str) -> str:
+    if text and re.fullmatch(r"[a-z][a-z0-9-]*/\S+", text) is None:
+        raise ValueError("must be a Zenoh endpoint, PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447")
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+
+
+class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """Zenoh endpoints of this process and its peers."""
 
-    rendezvous: list[str] = Field(
+    rendezvous: list[Endpoint] = Field(
         default=["tcp/127.0.0.1:7447"],
         description="Zenoh endpoints where processes meet, one for each host; a process listens at its own host's and "
         "connects to all; [] for none",
@@ -69,11 +79,11 @@ class NetworkSettings(BaseModel, extra="forbid"):
         le=64,
         description="consecutive ports from each rendezvous' port on that processes meet at: any of them can be joined",
     )
-    listen: list[str] = Field(
+    listen: list[Endpoint] = Field(
         default=[],
         description="further Zenoh endpoints this process can be reached at; port 0 is any free one",
     )
-    connect: list[str] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
+    connect: list[Endpoint] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
     gossip: bool = Field(
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )
@@ -196,6 +206,17 @@ def _open(
             "retry": {"period_init_ms": retry_ms[0], "period_max_ms": retry_ms[1], "period_increase_factor": 1.5},
         },
         "open": {"return_conditions": {"connect_scouted": False}},  # otherwise it takes 0.5 s, whatever is linked
+        # Before it is queued, parsed or stored: what waits in memory is bounded, whoever publishes.
+        "low_pass_filter": [
+            {
+                "id": topic.name,
+                "flows": ["ingress"],
+                "messages": ["put", "query", "reply"],
+                "key_exprs": [topics.key(topic.name, "*")],
+                "size_limit": topic.limit,
+            }
+            for topic in topics.TOPICS.values()
+        ],
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "transport": {
             # No use for frames of seven bytes, and a killed process leaves its files behind.

@@ -35,6 +35,7 @@ WAITING: Final = 65_536
 """Messages of one topic that may wait to be taken; beyond that the oldest is dropped, and counted by its number."""
 
 _CLOCK: Final = struct.Struct("<q")
+ATTACHMENT_BYTES: Final = _CLOCK.size
 
 _Publisher = tuple[zenoh.ZenohId, int]
 """An EntityGlobalId cannot be compared."""

@@ -23,7 +23,10 @@ def bits_or_continuous(value: object) -> object:
     return None if value == "cont" else value
 
 
-Bits: TypeAlias = Annotated[Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)] | None, BeforeValidator(bits_or_continuous)]
+_Number: TypeAlias = Annotated[int, Field(ge=MIN_BITS, le=MAX_BITS)]
+Bits: TypeAlias = Annotated[
+    _Number | None, BeforeValidator(bits_or_continuous, json_schema_input_type=_Number | Literal["cont"] | None)
+]
 
 
 Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]

@@ -156,16 +156,16 @@ def guarded() -> Iterator[None]:
 
 
 @contextmanager
-def checked() -> Iterator[None]:
-    """Build values from user input; invalid input ends the command with exit code 2."""
+def checked(*models: type[BaseModel]) -> Iterator[None]:
+    """Build values of these models from user input; invalid input ends the command with exit code 2."""
     from pydantic import ValidationError
 
     try:
         yield
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        fail(f"{where}: {first['msg'].removeprefix('Value error, ')}, not {first['input']!r}", 2)
+        from aeroloop.protocol.wording import problems
+
+        fail(problems(error, *models)[0], 2)
     except AeroloopError as error:
         fail(str(error), 2)
 

@@ -90,6 +90,7 @@ def certify(
     ] = None,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -108,7 +109,7 @@ def certify(
             disturbance=disturbance,
             attitude_error_deg=attitude_error,
         )
-    show(result, json, certificate_table)
+    show(result, json, lambda found: certificate_table(found, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 
 

@@ -166,7 +166,7 @@ def set_gains(
     settings = settings_of(config, overrides)
     if c1 is c2 is gamma is None:
         fail("give --C1, --C2 or --Gamma, three numbers each", 2)
-    with checked():
+    with checked(Gains):
         gains = Gains(C1=c1, C2=c2, Gamma=gamma)
     _send(settings, "set_gains", gains)
 
@@ -184,7 +184,7 @@ def goto(
     from aeroloop.protocol.messages.operator import Hold, Track
 
     settings = settings_of(config, overrides)
-    with checked():
+    with checked(Track, Hold):
         track = Track(reference=Hold(attitude=(roll, pitch, yaw)), within_s=within_s)
     _send(settings, "track", track)
 
@@ -212,7 +212,7 @@ def track(
 ) -> None:
     """Follow another reference: configured, a sinusoid, a file, or set-points; `hold` and `stream` brake at once."""
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
-    from aeroloop.service.host.operator import read_points
+    from aeroloop.service.points_file import read_points
 
     settings = settings_of(config, overrides)
     given = {"amplitude": amplitude, "frequency": frequency, "timeout_s": timeout_s}
@@ -220,7 +220,7 @@ def track(
     misplaced = set(options) - {"sinusoid": {"amplitude", "frequency"}, "stream": {"timeout_s"}}.get(what, set())
     if misplaced:
         fail(f"{what} takes no --{misplaced.pop().removesuffix('_s')}", 2)
-    with checked():
+    with checked(Sinusoid, Stream, Track):
         reference: Reference | None
         match what:
             case "configured":

@@ -176,7 +176,7 @@ def _run_plant(options: DaemonOptions, *overrides: str) -> None:
 @daemon("recorder")
 def recorder(
     options: DaemonOptions,
-    log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="New log, or its folder.", show_default=False)] = None,
 ) -> None:
     """Record the traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []

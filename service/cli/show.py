@@ -15,9 +15,13 @@ group = typer.Typer(no_args_is_help=True, help="Print the configuration, the wir
 
 
 @group.command("config")
-def show_config(config: Config = None, overrides: Overrides = None) -> None:
-    """Print the effective configuration as TOML."""
-    typer.echo(settings_of(config, overrides).toml(), nl=False)
+def show_config(
+    bare: Annotated[bool, typer.Option("--bare", help="Leave out the comments.")] = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print the effective configuration as TOML, each key with what it means, its unit and its bounds."""
+    typer.echo(settings_of(config, overrides).toml(comments=not bare), nl=False)
 
 
 @group.command()

@@ -34,6 +34,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.attitude import distance
+from aeroloop.protocol.wording import problems
 from aeroloop.service.control.approach import Approach, nearest_turn
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
@@ -363,7 +364,8 @@ class OperatorChanges:
 
     def _refuse(self, error: Exception) -> None:
         self.refused += 1
-        self._role.warn("set-point", "fault", f"set-point refused: {str(error).splitlines()[0]}", self._session)
+        why = problems(error, Setpoint)[0] if isinstance(error, ValidationError) else str(error)
+        self._role.warn("set-point", "fault", f"set-point refused: {why}", self._session)
 
     @property
     def _time(self) -> float:

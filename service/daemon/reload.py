@@ -39,6 +39,10 @@ _SECTIONS: Final = {
 """By role, the sections that it uses."""
 
 
+_MOST_SHOWN: Final = 8
+"""Elements of a list that are shown."""
+
+
 def reload_on_hangup(
     role: Role,
     settings: Settings,
@@ -91,10 +95,16 @@ def differences(before: Settings, after: Settings, role: str) -> list[str]:
     old, new = (_flat(settings.model_dump(mode="json", include=_SECTIONS[role])) for settings in (before, after))
     live = tuple(f"{name}." for name in LIVE[role])
     return [
-        f"{key}: {old.get(key)} → {new.get(key)}" + ("" if f"{key}.".startswith(live) else ", after a restart")
+        f"{key}: {_short(old.get(key))} → {_short(new.get(key))}"
+        + ("" if f"{key}.".startswith(live) else ", after a restart")
         for key in sorted(old.keys() | new.keys())
         if old.get(key) != new.get(key)
     ]
+
+
+def _short(value: object) -> str:
+    """A value in a line: the points of a reference may be thousands."""
+    return f"{len(value)} values" if isinstance(value, list) and len(value) > _MOST_SHOWN else str(value)
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

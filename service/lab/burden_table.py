@@ -1,12 +1,13 @@
 """Tables of `lab burden`: one for each of the sensors, in the terminal or as Markdown.
 
 A row is one experiment with its traffic under both policies, compared with float64 at every tick. A missing figure is a
-dash, with the reason below. Columns fold in the terminal; in a pipe or a file lines stay whole.
+dash, with the reason below. A terminal too narrow for all columns has a block for each policy, without how often values
+change and the least time between frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from rich.console import Console
@@ -33,6 +34,8 @@ HEADER: Final = (
 STAMP_BYTES: Final = 47
 """Zenoh's time of publication (26 bytes) and source info (21 bytes); counted with Zenoh 1.10."""
 _PIPE_WIDTH: Final = 160
+_BLOCKS: Final = {"every tick": (0, 1, 2, 3, 5, 6), "on change": (0, 1, 7, 8, 10, 11)}
+"""Columns of each block, where not all fit beside each other."""
 _SPLIT: Final = "†"
 
 
@@ -42,20 +45,39 @@ def burden_table(burden: Burden) -> None:
     if not console.is_terminal:
         console.width = _PIPE_WIDTH  # folded lines cannot be unfolded in a file
     for name, text in burden.sensors.items():
-        table = Table(
-            title=f"sensors {name}: {text}", title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
-        )
-        for i, title in enumerate(HEADER):
-            names = i < 2  # of the experiment; the rest is numbers
-            table.add_column(title, justify="left" if names else "right", no_wrap=names, overflow="fold")
-        for row in _rows(burden, name):
-            table.add_row(*(Text(cell) for cell in row))
-        console.print(table)
+        console.print(Text(f"sensors {name}: {text}", style="italic"))
+        rows = list(_rows(burden, name))
+        whole = range(len(HEADER))
+        if _width(rows, whole) <= console.width:
+            console.print(_table(rows, whole))
+        else:
+            for policy, columns in _BLOCKS.items():
+                console.print(Text(f"\n{policy}", style="bold"))
+                console.print(_table(rows, columns))
         for line in _counted(burden, name):
             console.print(Text(line), soft_wrap=not console.is_terminal)
         console.print()
     for line in _notes(burden):
         console.print(Text(line), soft_wrap=not console.is_terminal)
+
+
+def _least(rows: list[list[str]], i: int) -> int:
+    """Least width of a column: a title folds between words, figures do not."""
+    return max(len(text) for text in (*HEADER[i].split(), *(row[i] for row in rows)))
+
+
+def _width(rows: list[list[str]], columns: Sequence[int]) -> int:
+    return sum(_least(rows, i) + 1 for i in columns)
+
+
+def _table(rows: list[list[str]], columns: Sequence[int]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for i in columns:
+        title = HEADER[i] if len(columns) == len(HEADER) else HEADER[i].rpartition(": ")[2]
+        table.add_column(title, justify="left" if i < 2 else "right", width=_least(rows, i))
+    for row in rows:
+        table.add_row(*(Text(row[i]) for i in columns))
+    return table
 
 
 def markdown(burden: Burden) -> str:

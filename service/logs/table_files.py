@@ -2,8 +2,8 @@
 
 All have the same columns by the same names. Parquet has each column's unit and description in its field's metadata,
 and the configuration in the file's; a MATLAB file has them in the fields `units`, `descriptions` and `config` of its
-struct; CSV has a header row only. Parquet and CSV are written batch by batch; scipy needs all of a MATLAB file in
-memory.
+struct; CSV has a header row only, and 1 and 0 for booleans. Parquet and CSV are written batch by batch; scipy needs all
+of a MATLAB file in memory.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.logs.table import Array, Group, Rows
+from aeroloop.service.logs.table import Array, Column, Group, Kind, Rows
 
 MAT_LIMIT: Final = 2**31 - 1
 """Bytes that a variable of a MATLAB v5 file may have."""
@@ -60,15 +60,19 @@ class TableFile(ABC):
 class ArrowFile(TableFile):
     """Writer by Arrow, batch by batch; a batch is a row group of a Parquet file."""
 
+    booleans: Kind = "bool"
+
     def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None:
         self._groups = groups
         columns = [column for group in groups for column in group.columns]
         fields = [
-            pa.field(c.name, pa.type_for_alias(c.kind), metadata={"unit": c.unit, "description": c.description})
-            for c in columns
+            pa.field(c.name, self._type(c), metadata={"unit": c.unit, "description": c.description}) for c in columns
         ]
         self._schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
         self._writer = self._open(path, self._schema)
+
+    def _type(self, column: Column) -> pa.DataType:
+        return pa.type_for_alias(self.booleans if column.kind == "bool" else column.kind)
 
     @abstractmethod
     def _open(self, path: Path, schema: pa.Schema) -> Any:
@@ -85,7 +89,7 @@ class ArrowFile(TableFile):
                 values, gaps = matrix[i], None if missing is None or not missing[i].any() else missing[i]
                 if column.kind in ("bool", "int8"):
                     values = (values if gaps is None else np.where(gaps, 0, values)).astype(column.kind)
-                arrays.append(pa.array(values, pa.type_for_alias(column.kind), mask=gaps))
+                arrays.append(pa.array(values, self._type(column), mask=gaps))
         self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
 
     def close(self) -> None:
@@ -103,7 +107,12 @@ class ParquetFile(ArrowFile):
 
 
 class CsvFile(ArrowFile):
-    """CSV by RFC 4180. A number has enough digits to be read back exactly; a missing one is empty."""
+    """CSV by RFC 4180. A number has enough digits to be read back exactly; a missing one is empty.
+
+    Booleans are numbers: a reader that guesses types takes `true` beside an empty cell for text.
+    """
+
+    booleans = "int8"
 
     def _open(self, path: Path, schema: pa.Schema) -> Any:
         options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")

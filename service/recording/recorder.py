@@ -10,6 +10,7 @@ A crash costs the open chunk and 0.5 s; the restarted recorder recovers them fro
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections import Counter
 from functools import lru_cache
@@ -45,8 +46,14 @@ QUIET_S: Final = 0.3
 ANSWER_S: Final = 5.0
 """Longest wait for a role's answer at the end; after it recording ends without the role's last messages [s]."""
 
+TRIM_BYTES: Final = 32_000_000
+"""After so many bytes are written, freed memory goes back to the system: after a flood, malloc would keep it."""
+
 GOES_ON_S: Final = 1.0
 """Longest wait for a quiet network at the end [s]."""
+
+_malloc_trim: Final = getattr(ctypes.CDLL(None), "malloc_trim", None)
+"""Of glibc; other C libraries have none."""
 
 _address = lru_cache(maxsize=4096)(topics.read_key)
 
@@ -67,6 +74,7 @@ class Recorder:
         self._backlog = Backlog()
         self._lost: Counter[str] = Counter()  # by reason
         self._status_due = 0.0
+        self._written_bytes = 0  # since memory was last given back
         self._status_written = 0
         self._status_at = time.monotonic()
         self.log = RollingLog(settings, self._report)
@@ -147,9 +155,14 @@ class Recorder:
         """Write the oldest messages, at most `AT_ONCE`, unless the disk refuses."""
         for _ in range(AT_ONCE):
             if not self.log.writable or (entry := self._backlog.next()) is None:
-                return
+                break
             received, at_ns = entry
             self.log.add(received, at_ns, self._decode(received, at_ns))
+            self._written_bytes += len(received.payload)
+        if self._written_bytes > TRIM_BYTES:
+            self._written_bytes = 0
+            if _malloc_trim is not None:
+                _malloc_trim(0)
 
     def _decode(self, received: Delivery, at_ns: int) -> list[Decoded]:
         address = _address(received.key)
@@ -194,11 +207,12 @@ class Recorder:
         notes = [f"{count} messages lost: {reason}" for reason, count in sorted(self._lost.items())]
         if log.trouble:
             notes.append(f"{log.trouble}; {len(self._backlog)} messages wait")
-        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "waiting for the disk"
+        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "not recording"
         self._role.status(
             Status(
                 role=self._role.role,
                 state=state,
+                cause=log.trouble or None,
                 uptime_s=self._role.uptime_s,
                 ticks=0,
                 rate_hz=(written - self._status_written) / max(now - self._status_at, 1e-3),

@@ -27,6 +27,8 @@ from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded
 
 RETRY_S: Final = 1.0
+REMIND_S: Final = 60.0
+"""How often a fault that lasts is reported again [s]."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 LOOK_S: Final = 1.0
 """How often to check that the file is still there [s]."""
@@ -63,13 +65,17 @@ class RollingLog:
         self.written = 0
         self.trouble = ""
         self._report = report
-        self._base = settings.path or settings.directory / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap")
+        path = settings.path
+        self._named = path is not None and not path.is_dir()
+        if path is None or not self._named:
+            path = (path or settings.directory) / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap")
+        self._base = path
         self._descriptions: dict[str, bytes] = {}
         self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []
         self._part = 0  # of the next file
         self._began = 0.0
-        self._due = self._check_due = self._retry_due = 0.0
+        self._due = self._check_due = self._retry_due = self._remind_due = 0.0
         try:
             self._base.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._begin()
@@ -160,26 +166,37 @@ class RollingLog:
             self._refused(error)
 
     def _refused(self, error: OSError) -> None:
-        self._retry_due = time.monotonic() + RETRY_S
-        if not self.trouble:
+        now = time.monotonic()
+        self._retry_due = now + RETRY_S
+        if not self.trouble or now >= self._remind_due:
             self.trouble = f"{self.path} cannot be written: {error.strerror}"
-            self._report(f"{self.trouble}; messages are kept in memory and written when it can be", True)
+            self._remind(f"{self.trouble}; messages are kept in memory and written when it can be")
+
+    def _remind(self, text: str) -> None:
+        self._remind_due = time.monotonic() + REMIND_S
+        self._report(text, True)
 
     def _retry(self) -> None:
         """Write what is pending into the same file or, unless the disk is only full, into a new one."""
         try:
-            try:
-                self._file.commit()
-            except OSError as error:
-                if error.errno in FULL:
-                    raise
+            if self._file.replaced:
                 self._replace_file()
+            else:
+                self._commit_or_replace()
         except OSError as error:
             self._refused(error)
             return
         self._unwritten.clear()
         self.trouble = ""
         self._report(f"recording again to {self.path}", False)
+
+    def _commit_or_replace(self) -> None:
+        try:
+            self._file.commit()
+        except OSError as error:
+            if error.errno in FULL:
+                raise
+            self._replace_file()
 
     def _replace_file(self) -> None:
         """Begin a new file with what the last one has not written."""
@@ -191,22 +208,28 @@ class RollingLog:
         except OSError:
             file.remove()
             raise
+        if self._file.replaced:  # it may stand elsewhere
+            with suppress(OSError):
+                self._file.end()
         self._file.abandon()
         self._file = file
 
     def _rotate_when_due(self, now: float) -> None:
-        settings = self.settings
-        if self._file.replaced:
-            self._report(f"{self.path} was moved or removed while it was written", True)
-        elif self._file.size < settings.max_file_mb * 1e6 and now - self._began < settings.max_file_s:
+        settings, last = self.settings, self._file
+        replaced = last.replaced
+        if not replaced and last.size < settings.max_file_mb * 1e6 and now - self._began < settings.max_file_s:
             return
-        last = self._file
         try:
             self._file = self._begin()
-        except OSError as error:  # a file that is too large is better than none
+        except OSError as error:
+            if replaced:  # what is written to it now would be gone
+                self._refused(error)
+            elif now >= self._remind_due:  # a file that is too large is better than none
+                self._remind(f"no new file can be begun ({error.strerror}), so {self.path} goes on")
             self._began = now
-            self._report(f"no new file can be begun ({error.strerror}), so {self.path} goes on", True)
             return
+        if replaced:
+            self._report(f"{last.path} was moved or removed while it was written", True)
         try:
             last.end()
         except OSError as error:
@@ -271,6 +294,6 @@ class RollingLog:
             head = opening(path)
             if head is not None and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                runs = re.escape(self._base.stem) if self.settings.path else r"aeroloop-\d{8}-\d{6}"
+                runs = re.escape(self._base.stem) if self._named else r"aeroloop-\d{8}-\d{6}"
                 return run["part"] == path.stem and re.fullmatch(runs, run["run"]) is not None
         return False

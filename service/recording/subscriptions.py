@@ -22,6 +22,11 @@ from aeroloop.protocol.transport.publication import WAITING, Delivery, Recoverin
 _MASK: Final = 0xFFFF_FFFF
 """Publishers' numbers have 32 bits and begin again at 0."""
 
+_RING_BYTES: Final = 67_108_864
+"""A ring holds no more than this of the longest messages of its topic, but `_LEAST_WAITING` of them in any case."""
+_LEAST_WAITING: Final = 8192
+"""The last minute of several vehicles, which caches send at once."""
+
 _Source = tuple[zenoh.ZenohId, int]
 """A publisher: an EntityGlobalId cannot be compared."""
 
@@ -32,13 +37,14 @@ class Subscriptions:
     Args:
         session: An open session; it outlives the subscriptions.
         frames: Receive the loop's frames, too; these have no numbers, so their losses are not counted.
-        waiting: Messages of one topic that may wait to be taken.
+        waiting: Most messages of one topic that may wait to be taken; fewer where they may be long.
     """
 
     def __init__(self, session: zenoh.Session, *, frames: bool = False, waiting: int = WAITING) -> None:
         self._waiting = waiting
         self._topics = {
-            key: RecoveringSubscriber(session, key, waiting) for key in (topics.key(n, "*") for n in topics.RECORDED)
+            key: RecoveringSubscriber(session, key, min(waiting, max(_LEAST_WAITING, _RING_BYTES // topic.limit)))
+            for key, topic in ((topics.key(name, "*"), topics.TOPICS[name]) for name in topics.RECORDED)
         }
         self._frames = [
             session.declare_subscriber(topics.key(name, "*"), RingChannel(waiting)) for name in topics.FRAMES if frames

@@ -24,7 +24,8 @@ from aeroloop.protocol.messages.operator import Advance, Answer, Ask, Gains, Hol
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, as_overrides, load
-from aeroloop.service.host.operator import read_points, send, stop
+from aeroloop.service.host.operator import send, stop
+from aeroloop.service.points_file import read_points
 from aeroloop.service.testing.hil_log import HilError as HilError
 from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
@@ -79,8 +80,8 @@ class Hil:
 
         Args:
             config: A TOML file, as for `--config`.
-            settings: Overrides: `{"loop.rate_hz": 200}`, as for `--set`, or nested, `{"loop": {"rate_hz": 200}}`. Without
-                one of `controller.after_restart` the controller follows the configured reference from the start.
+            settings: Overrides: `{"loop.rate_hz": 200}`, as for `--set`, or nested, `{"loop": {"rate_hz": 200}}`.
+                Without one of `controller.after_restart` the controller follows the configured reference at once.
             drive: Whether to start a controller and wait for it.
 
         Raises:

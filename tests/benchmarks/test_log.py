@@ -1,7 +1,7 @@
 """Log benchmark: review and replay of a minute at 500 Hz, in µs a tick.
 
 Run with `uv run pytest tests/benchmarks/test_log.py --benchmark-enable`; for another length, such as an hour, set
-`AEROLOOP_BENCHMARK_LOG_S=3600`. No time is asserted.
+`BENCHMARK_LOG_S=3600`. No time is asserted.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Made:
 def made(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Made:
     """A log in real time, a chunk a second; a short one where nothing is measured."""
     measured = bool(pytestconfig.getoption("--benchmark-enable"))
-    seconds = float(os.environ.get("AEROLOOP_BENCHMARK_LOG_S", "60")) if measured else 1.0
+    seconds = float(os.environ.get("BENCHMARK_LOG_S", "60")) if measured else 1.0
     return Made(tmp_path_factory.mktemp("log") / "made.mcap", seconds)
 
 

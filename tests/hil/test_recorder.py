@@ -265,7 +265,7 @@ def test_a_full_disk_stops_neither_the_loop_nor_for_good_the_recorder_and_costs_
             processes.start("controller")  # which waits for the recorder by itself
             eventually("driving", lambda: statuses.state("plant") == "driven")
             small.fill()
-            eventually("its word", lambda: statuses.state("recorder") == "waiting for the disk")
+            eventually("its word", lambda: statuses.state("recorder") == "not recording")
             before = statuses.ticks()
             eventually("the loop goes on", lambda: statuses.ticks() > before + 2 * RATE)
             small.empty()

@@ -168,15 +168,25 @@ def test_frames_are_sent_as_their_golden_vectors_say(row: Row) -> None:
     assert [k % counters for k in sent] == [int(counter) for counter in counted.split()]
 
 
+def size(count: int) -> str:
+    """A number of bytes as the text has it."""
+    for unit, factor in (("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if count % factor == 0:
+            return f"{count // factor} {unit}"
+    return f"{count} B"
+
+
 def test_the_table_of_topics_is_that_of_the_code() -> None:
     documented = [
-        cells(line)[:2]
+        (cells(line)[0], (cells(line)[1], cells(line)[5]))
         for line in SPEC.read_text(encoding="utf-8").splitlines()
-        if line.startswith("|") and len(cells(line)) == 5
+        if line.startswith("|") and len(cells(line)) == 6
     ]
     start = next(i for i, row in enumerate(documented) if row[0] == "topic")
-    table = {name: key for name, key in documented[start + 1 :] if not set(name) <= set("-: ")}
-    assert table == {topic.name: topic.key for topic in TOPICS.values()}
+    table = {name: rest for name, rest in documented[start + 1 :] if not set(name) <= set("-: ")}
+    assert table == {
+        topic.name: (topic.key, "–" if topic.carries == "token" else size(topic.limit)) for topic in TOPICS.values()
+    }
 
 
 @pytest.mark.parametrize(("end", "table"), [("plant", PLANT_TABLE), ("controller", CONTROLLER_TABLE)])

@@ -185,7 +185,7 @@ def test_where_it_fails_the_remedies_are_bits_that_the_kind_can_have_and_cure_it
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["wire.rate.kind=loud"], "wire.rate.kind: input should be 'uniform', 'hysteresis-uniform' or"),
+        (["wire.rate.kind=loud"], 'wire.rate.kind must be "uniform", "hysteresis-uniform" or'),
         (["wire.rate.hysteresis=0.1"], "wire.rate: hysteresis belongs to kind"),
         (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.bits=2"], "wire.voltage: a logarithmic-uniform"),
         (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.threshold=13"], "wire.voltage: a threshold is"),

@@ -12,6 +12,8 @@ import pytest
 import zenoh
 from pydantic import ValidationError
 
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.topics import TOPICS, Topic
 from aeroloop.protocol.runtime.processes import listener
 from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, visit
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
@@ -175,3 +177,39 @@ def test_messages_bear_no_time_of_zenohs() -> None:
 def test_network_settings_out_of_bounds_are_refused_by_name(broken: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match=next(iter(broken))):
         NetworkSettings.model_validate(broken)
+
+
+@pytest.mark.parametrize(
+    "topic", [topic for topic in TOPICS.values() if topic.carries != "token"], ids=lambda t: t.name
+)
+def test_what_exceeds_its_topics_limit_is_not_received(topic: Topic) -> None:
+    """Neither published nor asked nor answered, while the longest that is allowed is; its publisher is a stranger."""
+    key = topics.key(topic.name, "aero", session="s1", role="plant")
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with Gathering() as gathering:
+        member = gathering.join()
+        config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{gathering.ports[0]}"]')
+        with zenoh.open(config) as stranger:
+            received, answered = list[int](), list[int]()
+            subscriber = member.declare_subscriber(key, lambda sample: received.append(len(sample.payload.to_bytes())))
+            fits, exceeds = bytes(topic.limit), bytes(topic.limit + 1)
+
+            def arrives() -> bool:
+                stranger.put(key, exceeds)
+                stranger.put(key, fits)
+                return bool(received)
+
+            eventually("the one that fits", arrives)
+            assert set(received) == {topic.limit}
+            subscriber.undeclare()
+
+            def answer(query: zenoh.Query) -> None:
+                assert query.payload is not None
+                answered.append(len(query.payload.to_bytes()))
+                query.reply(key, fits)
+
+            member.declare_queryable(key, answer)
+            eventually("an answer", lambda: any(reply.ok for reply in stranger.get(key, payload=fits)))
+            assert not list(stranger.get(key, payload=exceeds, timeout=1.0))
+            assert set(answered) == {topic.limit}

@@ -73,13 +73,10 @@ def test_a_port_in_use_exits_with_1_and_is_named(capfd: pytest.CaptureFixture[st
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        for arguments in (
-            ("--set", f"network.rendezvous={endpoint}"),
-            ("--set", f'network.listen=["{endpoint}"]', "--set", "network.rendezvous="),
-        ):
-            code, line = refusal(capfd, "recorder", "--log", str(tmp_path / "a.mcap"), *arguments)
-            assert code == 1
-            assert endpoint in line
+        network = ("--set", f'network.listen=["{endpoint}"]', "--set", "network.rendezvous=")
+        code, line = refusal(capfd, "recorder", "--log", str(tmp_path / "a.mcap"), *network)
+        assert code == 1
+        assert endpoint in line
 
 
 def test_a_log_that_cannot_be_written_exits_with_1(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from aeroloop.protocol.messages.operator import Points
 from aeroloop.protocol.runtime.role import Action, Role
 from aeroloop.service.config import Settings, load
 from aeroloop.service.daemon.reload import LIVE, differences, reload_on_hangup
-from aeroloop.service.host.operator import OperatorError, read_points
+from aeroloop.service.points_file import PointsError, read_points
 
 ROLES = ("controller", "plant", "recorder")
 
@@ -111,6 +111,14 @@ def test_another_kind_of_reference_is_reported_key_by_key_and_takes_effect_at_on
         "reference.frequency",
     }
     assert not any("restart" in line for line in lines)
+
+
+def test_the_points_of_a_reference_are_counted_not_listed() -> None:
+    times, attitudes = list(range(9)), [[0, 0, 0]] * 9
+    lines = changed(
+        "controller", "reference.kind=points", f"reference.times={times}", f"reference.attitudes={attitudes}"
+    )
+    assert "reference.times: None → 9 values" in lines
 
 
 def test_several_differences_are_reported_a_line_each_in_order_and_each_for_itself() -> None:
@@ -273,7 +281,7 @@ def test_a_table_of_points_is_read_with_or_without_a_heading(file: File, content
 )
 def test_a_row_that_is_none_is_reported_with_file_and_line(file: File, content: str, line: int) -> None:
     path = file(content)
-    with pytest.raises(OperatorError) as refused:
+    with pytest.raises(PointsError) as refused:
         read_points(path)
     text = str(refused.value)
     assert text.startswith(f"{path}, line {line}: expected four numbers (time [s], roll, pitch, yaw [deg])")
@@ -281,15 +289,20 @@ def test_a_row_that_is_none_is_reported_with_file_and_line(file: File, content: 
 
 
 BAD_TABLES = [
-    pytest.param("", "at least 2 items", None, id="empty"),
-    pytest.param("time,roll,pitch,yaw\n", "at least 2 items", None, id="a heading and no more"),
-    pytest.param("0,0,0,0\n", "at least 2 items", None, id="one point"),
+    pytest.param("", "has 0 points, and a reference 2 to", None, id="empty"),
+    pytest.param("time,roll,pitch,yaw\n", "has 0 points, and a reference 2 to", None, id="a heading and no more"),
+    pytest.param("0,0,0,0\n", "has 1 points, and a reference 2 to", None, id="one point"),
     pytest.param("1,0,0,0\n2,0,0,0\n", "the first time must be 0", 1, id="begins later"),
     pytest.param("0,0,0,0\n2,0,0,0\n1,0,0,0\n", "must rise", 3, id="falls"),
     pytest.param("0,0,0,0\n0,0,0,0\n", "must rise", 2, id="stands still"),
     pytest.param("0,0,0,0\nnan,0,0,0\n", "number", 2, id="a time that is no number"),
     pytest.param("0,0,0,0\n1,0,inf,0\n", "number", 2, id="an angle that is none"),
-    pytest.param("".join(f"{n},0,0,0\n" for n in range(10_001)), "at most 10000", None, id="too many"),
+    pytest.param(
+        "".join(f"{n},0,0,0\n" for n in range(10_001)),
+        "has 10001 points, and a reference 2 to 10000",
+        None,
+        id="too many",
+    ),
 ]
 
 
@@ -298,7 +311,7 @@ def test_a_table_that_makes_no_sense_is_reported_with_file_and_reason(
     file: File, content: str, why: str, _line: int | None
 ) -> None:
     path = file(content)
-    with pytest.raises(OperatorError, match=why) as refused:
+    with pytest.raises(PointsError, match=why) as refused:
         read_points(path)
     assert str(path) in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
@@ -306,26 +319,26 @@ def test_a_table_that_makes_no_sense_is_reported_with_file_and_reason(
 
 @pytest.mark.parametrize(("content", "why", "line"), [case for case in BAD_TABLES if case.values[2] is not None])
 def test_a_table_that_makes_no_sense_is_reported_with_its_line(file: File, content: str, why: str, line: int) -> None:
-    with pytest.raises(OperatorError, match=f"line {line}: .*{why}"):
+    with pytest.raises(PointsError, match=f"line {line}: .*{why}"):
         read_points(file(content))
 
 
 def test_a_file_that_is_not_there_or_cannot_be_read_is_named(tmp_path: Path, file: File) -> None:
     missing = tmp_path / "missing.csv"
     for path, why in [(missing, "No such file"), (tmp_path, "directory"), (file(b"0,0,0,0\n\xff\xfe,0,0,0\n"), "text")]:
-        with pytest.raises(OperatorError, match=why) as refused:
+        with pytest.raises(PointsError, match=why) as refused:
             read_points(path)
         assert str(path) in str(refused.value)
         assert len(str(refused.value).splitlines()) == 1
 
 
 def test_a_cell_without_end_is_reported(file: File) -> None:
-    with pytest.raises(OperatorError, match="line 2"):
+    with pytest.raises(PointsError, match="line 2"):
         read_points(file("0,0,0,0\n1,0,0," + "1" * 200_000 + "\n"))
 
 
 def test_a_row_is_named_by_its_line_in_the_file(file: File) -> None:
-    with pytest.raises(OperatorError, match="line 4"):
+    with pytest.raises(PointsError, match="line 4"):
         read_points(file('"time\n[s]",roll,pitch,yaw\n0,0,0,0\n1,0,0\n'))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
+from rich.console import Console
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
+from aeroloop.service.lab import burden_table
 from aeroloop.service.lab.burden import Burden, measure_burden, pareto_front
 from aeroloop.service.lab.burden_figure import draw_burden
 from aeroloop.service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
@@ -191,6 +194,23 @@ def test_the_markdown_is_a_table_with_a_row_for_each_experiment(document: tuple[
     assert "★" in rows[2]
     assert any("voltage limit" in line for line in lines)
     assert any(line.startswith("Counted on a Zenoh link") for line in lines)
+
+
+def test_at_80_columns_every_figure_stands_whole_in_a_block_for_each_policy(
+    document: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Console(width=80, force_terminal=True, color_system=None, file=StringIO())
+    monkeypatch.setattr(burden_table, "Console", lambda: screen)
+    burden = Burden.model_validate_json(document[0])
+    burden_table.burden_table(burden)
+    assert isinstance(screen.file, StringIO)
+    lines = screen.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line.strip("| ").split(" | ") for line in markdown(burden).splitlines() if line.startswith("| ")][1:]
+    blocks = "\n".join(lines).partition("every tick\n")[2].partition("on change\n")
+    for shown, columns in ((blocks[0], (0, 1, 2, 3, 5, 6)), (blocks[2], (0, 1, 7, 8, 10, 11))):
+        for row in rows:
+            assert any(line.split() == " ".join(row[i] for i in columns).split() for line in shown.splitlines()), row
 
 
 def test_the_table_states_what_the_counter_costs_and_what_a_bare_frame_saves(document: tuple[str, Path]) -> None:

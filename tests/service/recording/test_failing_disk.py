@@ -171,6 +171,35 @@ def test_a_file_that_is_moved_or_removed_is_reported_and_another_begun(
     assert list(raw(tmp_path / "a-0002.mcap")) == expected[200:]
 
 
+def test_while_the_folder_is_gone_nothing_counts_as_recorded_and_a_reminder_comes_once_a_minute(
+    tmp_path: Path, story: EventLog, clock: Clock
+) -> None:
+    folder = tmp_path / "logs"
+    recording = Recording(clock, story, path=folder / "a.mcap", chunk_s=0.05)
+    recording.take(story.messages[:100])
+    folder.rename(tmp_path / "moved")
+    recording.wait(rolling.LOOK_S)
+    recording.take(story.messages[100:200])
+    why = f"{folder / 'a.mcap'} cannot be written: {os.strerror(errno.ENOENT)}"
+    assert recording.log.trouble == why
+    for _ in range(40):
+        recording.wait(rolling.RETRY_S)
+        assert not recording.log.writable
+    told = f"{why}; messages are kept in memory and written when it can be"
+    assert recording.reported == [(told, True)]
+    recording.wait(rolling.REMIND_S)
+    assert recording.reported == [(told, True)] * 2
+    folder.mkdir()
+    recording.wait(rolling.RETRY_S)
+    assert recording.log.writable
+    recording.take(story.messages[200:300])
+    recording.log.close()
+    assert recording.reported[2:] == [(f"recording again to {folder / 'a-0001.mcap'}", False)]
+    expected = numbered(story.messages[:300])
+    assert list(raw(tmp_path / "moved" / "a.mcap")) == expected[:100]
+    assert list(raw(folder / "a-0001.mcap")) == expected[100:]
+
+
 def test_where_no_new_file_can_be_begun_the_old_one_goes_on(
     tmp_path: Path, story: EventLog, clock: Clock, disk: Disk
 ) -> None:

@@ -317,7 +317,7 @@ def test_a_full_disk_is_reported_and_what_finds_no_room_in_memory_is_counted_in_
     publisher.send(2)
     eventually("trouble", lambda: not running.recorder.log.writable)
     publisher.send(502)
-    eventually("its word", lambda: any(status.state == "waiting for the disk" for status in reported))
+    eventually("its word", lambda: any(status.state == "not recording" and status.cause for status in reported))
     eventually("a full backlog", lambda: len(running.recorder._backlog) == ROOM)
     running.full = False
     eventually(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -121,6 +122,19 @@ def test_only_the_last_sessions_changes_are_in_the_next_file(tmp_path: Path, sto
     with in_order(tmp_path)[1].open("rb") as file:
         changes = [one.metadata["json"] for one in make_reader(file).iter_metadata() if one.name == CHANGE_METADATA]
     assert changes == [second.model_dump_json()]
+
+
+def test_a_log_given_as_a_folder_is_written_in_it_and_its_oldest_files_go(
+    tmp_path: Path, story: EventLog, clock: Clock
+) -> None:
+    (tmp_path / "logs").mkdir()
+    for _ in range(2):
+        recording = Recording(clock, story, path=tmp_path / "logs", chunk_s=0.05, keep_gb=1e-9)
+        recording.take(story.messages[:100])
+        recording.log.close()
+        assert re.fullmatch(r"aeroloop-\d{8}-\d{6}(-\d{4})?\.mcap", recording.log.path.name)
+    assert list(tmp_path.iterdir()) == [tmp_path / "logs"]
+    assert list((tmp_path / "logs").iterdir()) == [recording.log.path]
 
 
 def test_no_log_is_written_over(tmp_path: Path, story: EventLog, clock: Clock) -> None:

@@ -1,0 +1,56 @@
+"""Certificate in the terminal: the verdict and what decides it; every term on request; whole at 80 columns."""
+
+from __future__ import annotations
+
+from io import StringIO
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from aeroloop.service.config import load
+from aeroloop.service.terminal import certificate_table
+from aeroloop.service.theorem.certificate import Certificate, certify
+
+
+def certificate(*overrides: str) -> Certificate:
+    settings = load(overrides=overrides)
+    return certify(settings.wire, settings.law, settings.reference, settings.controller)
+
+
+def lines(found: Certificate, monkeypatch: pytest.MonkeyPatch, *, verbose: bool, width: int = 80) -> list[str]:
+    screen = Console(width=width, file=StringIO())
+    monkeypatch.setattr(certificate_table, "Console", lambda: screen)
+    certificate_table.certificate_table(found, verbose=verbose)
+    assert isinstance(screen.file, StringIO)
+    return screen.file.getvalue().splitlines()
+
+
+def test_unless_all_is_asked_for_a_verdict_and_about_ten_lines_are_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = certificate()
+    shown = lines(found, monkeypatch, verbose=False)
+    assert " ".join(" ".join(shown).split()).startswith(found.verdict)
+    assert len(shown) <= 20
+    assert f"--verbose prints all {len(found.terms)} terms" in shown[-1]
+
+
+def test_all_terms_are_there_with_their_equations_and_no_word_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = certificate()
+    shown = lines(found, monkeypatch, verbose=True)
+    assert max(map(cell_len, shown)) <= 80
+    text = " ".join(" ".join(shown).split())
+    for term in found.terms:
+        assert any(line.startswith(f"{term.symbol} ") for line in shown), term.symbol
+    words = text.split()
+    for term in found.terms:
+        for word in f"{term.meaning} ({term.equation})".split():
+            assert word in words, word
+
+
+def test_a_remedy_can_be_copied_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = certificate("law.C2=[0.01, 0.01, 0.01]")
+    assert not found.holds
+    shown = lines(found, monkeypatch, verbose=False, width=40)
+    for remedy in found.remedies:
+        if remedy.overrides:
+            assert "    " + " ".join(f"--set {change!r}" for change in remedy.overrides) in shown

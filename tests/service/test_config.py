@@ -1,0 +1,210 @@
+"""Configuration: every key explains itself, wrong ones are named with a remedy, and nothing is taken silently."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.operator import Points
+from aeroloop.protocol.wording import Shapes, words
+from aeroloop.service.config import ENV_PREFIX, ConfigError, Settings, from_description, load
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.logs.replay import EndReplay, replay
+from tests.support.made_log import make_log
+
+SHAPES = Shapes(Settings)
+KEYS = dict(SHAPES.every_key())
+LEAVES = [key for key, shape in KEYS.items() if not SHAPES.fields(shape)]
+KINDS = SHAPES.kinds(KEYS["reference"])
+
+PYDANTIC = (
+    "nput should", "alue error", "alid ", "unable to", "ield required", "xtra input", "ictionary", "tuple", "nstance",
+    "ist should", "tring should", "at least", "at most", "pydantic", "errors for", "validation error",
+)  # fmt: skip
+"""What of pydantic's own sentences could show up in ours."""
+
+ODD = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=80), st.just("file"),
+    st.lists(st.one_of(st.integers(), st.floats(), st.text(max_size=4), st.none()), max_size=4),
+    st.lists(st.lists(st.floats(), max_size=3), max_size=3),
+    st.dictionaries(st.text(max_size=8), st.integers(), max_size=2),
+)  # fmt: skip
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(list(KEYS)), ODD)
+def test_no_words_of_pydantic_reach_a_person_whatever_is_set(key: str, value: Any) -> None:
+    tree: dict[str, Any] = Settings().description()
+    branch = tree
+    *sections, name = key.split(".")
+    for section in sections:
+        branch = branch[section]
+    if sections == ["reference"]:
+        branch["kind"] = next(kind for kind, shape in KINDS.items() if name in SHAPES.fields(shape))
+    branch[name] = value
+    try:
+        from_description(tree)
+    except ConfigError as error:
+        text = str(error)
+        ours = text.replace(json.dumps(value, ensure_ascii=False), "")
+        assert not any(phrase in ours for phrase in PYDANTIC), text
+        assert "\n" not in text
+        assert sections[0] in text if sections else name in text
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_key_is_described_and_a_quantity_has_a_unit(key: str) -> None:
+    description = KEYS[key].get("description", "")
+    assert description
+    if key in LEAVES:
+        assert "[" in description or not re.search(r"(?<!whole )number", words(KEYS[key])), description
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("loop.rate=1", "unknown key loop.rate: did you mean loop.rate_hz?"),
+        ("lop.rate_hz=1", "unknown key lop: did you mean loop?"),
+        ("rate_hz=1", "unknown key rate_hz: did you mean loop.rate_hz?"),
+        ("law.c1=1", "unknown key law.c1: did you mean law.C1?"),
+        ("plant.mass=1", "unknown key plant.mass: did you mean plant.aero.mass?"),
+        ("loop.zzz=1", "unknown key loop.zzz; loop has rate_hz, lockstep, realtime, priority, cpus, trace_s"),
+        ("law.C1=0.2", "law.C1 must be three numbers, not 0.2"),
+        ("loop.rate_hz=0.5", "loop.rate_hz must be a number from 1 to 10000, not 0.5"),
+        ("loop=3", "loop must be a section, not 3"),
+        ("wire.rate.bits=17", 'wire.rate.bits must be a whole number from 2 to 16 or "cont", not 17'),
+        ("reference.kind=hole",
+         'reference.kind must be "file", "hold", "points", "sinusoid" or "stream", not "hole"'),
+        ("reference.frequency=[0,1,-1]", "element 3 of reference.frequency must be a number from 0 to 100, not -1"),
+        ("network.rendezvous=7547",
+         "network.rendezvous must be a Zenoh endpoint, PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447, not 7547"),
+        ("plant.rigid_body.allocation=2", "plant.rigid_body.allocation must be three lists of three numbers, not 2"),
+    ],
+)  # fmt: skip
+def test_a_wrong_setting_is_named_with_what_it_must_be(override: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(overrides=[override])
+    assert str(caught.value) == line
+
+
+@pytest.mark.parametrize("key", LEAVES)
+def test_every_key_can_be_set_in_the_environment(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """None is refused as unknown; what it must be is not the matter here."""
+    if key.startswith("reference."):
+        kind = next(kind for kind, shape in KINDS.items() if key.partition(".")[2] in SHAPES.fields(shape))
+        monkeypatch.setenv("AEROLOOP_REFERENCE__KIND", kind)
+    monkeypatch.setenv(ENV_PREFIX + key.upper().replace(".", "__"), "[[[{a = 1}]]]")
+    with pytest.raises(ConfigError, match=key.split(".")[-1]) as caught:
+        load()
+    assert "unknown" not in str(caught.value)
+    assert "environment" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("variable", "hint"),
+    [
+        ("AEROLOOP_LOP__RATE_HZ", "AEROLOOP_LOOP__RATE_HZ"),
+        ("AEROLOOP_LOOP_RATE_HZ", "AEROLOOP_LOOP__RATE_HZ"),
+        ("AEROLOOP_VEHICEL", "AEROLOOP_VEHICLE"),
+        ("AEROLOOP_DEBUG", "unset it"),
+    ],
+)
+def test_a_variable_that_is_no_setting_is_refused(variable: str, hint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(variable, "200")
+    with pytest.raises(ConfigError, match=f"^{variable} in the environment is no setting: .*{hint}"):
+        load()
+
+
+def test_a_description_is_read_without_the_readers_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    old = load().description()
+    del old["loop"]["rate_hz"]
+    monkeypatch.setenv("AEROLOOP_LOOP__RATE_HZ", "100")
+    monkeypatch.setenv("AEROLOOP_LOP", "1")
+    assert from_description(old).loop.rate_hz == 500
+
+
+OVERRIDES: tuple[tuple[str, ...], ...] = (
+    (),
+    ("reference.kind=hold", "wire.rate.bits=cont", "recorder.path=a b.mcap", "controller.duration_s=3"),
+    ("reference.kind=stream", 'can.options={bitrate = 1000000, "odd key" = "x"}', 'plant.faults=["rate:off@5"]'),
+    ("reference.kind=points", "reference.times=[0, 1e-2]", "reference.attitudes=[[0,0,0],[0,1,2]]"),
+)
+
+
+@pytest.mark.parametrize("overrides", OVERRIDES)
+@pytest.mark.parametrize("comments", [True, False])
+def test_what_is_shown_loads_to_the_same_settings(tmp_path: Path, overrides: tuple[str, ...], comments: bool) -> None:
+    settings = load(overrides=overrides)
+    path = tmp_path / "a.toml"
+    path.write_text(settings.toml(comments=comments), encoding="utf-8")
+    assert load(path) == settings
+    tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def test_every_key_that_is_shown_has_its_description_and_bounds_above_it_within_100_columns() -> None:
+    lines = load().toml(comments=True).splitlines()
+    assert max(len(line) for line in lines) <= 100
+    assert not any(line.startswith("#") for line in load().toml().splitlines())
+    text = "\n".join(line for line in lines)
+    for comment, section, key in _commented(lines):
+        shape = KEYS[f"{section}.{key}".removeprefix(".")]
+        assert comment.startswith(" ".join(shape["description"].split())), key
+        if "number" in words(shape):
+            assert comment.endswith(f"({words(shape)})"), key
+    assert "# duration_s = (not set)" in text
+
+
+def _commented(lines: list[str]) -> Iterator[tuple[str, str, str]]:
+    """Each key's comment as one line, its section, and its name."""
+    section, comment = "", ""
+    for line in lines:
+        name, equals, _ = line.removeprefix("# ").partition(" = ")
+        if line.startswith("["):
+            section, comment = line.strip("[]"), ""
+        elif equals and name.isidentifier():
+            yield comment.strip(), section, name
+            comment = ""
+        else:
+            comment += line.removeprefix("#") if line else ""
+
+
+ROWS = "time,roll,pitch,yaw\n0,0,0,0\n1,0,-5,10\n2,0,0,20\n"
+POINTS = Points(times=[0, 1, 2], attitudes=[(0, 0, 0), (0, -5, 10), (0, 0, 20)])
+
+
+def test_points_of_a_csv_file_are_the_reference_and_stand_in_the_description(tmp_path: Path) -> None:
+    (tmp_path / "ref.csv").write_text(ROWS)
+    toml = tmp_path / "a.toml"
+    toml.write_text('reference = { kind = "file", path = "ref.csv" }\n')
+    settings = load(toml)  # from any folder: the path is relative to the TOML file
+    assert settings.reference == POINTS
+    (tmp_path / "ref.csv").unlink()
+    assert from_description(settings.description()) == settings  # no file is needed again
+    with pytest.raises(ConfigError, match=r"^reference: cannot read .*ref\.csv"):
+        load(toml)
+
+
+def test_a_lockstep_experiment_follows_the_points_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "ref.csv").write_text(ROWS)
+    file = load(overrides=["reference.kind=file", f"reference.path={tmp_path / 'ref.csv'}"])
+    written = ["reference.kind=points", f"reference.times={POINTS.times}"]
+    written.append(f"reference.attitudes={[list(each) for each in POINTS.attitudes]}")
+    assert run_experiment(file, 2.0).z_track == run_experiment(load(overrides=written), 2.0).z_track
+    assert run_experiment(file, 2.0).z_track != run_experiment(load(), 2.0).z_track
+
+
+def test_a_log_of_a_run_along_a_file_is_replayed_byte_for_byte_without_the_file(tmp_path: Path) -> None:
+    (tmp_path / "ref.csv").write_text(ROWS)
+    overrides = ["loop.lockstep=true", "reference.kind=file", f"reference.path={tmp_path / 'ref.csv'}"]
+    make_log(tmp_path / "a.mcap", 600, settings=load(overrides=overrides))
+    (tmp_path / "ref.csv").unlink()
+    both = replay([tmp_path / "a.mcap"])
+    assert both.controller == both.plant == EndReplay(ticks=600, differ=0)
