@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, No
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.cli.entry import INTERRUPTED, end_at_once
 
 if TYPE_CHECKING:
     from threading import Event
@@ -123,7 +124,15 @@ def _configured() -> Iterator[None]:
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Turn expected errors into one line and an exit code."""
+    """Turn expected errors into one line and an exit code. ^C is a KeyboardInterrupt; a second one ends at once."""
+
+    def interrupt(*_: object) -> None:
+        signal.signal(signal.SIGINT, end_at_once)
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # as in a background job
+        signal.signal(signal.SIGINT, interrupt)
     try:
         yield
     except (AeroloopError, ValueError) as error:
@@ -131,7 +140,9 @@ def guarded() -> Iterator[None]:
             raise
         fail(str(error).splitlines()[0], 1)
     except KeyboardInterrupt:
-        raise typer.Exit(130) from None
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -27,6 +27,7 @@ from aeroloop.service.cli.common import (
     show,
     with_bits_of,
 )
+from aeroloop.service.cli.entry import INTERRUPTED
 
 if TYPE_CHECKING:
     from threading import Event
@@ -78,7 +79,7 @@ def demo(
                 figures, complete = run_demo(settings, duration, log, update)
     show(figures, json, figures_table)
     if not complete:
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 @group.command()

@@ -1,19 +1,29 @@
 """Worker processes, one per core, for independent experiments.
 
 Arguments and results cross process boundaries, so both are plain data: a configuration goes as its dump, and only
-figures return.
+figures return. A worker takes no ^C, which reaches every process of a terminal: its parent ends it, and it ends with its
+parent.
 """
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from typing import Self, TypeVar, TypeVarTuple
+from typing import Final, Self, TypeVar, TypeVarTuple
 
 Arguments = TypeVarTuple("Arguments")
 Result = TypeVar("Result")
+
+
+_PR_SET_PDEATHSIG: Final = 1
+
+
+def _end_with_parent() -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class Workers:
@@ -21,12 +31,17 @@ class Workers:
 
     def __init__(self) -> None:
         # Spawned, not forked: a fork would inherit the locks of the caller's threads.
-        self._executor = ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+        self._executor = ProcessPoolExecutor(
+            os.cpu_count(), mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
+        )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:  # a failure or ^C: what the others compute has no use
+            for worker in list(self._executor._processes.values()):
+                worker.terminate()
         self._executor.shutdown(cancel_futures=True)
 
     def each(
@@ -40,7 +55,12 @@ class Workers:
         Raises:
             Exception: The first exception that the function raised.
         """
-        futures = [self._executor.submit(work, *job) for job in jobs]
+        # Processes start with the first job and inherit the mask. Why not in the initializer: importing takes seconds.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            futures = [self._executor.submit(work, *job) for job in jobs]
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             if progress is not None:

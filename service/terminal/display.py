@@ -11,7 +11,7 @@ from functools import partial
 from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.progress import (
     BarColumn,
@@ -27,6 +27,7 @@ from rich.table import Column, Table
 from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import paper
+from aeroloop.service.terminal.console import Console
 
 if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
 
-from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.service.review.report import Findings, Mark, Spread, TheoremFindings
+from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 
 if TYPE_CHECKING:
