@@ -1,8 +1,8 @@
 """Worker processes, one per core, for independent experiments.
 
 Arguments and results cross process boundaries, so both are plain data: a configuration goes as its dump, and only
-figures return. A worker takes no ^C, which reaches every process of a terminal: its parent ends it, and it ends with its
-parent.
+figures return. A worker takes no ^C, which reaches every process of a terminal: its parent ends it. It also ends if its
+parent is killed.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ class Workers:
             Exception: The first exception that the function raised.
         """
         # Processes start with the first job and inherit the mask. Why not in the initializer: importing takes seconds.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             futures = [self._executor.submit(work, *job) for job in jobs]
         finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             if progress is not None:

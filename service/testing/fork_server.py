@@ -41,6 +41,7 @@ _PRELOADED: Final = (
     "aeroloop.service.recording.recorder",
     "aeroloop.service.viewers.channels",
     "aeroloop.plant_emulator.hosts.can_node",
+    "casadi",  # the modules above import it at its first use
 )
 
 
