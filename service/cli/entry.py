@@ -7,12 +7,11 @@ install handlers of their own.
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # what `signal` wraps: it imports enum, during which ^C is a traceback
 import os
-import signal
 import sys
-from typing import Final
 
-INTERRUPTED: Final = 130
+INTERRUPTED = 130
 """Exit code after ^C, as of a process that SIGINT ends in a shell."""
 
 
@@ -25,8 +24,8 @@ def end_at_once(*_: object) -> None:
 
 def main() -> None:
     """Entry point of the command."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in a background job
-        signal.signal(signal.SIGINT, end_at_once)
+    if _signal.getsignal(_signal.SIGINT) is not _signal.SIG_IGN:  # as in a background job
+        _signal.signal(_signal.SIGINT, end_at_once)
     from aeroloop.service.cli.main import execute
     from aeroloop.service.terminal.encoding import replace_what_cannot_be_printed
 
