@@ -10,7 +10,7 @@ One controller at a time holds the plant, by name. Base of the plant's Endpoint 
    └────────────────────────────────── tripped ◄─────┘
 
 A plant that tripped or started unarmed refuses claims with the reason. A claim with `auto_arm` arms the plant itself,
-except after an operator's stop.
+except after `stop`.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Tenancy:
         self.unavailable: str | None = None
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self.cause: str | None = None if armed else "not armed since it was started"
-        self._operator_stop = False
+        self._operator_only = False  # whether only an operator's `arm` clears the latch
 
     @property
     def state(self) -> PlantState:
@@ -123,7 +123,7 @@ class Tenancy:
             return Refusal(reason=f"the plant has {'; '.join(differences)}", differences=differences)
         if self.session is not None:
             return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
-        if claim.auto_arm and not self._operator_stop:
+        if claim.auto_arm and not self._operator_only:
             self._clear()
         if self.cause is not None:
             return Refusal(reason=f"{self.cause}; `aeroloop op arm` clears it")
@@ -147,16 +147,16 @@ class Tenancy:
         if self.session is not None:
             return False
         self.operated("arm")
-        self._operator_stop = False
+        self._operator_only = False
         self._clear()
         self._notice("armed", "armed by an operator: the next claim is granted")
         return True
 
-    def stop(self) -> None:
-        """Trip on an operator's stop, in any state: 0 V, and no claim is granted before `arm`."""
-        self.operated("stop")
-        self._trip(TripCause.OPERATOR, "stopped by an operator")
-        self._operator_stop = True
+    def stop(self, cause: TripCause = TripCause.OPERATOR, reason: str = "stopped by an operator") -> None:
+        """Trip in any state: 0 V, and no claim, not even one with `auto_arm`, is granted before `arm`."""
+        self.operated("stop", cause=cause, reason=reason)
+        self._trip(cause, reason)
+        self._operator_only = True
 
     def lost(self, controller: str) -> None:
         """Trip if this controller, having lost its liveliness token, holds the plant."""

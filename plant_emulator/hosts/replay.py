@@ -213,7 +213,8 @@ class PlantReplay:
             case "arm":
                 endpoint.arm()
             case "stop":
-                endpoint.stop()
+                assert operation.cause is not None
+                endpoint.stop(operation.cause, operation.reason or "")
             case "lost":
                 endpoint.lost(operation.name or "")
             case "expire":

@@ -8,9 +8,13 @@ takes them between ticks, so that only one thread uses the endpoint.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
 from threading import Condition
 from typing import Final
+
+import zenoh
+from pydantic import ValidationError
 
 from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
@@ -18,6 +22,7 @@ from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal, Release, Status
 from aeroloop.protocol.messages.operator import Answer, Ask
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
@@ -66,6 +71,9 @@ class ZenohFront(Front):
         role.serve("arm", Ask, lambda _: self._arm)
         role.serve("stop", Ask, lambda _: self._stop)
         role.watch_tokens(self._token)
+        role.zenoh.declare_subscriber(
+            topics.key("status", role.vehicle, role=role.role), self._other_plant, allowed_origin=zenoh.Locality.REMOTE
+        )
         role.announce()
         role.event("started", f"{role.vehicle} waits for a claim")
 
@@ -138,6 +146,18 @@ class ZenohFront(Front):
     def _token(self, name: str, appeared: bool) -> None:
         if not appeared:
             self._role.later(lambda: self._endpoint.lost(name))
+
+    def _other_plant(self, sample: zenoh.Sample) -> None:
+        """Another plant end publishes under this one's name, as after a network was cut and healed."""
+        with suppress(ValidationError):
+            other = Status.model_validate_json(sample.payload.to_bytes())
+            self._role.later(lambda: self._contest(other.process))
+
+    def _contest(self, other: str) -> None:
+        if self._endpoint.trip is not TripCause.DUPLICATE:
+            plants = f"this one ({self._role.process}) and another ({other})"
+            text = f"two plants are named {self._role.vehicle}, {plants}; end one of them, then `aeroloop op arm`"
+            self._endpoint.stop(TripCause.DUPLICATE, text)
 
     def _claim(self, claim: Claim) -> Grant | Refusal:
         answer = self._endpoint.claim(claim)

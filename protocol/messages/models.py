@@ -115,6 +115,7 @@ class Status(Message):
     cause: str | None = Field(
         default=None, description="plant: why it is not armed; controller: why it claims no vehicle; null otherwise"
     )
+    process: str = Field(default="", description="host and process id of the role")
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
     uptime_s: float
     ticks: int = Field(description="ticks since start")

@@ -43,6 +43,7 @@ class TripCause(StrEnum):
     NO_ANSWER = "no answer in lockstep"
     BUS = "bus lost"
     NODE = "node lost"
+    DUPLICATE = "another plant of this name"
 
     @property
     def number(self) -> int:

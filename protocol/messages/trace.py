@@ -109,8 +109,8 @@ class Operation(Message):
     kind: OperationKind
     claim: Claim | None = Field(default=None, description="claim: as it was granted")
     name: str | None = Field(default=None, description="release: session; lost: controller; inject: fault, null: none")
-    cause: TripCause | None = Field(default=None, description="expire: the cause")
-    reason: str | None = Field(default=None, description="expire: the reason")
+    cause: TripCause | None = Field(default=None, description="stop, expire: the cause")
+    reason: str | None = Field(default=None, description="stop, expire: the reason")
     settings: dict[str, Any] | None = Field(default=None, description="reconfigure: `watchdog_s` and `limits`")
 
 

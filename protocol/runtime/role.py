@@ -26,8 +26,9 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
 from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
+from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
-from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join
+from aeroloop.protocol.transport.network import VISIT_S, NetworkSettings, join, visit
 from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -51,6 +52,26 @@ def notify_systemd(state: str) -> None:
         manager.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
+class OccupiedError(AeroloopError):
+    """The vehicle has a plant already; one line that names it."""
+
+
+def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
+    with visit(network) as here:
+        here.settle()
+        if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=VISIT_S)):
+            return
+        where = ""
+        for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=VISIT_S):
+            if reply.ok is not None:
+                with suppress(ValidationError):
+                    where = f" ({Status.model_validate_json(reply.ok.payload.to_bytes()).process})"
+    raise OccupiedError(
+        f"{vehicle} has a plant already{where}; stop that one, or give this one a name of its own with "
+        "--set vehicle=NAME"
+    )
+
+
 class Role:
     """A process's presence on the network.
 
@@ -59,6 +80,7 @@ class Role:
 
     Raises:
         NetworkError: The network cannot be joined.
+        OccupiedError: It is a plant's, and the vehicle has one.
     """
 
     def __init__(
@@ -68,8 +90,11 @@ class Role:
         self.vehicle = vehicle
         self.name = name or role
         self.stop = threading.Event()
-        self._network = network
+        if role == "plant":
+            _refuse_second_plant(network, vehicle)
+        name_process(role)
         self.zenoh = join(network)
+        self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._status = b""
         self._publishers: dict[str, CachedPublisher] = {}
         self._inbox: deque[Action] = deque()
@@ -92,15 +117,6 @@ class Role:
         """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
         notify_systemd("READY=1")
         self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
-
-    def refresh_links(self) -> None:
-        """Make Zenoh link again to peers that it failed to link to, by a session that joins the network and leaves it.
-
-        A peer known by gossip is connected to once. If that fails, as on a machine that stalls, the next attempt comes
-        when gossip changes (seen with zenoh 1.10: a controller without a link to its recorder for 341 s).
-        """
-        with suppress(NetworkError):
-            join(self._network).close()
 
     def stop_on_signals(self) -> None:
         """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""
@@ -158,13 +174,14 @@ class Role:
             prepare: Called with the request in one of Zenoh's threads, for work that takes time. The function that it
                 returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
         """
+        key = topics.key(topic, self.vehicle)
 
         def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
             try:
                 reply = act()
             except AeroloopError as error:
                 reply = Answer(done=False, text=str(error))
-            query.reply(query.key_expr, reply.encode())
+            query.reply(key, reply.encode())  # not the query's key, which may name many vehicles
             query.drop()
 
         def received(query: zenoh.Query) -> None:
@@ -179,7 +196,7 @@ class Role:
             else:
                 self._inbox.append(lambda: guarded(query, action))
 
-        self.answer(topics.key(topic, self.vehicle), received)
+        self.answer(key, received)
 
     def later(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
@@ -244,5 +261,6 @@ class Role:
     def status(self, status: Status) -> None:
         """Publish the status, and answer queries with it until the next one."""
         notify_systemd("WATCHDOG=1")
+        status = status.model_copy(update={"process": self.process})
         self._status = status.encode()
         self.publish("status", status)

@@ -27,7 +27,7 @@ def status(json: Json = False, config: Config = None, overrides: Overrides = Non
     from aeroloop.service.host.operator import gather
 
     with guarded():
-        found = gather(settings.network)
+        found, silent = gather(settings.network)
     if json:
         from json import dumps
 
@@ -40,6 +40,8 @@ def status(json: Json = False, config: Config = None, overrides: Overrides = Non
         from aeroloop.service.terminal.display import status_table
 
         status_table(found)
+    for line in silent:
+        typer.echo(f"aeroloop: {line}", err=True)
 
 
 @group.command()
@@ -65,9 +67,22 @@ def arm(config: Config = None, overrides: Overrides = None) -> None:
 
 
 @group.command()
-def stop(config: Config = None, overrides: Overrides = None) -> None:
-    """Stop the plant at once: 0 V, and no controller drives it until it is armed again."""
-    _send(settings_of(config, overrides), "stop")
+def stop(
+    every: Annotated[bool, typer.Option("--all", help="Stop every vehicle's plant on the network.")] = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Stop the configured vehicle's plant at once, or all plants if none is configured: 0 V until `op arm`."""
+    settings = settings_of(config, overrides)
+    every = every or "vehicle" not in settings.model_fields_set
+    from aeroloop.service.host.operator import stop as stop_plants
+
+    with guarded():
+        answers, failures = stop_plants(settings.network, None if every else settings.vehicle)
+    for line in answers:
+        typer.echo(line)
+    if failures:
+        fail("; ".join(failures), 1)
 
 
 @group.command()

@@ -39,9 +39,6 @@ from aeroloop.service.settings import ControllerSettings
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 CLAIM_PERIOD_S: Final = 0.25
-FIRST_REFRESH_S: Final = 5.0
-LAST_REFRESH_S: Final = 60.0
-"""Links are refreshed after this long without a session, then at twice the interval each time, up to the last [s]."""
 LOCKSTEP_PATIENCE_S: Final = 2.0
 """Longest wait for the first measurement in lockstep [s]; between steps a plant may pause for any time."""
 WAIT_S: Final = 0.02
@@ -93,8 +90,6 @@ class Daemon:
         self._status_due = 0
         self._status_ticks = 0
         self._status_time = time.monotonic()
-        self._refresh_s = FIRST_REFRESH_S
-        self._refresh_due = self._status_time + FIRST_REFRESH_S
         self._take(settings)
 
     def run(self) -> None:
@@ -118,7 +113,6 @@ class Daemon:
                 link = self._claim() if self._may_claim() and self._machine.state is State.SEARCHING else None
                 if link is None:
                     self._publish_when_due()
-                    self._refresh_links_when_due()
                     role.stop.wait(CLAIM_PERIOD_S)
                     role.take_inbox()
                     continue
@@ -234,12 +228,6 @@ class Daemon:
             self._status_due = 0
 
     # ── the session ──
-
-    def _refresh_links_when_due(self) -> None:
-        if self._machine.state is State.SEARCHING and time.monotonic() >= self._refresh_due:
-            self._role.refresh_links()
-            self._refresh_s = min(2 * self._refresh_s, LAST_REFRESH_S)
-            self._refresh_due = time.monotonic() + self._refresh_s
 
     def _may_claim(self) -> bool:
         recorded = self._recorders > 0 or not self._settings.require_recorder

@@ -1,16 +1,19 @@
 """Operator commands: status of every role on the network, arm, stop, release, gains and reference.
 
 Each is a Zenoh query that the addressed role answers. Status is answered by the role's network thread from the last
-published one, so it never stalls a loop; the other commands are taken between two ticks.
+published one, so it never stalls a loop; the other commands are taken between two ticks. A process that hangs or that
+is no role delays none of them, and is named by its address and, on this host, by its role and process id.
 """
 
 from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Iterable
+from contextlib import suppress
 from math import isfinite
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import zenoh
 from pydantic import ValidationError
@@ -19,10 +22,9 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Ask, Message, Points
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.runtime.processes import listener
+from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, visit
 
-GATHER_S: Final = 1.0
-"""How long to query for roles [s]. Gossip links a new peer to all others in some 50 ms."""
 ANSWER_S: Final = 1.0
 
 Statuses = dict[str, dict[str, Status]]
@@ -32,38 +34,48 @@ class OperatorError(AeroloopError):
     """No role answered, or the command was refused; one line."""
 
 
-def gather(network: NetworkSettings) -> Statuses:
-    """Status of every role of every vehicle on the network, by vehicle and role.
+class Gathered(NamedTuple):
+    """What is on the network.
 
-    Of several controllers of one vehicle it is the one with the session, if any.
+    Attributes:
+        statuses: By vehicle and role. Of several controllers of one vehicle, the one with the session, if any.
+        silent: A line about each process that accepts a connection and does not answer.
+    """
+
+    statuses: Statuses
+    silent: list[str]
+
+
+def gather(network: NetworkSettings) -> Gathered:
+    """Status of every role of every vehicle on the network.
 
     Raises:
-        NetworkError: The network cannot be joined.
         OperatorError: No role answers.
     """
-    with join(network) as session:
-        found: Statuses = {}
-        deadline = time.monotonic() + GATHER_S
-        while time.monotonic() < deadline:
-            now: Statuses = {}
-            for reply in session.get(topics.key("status", "*"), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL):
-                if reply.ok is None or (address := topics.read_key(str(reply.ok.key_expr))) is None:
-                    continue
-                if address.role is not None:
-                    status = Status.model_validate_json(reply.ok.payload.to_bytes())
-                    roles = now.setdefault(address.vehicle, {})
-                    if address.role not in roles or status.session:
-                        roles[address.role] = status
-            for vehicle, roles in now.items():
-                found.setdefault(vehicle, {}).update(roles)
-            time.sleep(0.1)
-    if not found:
-        raise OperatorError(f"no role answers at {network.rendezvous}; is an emulator or a controller running?")
-    return found
+    statuses: Statuses = {}
+
+    def received(reply: zenoh.Reply) -> None:
+        address = topics.read_key(str(reply.ok.key_expr)) if reply.ok is not None else None
+        if reply.ok is None or address is None or address.role is None:
+            return
+        with suppress(ValidationError):  # of another version
+            status = Status.model_validate_json(reply.ok.payload.to_bytes())
+            roles = statuses.setdefault(address.vehicle, {})
+            if address.role not in roles or status.session:
+                roles[address.role] = status
+
+    with visit(network) as here:
+        here.settle()
+        for reply in _get(here.session, topics.key("status", "*"), b"", VISIT_S):
+            received(reply)
+        silent = [_unanswered(place) for place in here.silent()]
+    if not statuses:
+        raise OperatorError("; ".join([_nobody(network), *silent]))
+    return Gathered(statuses, silent)
 
 
 def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Send a command to a vehicle's plant (`arm`, `stop`) or controller (`stand_down`, `set_gains`, `track`).
+    """Send a request to a vehicle's plant (`arm`) or controller (`stand_down`, `set_gains`, `track`).
 
     `arm` also recalls controllers that are holding or faulted.
 
@@ -71,14 +83,81 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         What was done, in one line.
 
     Raises:
-        NetworkError: The network cannot be joined.
         OperatorError: No role answers, or it refuses.
     """
-    with join(network) as session:
-        texts = [_query(session, network, vehicle, topic, message)]
+    with visit(network, ANSWER_S) as here:
+        answers: list[Answer] = []
+        deadline = time.monotonic() + ANSWER_S
+        while not answers and time.monotonic() < deadline:
+            answers = _answers(here.session, topic, vehicle, message)
+            time.sleep(POLL_S)
+        if not answers:
+            role = "plant" if topic in ("arm", "stop") else "controller"
+            silent = [_unanswered(place) for place in here.silent()]
+            raise OperatorError("; ".join([f"no {role} of {vehicle} answers", *(silent or [_nobody(network)])]))
+        done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
+        if not done:
+            raise OperatorError("; ".join(answer.text for answer in answers))
         if topic == "arm":
-            texts += [answer.text for answer in _answers(session, "recall", vehicle, Ask()) if answer.done]
-        return "; ".join(texts)
+            done += [answer.text for answer in _answers(here.session, "recall", vehicle, Ask()) if answer.done]
+        return "; ".join(done)
+
+
+class Stopped(NamedTuple):
+    """Outcome of a stop.
+
+    Attributes:
+        answers: What each plant answered.
+        failures: A line about each plant, or process that may be one, which did not.
+    """
+
+    answers: list[str]
+    failures: list[str]
+
+
+def stop(network: NetworkSettings, vehicle: str | None = None) -> Stopped:
+    """Stop a vehicle's plant, or every plant on the network. What fails at first is tried once more, for longer.
+
+    A process that does not answer is no failure where it is known to be no plant.
+    """
+    outcome = _stop(network, vehicle or "*", VISIT_S)
+    return _stop(network, vehicle or "*", 4 * VISIT_S) if outcome.failures else outcome
+
+
+def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
+    answers: dict[str, list[str]] = {}
+
+    def received(reply: zenoh.Reply) -> None:
+        address = topics.read_key(str(reply.ok.key_expr)) if reply.ok is not None else None
+        if reply.ok is not None and address is not None:
+            answers[address.vehicle].append(Answer.model_validate_json(reply.ok.payload.to_bytes()).text)
+
+    with visit(network, wait_s) as here:
+        begun = time.monotonic()
+        while (passed := time.monotonic() - begun) < wait_s:
+            # A plant declares its token last, so one with a token answers.
+            for token in _get(here.session, topics.key("alive", vehicle, role="plant"), None, VISIT_S):
+                address = topics.read_key(str(token.ok.key_expr)) if token.ok is not None else None
+                if address is not None and address.vehicle not in answers:
+                    answers[address.vehicle] = []
+                    here.session.get(
+                        topics.key("stop", address.vehicle),
+                        received,
+                        payload=Ask().encode(),
+                        timeout=wait_s,
+                        target=zenoh.QueryTarget.ALL,
+                        consolidation=zenoh.ConsolidationMode.NONE,
+                    )
+            if passed > SETTLE_S and not here.silent() and all(answers.values()):
+                break
+            time.sleep(POLL_S)
+        unanswered = [(place, listener(place)) for place in here.silent()]
+    failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
+    others = ("controller", "recorder")
+    failures += [_unanswered(place) for place, process in unanswered if process is None or process.role not in others]
+    if not answers and not failures:
+        failures.append(_nobody(network))
+    return Stopped([text for texts in answers.values() for text in texts], failures)
 
 
 def read_points(path: Path) -> Points:
@@ -137,22 +216,30 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _query(session: zenoh.Session, network: NetworkSettings, vehicle: str, topic: str, message: Message) -> str:
-    """Query until a role answers, as a new peer's links take a moment. Of several answers one success is enough."""
-    deadline = time.monotonic() + ANSWER_S
-    while time.monotonic() < deadline:
-        if answers := _answers(session, topic, vehicle, message):
-            for answer in answers:
-                if answer.done:
-                    return answer.text
-            raise OperatorError("; ".join(answer.text for answer in answers))
-        time.sleep(0.02)
-    role = "plant" if topic in ("arm", "stop") else "controller"
-    raise OperatorError(f"no {role} of {vehicle} answers at {network.rendezvous}")
+def _get(session: zenoh.Session, key: str, payload: bytes | None, timeout_s: float) -> Iterable[zenoh.Reply]:
+    """All replies to a query; those of several roles to one key are not merged. A token's key if `payload` is None."""
+    if payload is None:
+        return session.liveliness().get(key, timeout=timeout_s)
+    return session.get(
+        key,
+        payload=payload,
+        timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    )
 
 
 def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message) -> list[Answer]:
-    replies = session.get(
-        topics.key(topic, vehicle), payload=message.encode(), timeout=ANSWER_S, target=zenoh.QueryTarget.ALL
-    )
+    replies = _get(session, topics.key(topic, vehicle), message.encode(), ANSWER_S)
     return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+
+
+def _unanswered(place: str) -> str:
+    """One line about a process that accepts connections at an endpoint and does not answer."""
+    process = listener(place)
+    return f"the {process} at {place} does not answer" if process else f"the process at {place} does not answer"
+
+
+def _nobody(network: NetworkSettings) -> str:
+    where = ", ".join([*network.rendezvous, *network.connect])
+    return f"no role answers at {where}; is an emulator or a controller running?"

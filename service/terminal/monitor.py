@@ -133,7 +133,7 @@ def watch(network: NetworkSettings, show: Callable[[RenderableType], None], stop
     def receive(sample: zenoh.Sample) -> None:
         top.receive(str(sample.key_expr), sample.payload.to_bytes())
 
-    with join(network) as session:
+    with join(network, listen=False) as session:
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), receive)
         queried = 0.0

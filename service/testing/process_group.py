@@ -15,7 +15,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
+from random import randrange
 from typing import Any, Final, Literal, Self, get_args
 
 import zenoh
@@ -23,7 +25,7 @@ import zenoh
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
@@ -31,6 +33,10 @@ from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
 RoleName = Literal["controller", "plant", "can-node", "recorder"]
 
 Child = subprocess.Popen[bytes] | ForkedProcess
+
+_BLOCKS: Final = 10_000, 32_000
+"""Ports to choose blocks from: below those that the system gives out by itself."""
+_reserved: Final[list[socket.socket]] = []
 
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
@@ -41,10 +47,21 @@ class ProcessGroupError(AeroloopError):
 
 
 def free_rendezvous() -> str:
-    """A free loopback endpoint."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """A loopback endpoint with free ports from it on, which no other call returns while this process lives.
+
+    Why a UDP socket: it reserves the block against other processes that look for one, and leaves its TCP ports free.
+    """
+    ports = NetworkSettings().ports
+    while True:
+        first = randrange(*_BLOCKS, ports)  # noqa: S311  # no secret
+        reservation = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        with suppress(OSError):
+            reservation.bind(("127.0.0.1", first))
+            for port in range(first, first + ports):
+                socket.create_server(("127.0.0.1", port)).close()
+            _reserved.append(reservation)
+            return f"tcp/127.0.0.1:{first}"
+        reservation.close()
 
 
 def private_bus(can: CanSettings) -> CanSettings:
@@ -68,7 +85,7 @@ def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
     controller |= {"require_recorder": True, "auto_arm": True}
     return settings.model_copy(
         update={
-            "network": settings.network.model_copy(update={"rendezvous": free_rendezvous()}),
+            "network": settings.network.model_copy(update={"rendezvous": [free_rendezvous()]}),
             "controller": settings.controller.model_copy(update=controller),
             "can": private_bus(settings.can),
             "recorder": settings.recorder.model_copy(update={"path": log.absolute()}),
@@ -92,7 +109,7 @@ class ProcessGroup:
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
         self._changed = threading.Condition()
-        self.zenoh = join(settings.network)
+        self.zenoh = join(settings.network, listen=False)
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
 
     def __enter__(self) -> Self:

@@ -144,7 +144,7 @@ def serve(
         FoxgloveServerError: The address or port cannot be listened on.
         NetworkError: The network cannot be joined.
     """
-    with FoxgloveServer(vehicle, address, port) as outlet, join(network) as session:
+    with FoxgloveServer(vehicle, address, port) as outlet, join(network, listen=False) as session:
         feed = LiveDecoder(session, vehicle)
         ready(outlet.url)
         while not stop.wait(1 / rate_hz):

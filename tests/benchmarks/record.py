@@ -119,7 +119,7 @@ def measured(names: list[str], seconds: float, *overrides: str) -> tuple[Counter
             processes.await_role("recorder")
             pid = processes.pid("recorder")
             before = cpu_s(pid)
-            run_publishers(settings.network.rendezvous, names, seconds)
+            run_publishers(settings.network.rendezvous[0], names, seconds)
             used = cpu_s(pid) - before
             processes.stop("recorder")
         size = sum(path.stat().st_size for path in Path(folder).glob("*.mcap"))

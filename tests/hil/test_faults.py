@@ -163,7 +163,7 @@ def far_apart() -> Iterator[tuple[Cable, list[Event], list[Truth], list[subproce
         assert time.monotonic() < deadline
         time.sleep(0.05)
     with (
-        join(NetworkSettings(rendezvous=rendezvous, gossip=False)) as session,
+        join(NetworkSettings(rendezvous=[rendezvous], gossip=False)) as session,
         Cable(int(rendezvous.rsplit(":", 1)[1])) as cable,
     ):
         for name, into, model in (("event", events, Event), ("truth", truths, Truth)):

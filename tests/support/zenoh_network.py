@@ -11,6 +11,7 @@ from typing import Self
 import zenoh
 
 from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.service.testing.process_group import free_rendezvous
 
 PATIENCE_S = 20.0
 """How long to wait for what takes milliseconds: a shared machine can keep a process waiting."""
@@ -43,8 +44,8 @@ class Gathering:
     """Sessions at one rendezvous. A context: leaving it closes those that are still open."""
 
     def __init__(self) -> None:
-        self.port = free_port()
-        self.settings = NetworkSettings(rendezvous=f"tcp/127.0.0.1:{self.port}")
+        self.settings = NetworkSettings(rendezvous=[free_rendezvous()])
+        self.ports = [int(place.rpartition(":")[2]) for place in self.settings.places]
         self._members: list[zenoh.Session] = []
 
     def join(self, settings: NetworkSettings | None = None) -> zenoh.Session:

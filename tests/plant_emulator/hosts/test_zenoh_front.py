@@ -1,17 +1,23 @@
-"""Emulator on a real Zenoh: its published messages are enough to compute the session again."""
+"""Emulator on a real Zenoh: its messages are enough to compute a session again, and a vehicle has one plant."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
 
 from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Release
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.role import OccupiedError, Role
 from aeroloop.protocol.transport.link import ZenohLink
+from aeroloop.protocol.transport.network import NetworkSettings
 from aeroloop.protocol.transport.publication import RecoveringSubscriber
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -74,3 +80,43 @@ def test_a_subscriber_that_joins_after_a_session_recovers_its_trace_and_the_plan
     outcomes = [outcome for batch in batches for outcome in batch.columns["outcome"].tolist()]
     assert len(outcomes) >= ANSWERED
     assert {Outcome.ACTED, Outcome.WITHHELD} <= set(outcomes)
+
+
+@contextmanager
+def running(network: NetworkSettings, vehicle: str = "aero") -> Iterator[EmulatorOnZenoh]:
+    """An armed emulator on a network."""
+    with Role("plant", vehicle, network, {}) as role:
+        emulator = EmulatorOnZenoh(role, LOOP, WIRE, PLANT.model_copy(update={"armed_at_start": True}))
+        thread = threading.Thread(target=emulator.run)
+        thread.start()
+        try:
+            yield emulator
+        finally:
+            role.stop.set()
+            thread.join()
+
+
+def test_a_second_plant_of_a_vehicle_refuses_to_start_and_names_the_first() -> None:
+    with Gathering() as gathering, running(gathering.settings):
+        zenoh = gathering.join()
+        key = topics.key("status", "aero", role="plant")
+        eventually("a status", lambda: any(reply.ok is not None for reply in zenoh.get(key)))
+        with pytest.raises(OccupiedError, match=r"aero has a plant already \(.*, pid \d+\); stop that one, or"):
+            Role("plant", "aero", gathering.settings, {})
+        with running(gathering.settings, "another") as emulator:
+            assert emulator.endpoint.cause is None
+
+
+def test_two_plants_of_a_vehicle_that_meet_both_trip_until_one_has_ended_and_the_other_is_armed() -> None:
+    with Gathering() as one, Gathering() as other, running(one.settings) as first:
+        with running(other.settings) as second:
+            both = [*one.settings.rendezvous, *other.settings.rendezvous]
+            zenoh = one.join(one.settings.model_copy(update={"rendezvous": both}))  # the cut is healed
+            for emulator in (first, second):
+                eventually("the trip", lambda e=emulator: e.endpoint.trip is TripCause.DUPLICATE)  # type: ignore[misc]
+                assert "two plants are named aero" in str(emulator.endpoint.cause)
+        claim = Claim(controller="c", session="s", period_ns=LOOP.period_ns, lockstep=False, auto_arm=True, wire=WIRE)
+        replies = [reply.ok for reply in zenoh.get(topics.key("claim", "aero"), payload=claim.encode())]
+        assert [b"two plants are named aero" in reply.payload.to_bytes() for reply in replies if reply] == [True]
+        list(zenoh.get(topics.key("arm", "aero")))
+        assert first.endpoint.cause is None

@@ -1,18 +1,19 @@
-"""Network: peers meet at a rendezvous that any of them holds, and an endpoint in use is a one-line error."""
+"""Network: any process can be joined at, none is needed by the others, and one that hangs delays nobody."""
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import pytest
 import zenoh
 from pydantic import ValidationError
 
-from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.network import NetworkError, NetworkSettings
+from aeroloop.protocol.runtime.processes import listener
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, visit
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 
@@ -39,37 +40,66 @@ def receives(listener: Listener, speaker: zenoh.Session, word: bytes) -> None:
     eventually(f"receiving {word!r}", said)
 
 
-def test_the_first_to_start_listens_at_the_rendezvous_and_the_others_join() -> None:
-    with Gathering() as gathering:
-        assert not accepts(gathering.port)
-        first = gathering.join()
-        assert accepts(gathering.port)
-        second, third = gathering.join(), gathering.join()
-        everyone = {first, second, third}
-        for member in everyone:
-            others = {str(other.zid()) for other in everyone - {member}}
-            eventually("meeting", lambda m=member, o=others: {str(zid) for zid in m.info.peers_zid()} == o)  # type: ignore[misc]  # bound now
-        listener = Listener(third, "t/word")
-        receives(listener, first, b"from the first")
-        receives(listener, second, b"from the second")
+def peers(member: zenoh.Session) -> set[str]:
+    """Ids of the sessions that a session is linked to."""
+    return {str(zid) for zid in member.info.peers_zid()}
 
 
-def test_when_the_holder_goes_the_rest_stay_together_and_the_next_takes_the_rendezvous() -> None:
+def linked(members: Iterable[zenoh.Session]) -> None:
+    """Wait until each is linked to all others and to no other."""
+    everyone = {str(member.zid()) for member in members}
+    for member in members:
+        eventually("linking", lambda m=member: peers(m) == everyone - {str(m.zid())})  # type: ignore[misc]  # bound now
+
+
+def test_each_process_listens_at_a_port_of_its_own_and_links_to_all() -> None:
     with Gathering() as gathering:
-        holder, b, c = gathering.join(), gathering.join(), gathering.join()
-        listeners = {name: Listener(member, "t/word") for name, member in (("b", b), ("c", c))}
-        receives(listeners["b"], c, b"before")
-        holder.close()
-        eventually("the holder's leaving", lambda: not accepts(gathering.port))
-        receives(listeners["b"], c, b"c to b, without a holder")
-        receives(listeners["c"], b, b"b to c, without a holder")
-        newcomer = gathering.join()
-        assert accepts(gathering.port)
-        listener = Listener(newcomer, "t/word")
-        for name, each in listeners.items():
-            receives(each, newcomer, f"the newcomer to {name}".encode())
-        receives(listener, b, b"b to the newcomer")
-        receives(listener, c, b"c to the newcomer")
+        members = []
+        for taken in range(4):
+            assert [accepts(port) for port in gathering.ports] == [port < taken for port in range(8)]
+            members.append(gathering.join())
+        linked(members)
+        ear = Listener(members[3], "t/word")
+        receives(ear, members[0], b"from the first")
+
+
+@pytest.mark.parametrize("first_to_go", range(3))
+def test_whichever_process_ends_a_newcomer_links_to_the_rest_and_takes_its_port(first_to_go: int) -> None:
+    with Gathering() as gathering:
+        members = [gathering.join() for _ in range(3)]
+        linked(members)
+        members.pop(first_to_go).close()
+        eventually("its leaving", lambda: not accepts(gathering.ports[first_to_go]))
+        linked(members)
+        members.append(gathering.join())
+        assert accepts(gathering.ports[first_to_go])
+        linked(members)
+
+
+def test_more_processes_than_ports_link_by_gossip() -> None:
+    with Gathering() as gathering:
+        settings = gathering.settings.model_copy(update={"ports": 2})
+        linked([gathering.join(settings) for _ in range(5)])
+
+
+def test_a_command_visits_without_an_endpoint() -> None:
+    with Gathering() as gathering:
+        member = gathering.join()
+        with visit(gathering.settings) as here:
+            linked([member, here.session])
+            assert here.silent() == []
+            assert [accepts(port) for port in gathering.ports] == [True] + 7 * [False]
+
+
+def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() -> None:
+    """A halted process is such a one: the kernel accepts for it."""
+    with Gathering() as gathering, socket.create_server(("127.0.0.1", gathering.ports[0])):
+        members = [gathering.join(), gathering.join()]
+        linked(members)
+        with visit(gathering.settings) as here:
+            linked([*members, here.session])
+            assert here.silent() == [gathering.settings.places[0]]
+        assert listener(gathering.settings.places[0]) == (os.getpid(), None)
 
 
 @contextmanager
@@ -104,34 +134,32 @@ def one_line(error: BaseException) -> str:
     return text
 
 
-def test_a_rendezvous_held_by_another_program_is_reported_in_one_line() -> None:
+def test_a_port_held_by_another_program_is_passed_over() -> None:
     with Gathering() as gathering, rude_program() as port:
-        with pytest.raises(NetworkError) as caught:
-            gathering.join(NetworkSettings(rendezvous=f"tcp/127.0.0.1:{port}"))
-        text = one_line(caught.value)
-        assert f"the rendezvous tcp/127.0.0.1:{port} does not answer as Zenoh" in text
-        assert "--set network.rendezvous=" in text
+        settings = NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1)
+        linked([gathering.join(settings)])
+        assert accepts(port)
 
 
 def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
     with Gathering() as gathering, rude_program() as port:
-        for rendezvous in ("", gathering.settings.rendezvous):
+        for rendezvous in ([], gathering.settings.rendezvous):
             with pytest.raises(NetworkError) as caught:
                 gathering.join(NetworkSettings(rendezvous=rendezvous, listen=[f"tcp/127.0.0.1:{port}"]))
             text = one_line(caught.value)
             assert f"cannot listen on tcp/127.0.0.1:{port}" in text
             assert "--set network.listen=" in text
             assert ".rs" not in text  # Zenoh's own source locations are of no use to the user
-        assert not accepts(gathering.port)  # what failed to join holds nothing
+        assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
 
 
 def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:
     with Gathering() as gathering:
         place = f"tcp/127.0.0.1:{free_port()}"
-        alone = gathering.join(NetworkSettings(rendezvous="", listen=[place]))
-        assert not accepts(gathering.port)
+        alone = gathering.join(NetworkSettings(rendezvous=[], listen=[place]))
+        assert not any(accepts(port) for port in gathering.ports)
         assert list(alone.info.peers_zid()) == []
-        caller = gathering.join(NetworkSettings(rendezvous="", connect=[place]))
+        caller = gathering.join(NetworkSettings(rendezvous=[], connect=[place]))
         receives(Listener(alone, "t/word"), caller, b"found")
 
 
@@ -147,13 +175,3 @@ def test_messages_bear_no_time_of_zenohs() -> None:
 def test_network_settings_out_of_bounds_are_refused_by_name(broken: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match=next(iter(broken))):
         NetworkSettings.model_validate(broken)
-
-
-def test_refreshing_links_leaves_the_network_as_it_was() -> None:
-    """A link that Zenoh failed to make cannot be brought about on purpose; that a refresh disturbs nothing can."""
-    settings = NetworkSettings(rendezvous=f"tcp/127.0.0.1:{free_port()}")
-    with Role("plant", "aero", settings, {}) as plant, Role("recorder", "aero", settings, {}) as recorder:
-        eventually("the link", lambda: str(recorder.zenoh.zid()) in map(str, plant.zenoh.info.peers_zid()))
-        before = {str(peer) for peer in plant.zenoh.info.peers_zid()}
-        recorder.refresh_links()
-        eventually("the old peers", lambda: {str(peer) for peer in plant.zenoh.info.peers_zid()} == before)

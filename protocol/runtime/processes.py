@@ -1,0 +1,60 @@
+"""Processes of this host: names a role's process, and finds the process that listens at a TCP port."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+_SUFFIX: Final = "@aeroloop"
+_NAME_LENGTH: Final = 15
+_PR_SET_NAME: Final = 15
+_LISTENS: Final = "0A"
+_ROLES: Final = ("plant", "controller", "recorder")
+
+
+class Listener(NamedTuple):
+    """A process that listens at a port.
+
+    Attributes:
+        pid: Process id.
+        role: `plant`, `controller`, `recorder`, or None where it is not a role of this program.
+    """
+
+    pid: int
+    role: str | None
+
+    def __str__(self) -> str:
+        return f"{self.role or 'process'} with pid {self.pid}"
+
+
+def name_process(role: str) -> None:
+    """Name this process after its role, for `ps`, `top` and `listener`; at most 15 characters, see prctl(2)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_NAME, f"{role}{_SUFFIX}"[:_NAME_LENGTH].encode(), 0, 0, 0)
+
+
+def listener(endpoint: str) -> Listener | None:
+    """The process of this host that listens at a Zenoh endpoint of TCP; None where that cannot be found out.
+
+    A process of another user is not found, nor one on another host.
+    """
+    port = re.fullmatch(r"tcp/.*:(\d+)", endpoint)
+    if port is None:
+        return None
+    inodes = set()
+    for table in ("tcp", "tcp6"):
+        with suppress(OSError):
+            for line in Path("/proc/net", table).read_text().splitlines()[1:]:
+                cells = line.split()
+                if cells[3] == _LISTENS and int(cells[1].rpartition(":")[2], 16) == int(port[1]):
+                    inodes.add(f"socket:[{cells[9]}]")
+    for folder in Path("/proc").glob("[0-9]*") if inodes else []:
+        with suppress(OSError):
+            if any(os.readlink(file) in inodes for file in (folder / "fd").iterdir()):
+                name, _, _ = (folder / "comm").read_text().strip().partition("@")
+                return Listener(int(folder.name), name if name in _ROLES else None)
+    return None
