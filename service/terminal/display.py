@@ -12,6 +12,7 @@ from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Group, RenderableType
+from rich.layout import Layout
 from rich.live import Live
 from rich.progress import (
     BarColumn,
@@ -23,6 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Column, Table
+from rich.text import Text
 
 from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.figures import Figures
@@ -31,7 +33,6 @@ from aeroloop.service.terminal.console import Console
 
 if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis
-    from aeroloop.service.host.operator import Statuses
     from aeroloop.service.host.soak import Soak
     from aeroloop.service.lab.calibrate import Calibration
     from aeroloop.service.lab.demo import Progress as DemoProgress
@@ -164,10 +165,20 @@ def calibration_table(fit: Calibration) -> None:
 
 
 @contextmanager
-def live_screen() -> Iterator[Callable[[RenderableType], None]]:
-    """A function that redraws the whole terminal."""
-    with Live(console=Console(), auto_refresh=False, screen=Console().is_terminal) as live:
-        yield lambda drawing: live.update(drawing, refresh=True)
+def live_screen() -> Iterator[Callable[[Callable[[int], RenderableType], Text], None]]:
+    """A function that redraws the whole terminal: a view, given for a width, and a footer at the bottom."""
+    console = Console()
+    with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
+
+        def show(draw: Callable[[int], RenderableType], footer: Text) -> None:
+            drawing = draw(console.width)
+            if console.is_terminal:
+                layout = Layout()
+                layout.split_column(Layout(drawing), Layout(footer, size=1))
+                drawing = layout
+            live.update(drawing, refresh=True)
+
+        yield show
 
 
 def diagnosis_table(diagnosis: Diagnosis) -> None:
@@ -178,22 +189,6 @@ def diagnosis_table(diagnosis: Diagnosis) -> None:
     Console().print(table)
     holds = "holds" if diagnosis.holds else "does not hold"
     Console().print(f"this machine {holds} {diagnosis.rate_hz:g} Hz", style="bold")
-
-
-def status_table(found: Statuses) -> None:
-    """Print the status of every role."""
-    table = Table("vehicle", "role", "state", "rate", "skipped", "latency p50/p99", "up", "", box=None)
-    for vehicle, roles in sorted(found.items()):
-        for role, status in sorted(roles.items()):
-            figures = (
-                f"{status.rate_hz:.0f}/s",
-                str(status.skipped),
-                p50_p99(status.latency_us),
-                f"{status.uptime_s:.0f} s",
-            )
-            notes = [*([status.cause] if status.cause else []), *status.notes]
-            table.add_row(vehicle, role, status.state, *figures, "; ".join(notes))
-    Console().print(table)
 
 
 @contextmanager

@@ -9,14 +9,15 @@ from rich.console import Console
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, Status, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Message
 from aeroloop.service.config import load
-from aeroloop.service.terminal.monitor import SILENT_S, Top
+from aeroloop.service.host.health import SILENT_S
+from aeroloop.service.terminal.monitor import Top
 
 
-def text(top: Top) -> str:
-    """What a wide terminal would show."""
+def text(top: Top, width: int = 200) -> str:
+    """What a terminal of this width would show."""
     page = StringIO()
-    console = Console(width=200, file=page)
-    console.print(top.draw())
+    console = Console(width=width, file=page)
+    console.print(top.draw(width))
     return page.getvalue()
 
 
