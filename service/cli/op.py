@@ -74,12 +74,19 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
     from aeroloop.service.terminal.keyboard import keyboard
     from aeroloop.service.terminal.monitor import Footer, watch
 
-    stop = threading.Event()
+    stop, signals = threading.Event(), list[int]()
+
+    def end(number: int, _: object) -> None:
+        signals.append(number)
+        stop.set()
+
     footer = Footer(lambda: _stop(settings), _stopped_vehicle(settings) or "every plant")
     with guarded(), keyboard() as read, live_screen() as show:
         for which in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(which, lambda *_: stop.set())
+            signal.signal(which, end)
         watch(settings.network, show, stop, read, footer)
+    if signals:
+        raise typer.Exit(128 + signals[0])
 
 
 @group.command()

@@ -11,6 +11,7 @@ from functools import partial
 from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
+from rich.columns import Columns
 from rich.console import Group, RenderableType
 from rich.layout import Layout
 from rich.live import Live
@@ -174,7 +175,7 @@ def live_screen() -> Iterator[Callable[[Callable[[int], RenderableType], Text], 
             drawing = draw(console.width)
             if console.is_terminal:
                 layout = Layout()
-                layout.split_column(Layout(drawing), Layout(footer, size=1))
+                layout.split_column(Layout(drawing), Layout(footer, size=2))
                 drawing = layout
             live.update(drawing, refresh=True)
 
@@ -193,21 +194,29 @@ def diagnosis_table(diagnosis: Diagnosis) -> None:
 
 @contextmanager
 def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
-    """The demo's live view on stderr: a bar and a line of figures."""
-    seconds = TextColumn("{task.completed:5.1f}/{task.total:g} s")
-    bar = Progress(BarColumn(), seconds, TimeRemainingColumn(), console=_stderr)
+    """The demo's live view on stderr: what it waits for; from the first command on, a bar and the figures of now."""
+    bar = Progress(BarColumn(), TextColumn("{task.completed:5.1f}/{task.total:g} s"), console=_stderr)
     task = bar.add_task("", total=total_s)
-    with Live(bar, console=_stderr, refresh_per_second=10, transient=True) as live:
+    with Live("starting", console=_stderr, refresh_per_second=10, transient=True) as live:
 
         def update(now: DemoProgress) -> None:
+            if now.waiting_for:
+                states = ", ".join(f"{role} {status.state}" for role, status in sorted(now.statuses.items()))
+                live.update(
+                    f"waiting for {now.waiting_for}" + (f" ({states})" if states and not now.time_s else ""),
+                    refresh=True,
+                )
+                return
             bar.update(task, completed=now.time_s)
-            up, down = now.bits_per_s
-            volts = "  ".join(f"{u:+6.1f}" for u in now.voltages) or "–"
-            line = (
-                f"error {degrees(now.error_rad):5.2f}°   volts {volts}   {now.rate_hz:5.0f} Hz   "
-                f"skipped {now.skipped}   {up / 1000:.1f} + {down / 1000:.1f} kbit/s"
-            )
-            live.update(Group(bar, line if now.statuses.get("controller") else "starting three processes …"))
+            figures = [
+                f"error {degrees(now.error_rad):5.2f}°",
+                f"voltages {' '.join(f'{u:+6.1f}' for u in now.voltages)} V",
+            ]
+            if "controller" in now.statuses:
+                up, down = now.bits_per_s
+                figures.append(f"{now.rate_hz:3.0f} ticks/s, {now.skipped} skipped")
+                figures.append(f"payload {up / 1000:.1f} + {down / 1000:.1f} kbit/s")
+            live.update(Group(bar, Columns(figures, padding=(0, 3, 0, 0))))
 
         yield update
 

@@ -102,7 +102,8 @@ def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now:
     at, telemetry = vehicle.telemetry or (now, None)
     session = _session(statuses)
     if session is None:
-        yield Text("no session: no error, no voltages", style=STALE)
+        if statuses:
+            yield Text("no session: no error, no voltages", style=STALE)
         return
     if telemetry is None or telemetry.session != session:
         yield Text("no telemetry yet", style=WAITING)
@@ -154,8 +155,8 @@ class Footer:
         self._shown = Text("; ".join([*failures, *answers]), style=BAD if failures else GOOD)
 
     def draw(self) -> Text:
-        """The last line of the view."""
-        return self._shown or Text(f"s: stop {self._what}   q: quit", style=STALE)
+        """The last two lines of the view: what was asked or done, and the keys."""
+        return Text("\n").join([self._shown, Text(f"s: stop {self._what}   q: quit", style=STALE)])
 
 
 def watch(

@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.protocol.messages.models import Percentiles, Status
-from aeroloop.service.host.health import SILENT_S, troubles
+from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.terminal.console import Console
 
@@ -50,6 +50,7 @@ def roles_view(statuses: Mapping[str, tuple[float, Status]], width: int) -> Grou
             style=STALE if silent else "",
         )
         lines += _lines(role, age, status, silent)
+    lines += [Text(f"no {role}", style=WAITING) for role in NEEDED if role not in statuses]
     return Group(table, *lines)
 
 
