@@ -40,7 +40,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.", show_default=False),
 ]
-Duration = Annotated[float, typer.Option("--duration", min=0.01, help="Length of the experiment, in s.")]
+Duration = Annotated[float, typer.Option("--duration", metavar="S", min=0.01, help="Length of the experiment, in s.")]
 BitsOut = Annotated[
     str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
 ]

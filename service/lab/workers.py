@@ -22,8 +22,10 @@ Result = TypeVar("Result")
 _PR_SET_PDEATHSIG: Final = 1
 
 
-def _end_with_parent() -> None:
+def _end_with_parent(parent: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before prctl took effect
+        os._exit(1)
 
 
 class Workers:
@@ -32,7 +34,10 @@ class Workers:
     def __init__(self) -> None:
         # Spawned, not forked: a fork would inherit the locks of the caller's threads.
         self._executor = ProcessPoolExecutor(
-            os.cpu_count(), mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
+            os.cpu_count(),
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_end_with_parent,
+            initargs=(os.getpid(),),
         )
 
     def __enter__(self) -> Self:
