@@ -11,8 +11,10 @@ import ctypes
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from typing import Final, Self, TypeVar, TypeVarTuple
 
 Arguments = TypeVarTuple("Arguments")
@@ -26,6 +28,26 @@ def _end_with_parent(parent: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it ended before prctl took effect
         os._exit(1)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Put ^C off while processes start: one that starts half prints a traceback. They inherit the mask of signals.
+
+    Why not a mask alone: another thread would take the signal, and Python handles it in the main thread all the same.
+    """
+    arrived: list[int] = []
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, lambda number, _: arrived.append(number)) if main else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if main:
+            signal.signal(signal.SIGINT, before)
+    if arrived:
+        signal.raise_signal(signal.SIGINT)
 
 
 class Workers:
@@ -60,12 +82,8 @@ class Workers:
         Raises:
             Exception: The first exception that the function raised.
         """
-        # Processes start with the first job and inherit the mask. Why not in the initializer: importing takes seconds.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with _uninterrupted():
             futures = [self._executor.submit(work, *job) for job in jobs]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             if progress is not None:
