@@ -47,7 +47,9 @@ class Shapes:
     def kinds(self, shape: Shape) -> dict[str, Shape]:
         """By `kind`, the sections that may stand here; empty unless there are several."""
         choices = [shape, *shape.get("anyOf", [])]  # the latter where it may be null
-        mapping: dict[str, str] = next((each["discriminator"]["mapping"] for each in choices if "discriminator" in each), {})
+        mapping: dict[str, str] = next(
+            (each["discriminator"]["mapping"] for each in choices if "discriminator" in each), {}
+        )
         return {kind: self.resolved({"$ref": ref}) for kind, ref in mapping.items()}
 
     def fields(self, shape: Shape) -> dict[str, Shape]:

@@ -14,10 +14,9 @@ from collections.abc import Sequence
 from math import cos, hypot, inf, nan, sin
 from typing import Final, TypeAlias
 
-import numpy as np
-
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.lazy import numpy as np
 
 Values: TypeAlias = tuple[float, ...]
 

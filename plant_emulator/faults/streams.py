@@ -9,10 +9,9 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Literal
 
-import numpy as np
-
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.faults.signals import generator
+from aeroloop.protocol.lazy import numpy as np
 
 
 class StreamFault:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from math import hypot
 
-import casadi as ca
-import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
+from aeroloop.protocol.lazy import casadi as ca
+from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import Quaternion, R, S, T, Vector
 
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from math import cos, exp, floor, nan, pi, sin, sqrt
 from typing import Literal
 
-import numpy as np
 from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
 NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))

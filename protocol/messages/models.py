@@ -158,7 +158,9 @@ class Status(Message):
     uptime_s: float
     ticks: int = Field(description="ticks since start")
     rate_hz: float = Field(description="ticks a second since the last status")
+    age_s: float = Field(default=0.0, description="in an answer to a query: since the status was taken [s]")
     skipped: int = Field(description="ticks of the session's grid that were missed")
+    recent_skipped: int = Field(default=0, description="`skipped`, last 10 s")
     received: int = Field(default=0, description="frames (recorder: messages) received since start")
     sent: int = Field(default=0, description="frames sent since start")
     refused: int = Field(default=0, description="malformed frames since start")

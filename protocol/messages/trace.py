@@ -16,17 +16,19 @@ import struct
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import lru_cache
-from typing import Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import Field, ValidationError
 
+from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 End = Literal["controller", "plant"]
 ENDS: Final[tuple[End, ...]] = ("controller", "plant")

@@ -35,6 +35,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wording import problems
 
 M = TypeVar("M", bound=Message)
+_RECENT_S: Final = 10.0
 _SELDOM_PER_S: Final = 8.0
 """Cached messages per second of a topic that was not declared beforehand: statuses, events."""
 
@@ -94,7 +95,8 @@ class Role:
         name_process(role)
         self.zenoh = join(network)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
-        self._status = b""
+        self._status: tuple[float, Status] | None = None  # when it was taken
+        self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
         self._publishers: dict[str, CachedPublisher] = {}
         self._inbox: deque[Action] = deque()
         self._throttle = Throttle()
@@ -102,8 +104,7 @@ class Role:
         self.configured(config)
         key = topics.key("description", vehicle, role=role)
         self.answer(key, lambda query: query.reply(key, self._description))
-        status = topics.key("status", vehicle, role=role)
-        self.answer(status, lambda query: query.reply(status, self._status) if self._status else None)
+        self.answer(topics.key("status", vehicle, role=role), self._answer_status)
 
     def __enter__(self) -> Self:
         return self
@@ -265,6 +266,18 @@ class Role:
     def status(self, status: Status) -> None:
         """Publish the status, and answer queries with it until the next one."""
         notify_systemd("WATCHDOG=1")
-        status = status.model_copy(update={"process": self.process})
-        self._status = status.encode()
+        now, skipped = time.monotonic(), self._skipped
+        skipped.append((now, status.skipped))
+        while now - skipped[0][0] > _RECENT_S:
+            skipped.popleft()
+        recent = status.skipped - skipped[0][1]
+        status = status.model_copy(update={"process": self.process, "recent_skipped": recent})
+        self._status = now, status
         self.publish("status", status)
+
+    def _answer_status(self, query: zenoh.Query) -> None:
+        """Answer with the last status and its age, which tells a loop that hangs: Zenoh's threads do not."""
+        if self._status is not None:
+            taken, status = self._status
+            aged = status.model_copy(update={"age_s": round(time.monotonic() - taken, 3)})
+            query.reply(topics.key("status", self.vehicle, role=self.role), aged.encode())

@@ -92,7 +92,7 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     @field_validator("rendezvous", mode="before")
     @classmethod
     def _one_or_more(cls, value: object) -> object:
-        return ([value] if value else []) if isinstance(value, str) else value
+        return value if isinstance(value, list | tuple) else [value] if value else []
 
     @property
     def places(self) -> list[str]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from math import acos, asin, atan2, copysign, hypot, pi, sqrt
 from typing import TypeAlias
 
-import casadi as ca
+from aeroloop.protocol.lazy import casadi as ca
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 """[η, ε₁, ε₂, ε₃], unit length."""

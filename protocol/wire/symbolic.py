@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from math import prod
 from typing import Final, TypeAlias
 
-import casadi as ca
+from aeroloop.protocol.lazy import casadi as ca
 
 Buffer: TypeAlias = "memoryview[float]"
 """A row of doubles, written and read by index. Matrices are in CasADi's order, column by column."""

@@ -13,10 +13,12 @@ Examples are in `aeroloop/service/examples`.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
-
+TYPE_CHECKING = (
+    False  # as in typing, which, like importlib, is slow to import: ^C has no handler before `cli.entry` runs
+)
 if TYPE_CHECKING:
+    from typing import Any, Final
+
     from aeroloop.plant_emulator.plant import Measurement, Plant
     from aeroloop.protocol.errors import AeroloopError
     from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
@@ -80,6 +82,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'aeroloop' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(_HOMES[name]), name)
 
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from aeroloop.service.cli.main import main
+from aeroloop.service.cli.entry import main
 
 main()

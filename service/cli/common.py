@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, No
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.cli.entry import INTERRUPTED, end_at_once
 
 if TYPE_CHECKING:
     from threading import Event
@@ -43,7 +44,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; may be repeated.", show_default=False),
 ]
-Duration = Annotated[float, typer.Option("--duration", min=0.01, help="Length of the experiment, in s.")]
+Duration = Annotated[float, typer.Option("--duration", metavar="S", min=0.01, help="Length of the experiment, in s.")]
 BitsOut = Annotated[
     str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
 ]
@@ -144,7 +145,15 @@ def _configured() -> Iterator[None]:
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Turn expected errors into one line and an exit code."""
+    """Turn expected errors into one line and an exit code. ^C is a KeyboardInterrupt; a second one ends at once."""
+
+    def interrupt(*_: object) -> None:
+        signal.signal(signal.SIGINT, end_at_once)
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # as in a background job
+        signal.signal(signal.SIGINT, interrupt)
     try:
         yield
     except (AeroloopError, ValueError) as error:
@@ -152,7 +161,9 @@ def guarded() -> Iterator[None]:
             raise
         fail(str(error).splitlines()[0], 1)
     except KeyboardInterrupt:
-        raise typer.Exit(130) from None
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

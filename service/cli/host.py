@@ -68,7 +68,7 @@ def units(
     source = units.Source(file or units.CONFIG, overrides or [], settings_of(file, overrides))
     if install is None:
         for name in units.UNITS:
-            typer.echo(f"# ── aeroloop-{name}.service ──\n{units.unit(name, source)}")
+            typer.echo(f"# aeroloop-{name}.service\n{units.unit(name, source)}")
     else:
         with guarded():
             for path in units.install(install, source, force=force):

@@ -81,6 +81,7 @@ def certify(
     attitude_error: Annotated[
         float | None,
         typer.Option(
+            metavar="DEG",
             min=0,
             max=180,
             help="Assumed bound of the attitude error, in degrees; controller.start_within_deg if left out; 180 "

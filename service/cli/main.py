@@ -6,19 +6,22 @@ configuration, 1 for a failed run, 130 for ^C.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from typing import Annotated, Final
+from difflib import get_close_matches
+from typing import Annotated, Any, Final
 
 import typer
+from typer.core import TyperOption
 from typer.exceptions import TyperException
 
 from aeroloop.service.cli import host, lab, log, op, run, show
 from aeroloop.service.cli.common import logged_as, report, state
+from aeroloop.service.cli.entry import INTERRUPTED
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
+    suggest_commands=False,  # `_alike` does, across groups
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
 )
@@ -42,11 +45,6 @@ _EXTRAS: Final = {
 """Modules that the core installs without: the package, and the extra that brings it."""
 
 
-def main() -> None:
-    """Entry point of the command."""
-    sys.exit(execute(sys.argv[1:]))
-
-
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code. Any error is one line on stderr."""
     state["debug"] = False
@@ -55,11 +53,12 @@ def execute(arguments: Sequence[str]) -> int:
         return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
         if message := error.format_message():  # empty where no verb was given and help was printed
-            command = " ".join(["aeroloop", *arguments[:1]])
-            typer.echo(f"aeroloop: {message} (see `{command} --help`)", err=True)
+            context = getattr(error, "ctx", None)
+            command = context.command_path if context else "aeroloop"
+            typer.echo(f"aeroloop: {message.rstrip('.')}{_alike(error)} (see `{command} --help`)", err=True)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
-        return 130
+        return INTERRUPTED
     except Exception as error:
         if state["debug"]:
             raise
@@ -72,6 +71,29 @@ def execute(arguments: Sequence[str]) -> int:
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         report(f"unexpected {text}; `aeroloop --debug …` shows where")
         return 1
+
+
+def _alike(error: TyperException) -> str:
+    """The commands that an unknown verb may stand for, in its own group if any is there, else in another."""
+    context = getattr(error, "ctx", None)
+    if context is None or not error.message.startswith("No such command"):
+        return ""
+    groups = getattr(context.find_root().command, "commands", {})
+    paths = [*groups, *(f"{name} {verb}" for name, group in groups.items() for verb in getattr(group, "commands", {}))]
+    wrong, verbs = error.message.split("'")[1], {path.split()[-1] for path in paths}
+    alike = [wrong] if wrong in verbs else get_close_matches(wrong, verbs)
+    found = [f"aeroloop {path}" for path in paths if path.split()[-1] in alike]
+    own = [command for command in found if command.rpartition(" ")[0] == context.command_path]
+    return f"; did you mean `{'` or `'.join(own or found)}`?" if found else ""
+
+
+def _shown_type(option: TyperOption, ctx: Any) -> str | None:
+    """The type of an option's value, for its help. Typer would show `<bool>` beside every flag, which takes none."""
+    return None if option.is_flag else _TYPERS_TYPE(option, ctx)
+
+
+_TYPERS_TYPE: Final = TyperOption.display_type_rich
+TyperOption.display_type_rich = _shown_type  # type: ignore[method-assign,assignment]  # typer has no setting for it
 
 
 def _print_version(requested: bool) -> None:
@@ -94,7 +116,3 @@ def options(
 ) -> None:
     """Options of every command."""
     state["debug"] = debug
-
-
-if __name__ == "__main__":
-    main()

@@ -13,6 +13,7 @@ from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, 
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.operator import Message, Reference
     from aeroloop.service.config import Settings
+    from aeroloop.service.host.operator import Stopped
 
 Three = tuple[float, float, float]
 Within = Annotated[
@@ -26,43 +27,71 @@ group = typer.Typer(no_args_is_help=True, help="Operate running roles over the n
 
 
 @group.command()
-def status(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Print the status of every role of every vehicle on the network."""
+def status(
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Print only what is wrong, and exit with 1 if anything is: a plant tripped or a controller faulted; a "
+            "role silent for 3 s; a loop late (over 1 % of the last 10 s' ticks skipped, or commands that take over a "
+            "period at the 99th percentile); a controller or plant missing.",
+        ),
+    ] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print the status of every role of every vehicle on the network; exits with 1 if no role answers."""
     settings = settings_of(config, overrides)
+    from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
 
     with guarded():
-        found, silent = gather(settings.network)
+        found = gather(settings.network)
+    well = not check or not troubles(found)
     if json:
         from json import dumps
 
-        tree = {
+        tree: dict[str, object] = {
             vehicle: {role: status.model_dump(mode="json") for role, status in roles.items()}
-            for vehicle, roles in found.items()
+            for vehicle, roles in found.statuses.items()
         }
+        if check:
+            tree = {"well": well, "troubles": [trouble._asdict() for trouble in troubles(found)], "vehicles": tree}
         typer.echo(dumps(tree, indent=2))
     else:
-        from aeroloop.service.terminal.display import status_table
+        from aeroloop.service.terminal.roles import status_view, troubles_view
 
-        status_table(found)
-    for line in silent:
+        (troubles_view if check else status_view)(found)
+    for line in [] if check else found.silent:
         typer.echo(f"aeroloop: {line}", err=True)
+    if not well:
+        raise typer.Exit(1)
 
 
 @group.command()
 def top(config: Config = None, overrides: Overrides = None) -> None:
-    """Show every vehicle and role on the network, live, until ^C."""
+    """Show every vehicle and role on the network, live; s stops, q quits."""
     settings = settings_of(config, overrides)
     import threading
 
     from aeroloop.service.terminal.display import live_screen
-    from aeroloop.service.terminal.monitor import watch
+    from aeroloop.service.terminal.keyboard import keyboard
+    from aeroloop.service.terminal.monitor import Footer, watch
 
-    stop = threading.Event()
-    for which in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(which, lambda *_: stop.set())
-    with guarded(), live_screen() as show:
-        watch(settings.network, show, stop)
+    stop, signals = threading.Event(), list[int]()
+
+    def end(number: int, _: object) -> None:
+        signals.append(number)
+        stop.set()
+
+    footer = Footer(lambda: _stop(settings), _stopped_vehicle(settings) or "every plant")
+    with guarded(), keyboard() as read, live_screen() as show:
+        for which in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(which, end)
+        watch(settings.network, show, stop, read, footer)
+    if signals:
+        raise typer.Exit(128 + signals[0])
 
 
 @group.command()
@@ -101,15 +130,23 @@ def stop(
 ) -> None:
     """Stop the configured vehicle's plant at once, or all plants if none is configured: 0 V until `op arm`."""
     settings = settings_of(config, overrides)
-    every = every or "vehicle" not in settings.model_fields_set
-    from aeroloop.service.host.operator import stop as stop_plants
-
     with guarded():
-        answers, failures = stop_plants(settings.network, None if every else settings.vehicle)
+        answers, failures = _stop(settings, every=every)
     for line in answers:
         typer.echo(line)
     if failures:
         fail("; ".join(failures), 1)
+
+
+def _stop(settings: Settings, *, every: bool = False) -> Stopped:
+    from aeroloop.service.host.operator import stop as stop_plants
+
+    return stop_plants(settings.network, None if every else _stopped_vehicle(settings))
+
+
+def _stopped_vehicle(settings: Settings) -> str | None:
+    """The vehicle that is stopped: the configured one, or every vehicle if none is configured."""
+    return settings.vehicle if "vehicle" in settings.model_fields_set else None
 
 
 @group.command()
@@ -124,7 +161,7 @@ def inject(
         list[str] | None,
         typer.Argument(
             metavar="FAULT",
-            help="signal:kind[=value][@start[..end]], in s from now, such as rate:off@1..2 or command:drop=0.1.",
+            help="As rate:off, rate:off@1..2 (in s from now) or command:drop=0.1; plant_emulator/faults has all.",
             show_default=False,
         ),
     ] = None,

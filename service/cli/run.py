@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from json import dumps
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -27,6 +28,7 @@ from aeroloop.service.cli.common import (
     show,
     with_bits_of,
 )
+from aeroloop.service.cli.entry import INTERRUPTED
 
 if TYPE_CHECKING:
     from threading import Event
@@ -77,8 +79,11 @@ def demo(
             with live_demo(duration) as update:
                 figures, complete = run_demo(settings, duration, log, update)
     show(figures, json, figures_table)
+    if not json:
+        page = quote(str(Path(figures.log or "").with_suffix(".html")))
+        typer.echo(f"aeroloop: next, draw it: `aeroloop log review {quote(figures.log or '')} --html {page}`", err=True)
     if not complete:
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 @group.command()

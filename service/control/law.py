@@ -26,10 +26,10 @@ from dataclasses import dataclass
 from math import hypot
 from typing import Annotated, Final, NamedTuple
 
-import casadi as ca
-import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from aeroloop.protocol.lazy import casadi as ca
+from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.messages.operator import Gain
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.protocol.wire.symbolic import along_rows, in_columns

@@ -30,9 +30,13 @@ CLAIM_WAIT_S = 60.0
 
 @dataclass
 class Progress:
-    """Values that the demo shows while it runs, from received telemetry and statuses."""
+    """Values that the demo shows while it runs, from received telemetry and statuses.
+
+    `waiting_for` says what it waits for, before the first telemetry and after the last; it is empty between.
+    """
 
     settings: Settings
+    waiting_for: str = "three processes"
     time_s: float = 0.0
     error_rad: float = 0.0
     voltages: tuple[float, ...] = ()
@@ -47,6 +51,7 @@ class Progress:
         payload = sample.payload.to_bytes()
         if address.topic.name == "telemetry":
             telemetry = Telemetry.model_validate_json(payload)
+            self.waiting_for = ""
             self.time_s = telemetry.tick * self.settings.loop.period
             self.error_rad = angle(*telemetry.attitude_error)
             self.voltages = telemetry.voltages
@@ -93,6 +98,8 @@ def run_demo(
     settings = standalone(settings, path, duration_s=duration_s)
     progress = Progress(settings)
     interrupted = threading.Event()
+    show = show or (lambda _: None)
+    show(progress)
     with ProcessGroup(settings) as processes, _on_interrupt(interrupted):
         for topic in ("telemetry", "status"):
             processes.zenoh.declare_subscriber(topics.key(topic, settings.vehicle), progress.receive)
@@ -101,6 +108,7 @@ def run_demo(
         processes.await_role("recorder")
         processes.await_role("plant")
         processes.start("controller")
+        progress.waiting_for = "the first command"
         deadline, claimed = time.monotonic() + CLAIM_WAIT_S, False
         while processes.running("controller") and not interrupted.wait(REFRESH_S):
             processes.check()
@@ -108,9 +116,10 @@ def run_demo(
             if not claimed and time.monotonic() > deadline:
                 states = ", ".join(f"{role} {status.state}" for role, status in sorted(progress.statuses.items()))
                 raise ProcessGroupError(f"no session began within {CLAIM_WAIT_S:g} s ({states}); try again")
-            if show is not None:
-                show(progress)
+            show(progress)
         processes.check()
+    progress.waiting_for = "the review of the log"
+    show(progress)
     return review(*parts(path)), not interrupted.is_set()
 
 

@@ -6,10 +6,10 @@ import re
 from collections.abc import Container
 from typing import Final
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from aeroloop.service.terminal.console import Console
 from aeroloop.service.theorem.certificate import Certificate
 
 DECIDING: Final = (

@@ -11,7 +11,9 @@ from functools import partial
 from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
-from rich.console import Console, Group, RenderableType
+from rich.columns import Columns
+from rich.console import Group, RenderableType
+from rich.layout import Layout
 from rich.live import Live
 from rich.progress import (
     BarColumn,
@@ -23,14 +25,15 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Column, Table
+from rich.text import Text
 
 from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import paper
+from aeroloop.service.terminal.console import Console
 
 if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis
-    from aeroloop.service.host.operator import Statuses
     from aeroloop.service.lab.calibrate import Calibration
     from aeroloop.service.lab.demo import Progress as DemoProgress
     from aeroloop.service.lab.soak import Soak
@@ -163,10 +166,20 @@ def calibration_table(fit: Calibration) -> None:
 
 
 @contextmanager
-def live_screen() -> Iterator[Callable[[RenderableType], None]]:
-    """A function that redraws the whole terminal."""
-    with Live(console=Console(), auto_refresh=False, screen=Console().is_terminal) as live:
-        yield lambda drawing: live.update(drawing, refresh=True)
+def live_screen() -> Iterator[Callable[[Callable[[int], RenderableType], Text], None]]:
+    """A function that redraws the whole terminal: a view, given for a width, and a footer at the bottom."""
+    console = Console()
+    with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
+
+        def show(draw: Callable[[int], RenderableType], footer: Text) -> None:
+            drawing = draw(console.width)
+            if console.is_terminal:
+                layout = Layout()
+                layout.split_column(Layout(drawing), Layout(footer, size=2))
+                drawing = layout
+            live.update(drawing, refresh=True)
+
+        yield show
 
 
 def diagnosis_table(diagnosis: Diagnosis) -> None:
@@ -179,45 +192,31 @@ def diagnosis_table(diagnosis: Diagnosis) -> None:
     Console().print(f"this machine {holds} {diagnosis.rate_hz:g} Hz", style="bold")
 
 
-def status_table(found: Statuses) -> None:
-    """Print the status of every role."""
-    table = Table("vehicle", "role", "state", "rate", "skipped", "latency p50/p99", "up", "", box=None)
-    for vehicle, roles in sorted(found.items()):
-        for role, status in sorted(roles.items()):
-            figures = (
-                f"{status.rate_hz:.0f}/s",
-                str(status.skipped),
-                p50_p99(status.latency_us),
-                f"{status.uptime_s:.0f} s",
-            )
-            notes = [*([status.cause] if status.cause else []), *status.notes]
-            table.add_row(vehicle, role, status.state, *figures, "; ".join(notes))
-    console = Console()
-    console.print(table)
-    for vehicle, roles in sorted(found.items()):
-        if (driver := roles.get("controller")) is not None and driver.gains is not None:
-            gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in driver.gains if gain)
-            console.print(f"{vehicle}: reference {driver.reference} ({driver.reference_from})")
-            console.print(f"{vehicle}: gains {gains} ({driver.gains_from})")
-
-
 @contextmanager
 def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
-    """The demo's live view on stderr: a bar and a line of figures."""
-    seconds = TextColumn("{task.completed:5.1f}/{task.total:g} s")
-    bar = Progress(BarColumn(), seconds, TimeRemainingColumn(), console=_stderr)
+    """The demo's live view on stderr: what it waits for; from the first command on, a bar and the figures of now."""
+    bar = Progress(BarColumn(), TextColumn("{task.completed:5.1f}/{task.total:g} s"), console=_stderr)
     task = bar.add_task("", total=total_s)
-    with Live(bar, console=_stderr, refresh_per_second=10, transient=True) as live:
+    with Live("starting", console=_stderr, refresh_per_second=10, transient=True) as live:
 
         def update(now: DemoProgress) -> None:
+            if now.waiting_for:
+                states = ", ".join(f"{role} {status.state}" for role, status in sorted(now.statuses.items()))
+                live.update(
+                    f"waiting for {now.waiting_for}" + (f" ({states})" if states and not now.time_s else ""),
+                    refresh=True,
+                )
+                return
             bar.update(task, completed=now.time_s)
-            up, down = now.bits_per_s
-            volts = "  ".join(f"{u:+6.1f}" for u in now.voltages) or "–"
-            line = (
-                f"error {degrees(now.error_rad):5.2f}°   volts {volts}   {now.rate_hz:5.0f} Hz   "
-                f"skipped {now.skipped}   {up / 1000:.1f} + {down / 1000:.1f} kbit/s"
-            )
-            live.update(Group(bar, line if now.statuses.get("controller") else "starting three processes …"))
+            figures = [
+                f"error {degrees(now.error_rad):5.2f}°",
+                f"voltages {' '.join(f'{u:+6.1f}' for u in now.voltages)} V",
+            ]
+            if "controller" in now.statuses:
+                up, down = now.bits_per_s
+                figures.append(f"{now.rate_hz:3.0f} ticks/s, {now.skipped} skipped")
+                figures.append(f"payload {up / 1000:.1f} + {down / 1000:.1f} kbit/s")
+            live.update(Group(bar, Columns(figures, padding=(0, 3, 0, 0))))
 
         yield update
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
 
-from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Spread, TheoremFindings
+from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def review_account(findings: Findings) -> None:
     console = Console()
     console.print()
     if findings.timing:
-        console.print(_timing_table(findings))
+        console.print(_timing_table(findings, drawn=console.width >= 80))
         console.print()
     table = labelled()
     for label, text in _rows(findings):
@@ -56,7 +56,7 @@ def review_account(findings: Findings) -> None:
         console.print(checks)
 
 
-def _timing_table(findings: Findings) -> Table:
+def _timing_table(findings: Findings, *, drawn: bool) -> Table:
     labels, unit, bars = (
         Column(style="bold", no_wrap=True, min_width=LABELS),
         Column(no_wrap=True),
@@ -66,7 +66,7 @@ def _timing_table(findings: Findings) -> Table:
     table = Table(labels, *values, unit, bars, box=None, pad_edge=False, header_style="")
     for name, spread in findings.timing.items():
         percentiles = (spread.p50, spread.p99, spread.p999, spread.max)
-        table.add_row(_TIMINGS[name], *(f"{us:.0f}" for us in percentiles), "µs", sparkline(spread))
+        table.add_row(_TIMINGS[name], *(f"{us:.0f}" for us in percentiles), "µs", sparkline(spread) if drawn else "")
     if (age := findings.age_us) is not None:
         table.add_row("age when used", f"{age['p50']:.0f}", f"{age['p99']:.0f}", "", f"{age['max']:.0f}", "µs", "")
     return table

@@ -1,6 +1,7 @@
 """Live view of the network: every role of every vehicle, from its published messages.
 
-Subscribes to status, telemetry, truth and events, and queries descriptions, which hold the wire. Publishes nothing.
+Subscribes to status, telemetry, truth and events, and queries descriptions, which hold the wire. What is shown is true
+now: values of a session that has ended are left out, and what was not received for `SILENT_S` is marked with its age.
 """
 
 from __future__ import annotations
@@ -8,38 +9,38 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from math import degrees
+from math import degrees, inf
 from typing import Final
 
 import zenoh
 from pydantic import ValidationError
+from rich.columns import Columns
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
 from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.protocol.wire.attitude import angle, to_euler
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.host.bandwidth import PayloadRate
-from aeroloop.service.terminal.display import p50_p99
+from aeroloop.service.host.health import SILENT_S
+from aeroloop.service.terminal.roles import BAD, GOOD, STALE, WAITING, duration, roles_view
 
 REFRESH_S: Final = 0.2
-SILENT_S: Final = 3.0
-"""A role without a status for this long, three of its periods, is shown as silent [s]."""
 EVENTS: Final = 5
 
 
 @dataclass
 class Vehicle:
-    """The latest messages of one vehicle."""
+    """The latest messages of one vehicle, with the time of their arrival on `time.monotonic()`."""
 
     statuses: dict[str, tuple[float, Status]] = field(default_factory=dict)
-    telemetry: Telemetry | None = None
-    truth: Truth | None = None
+    telemetry: tuple[float, Telemetry] | None = None
+    truth: tuple[float, Truth] | None = None
     settings: Settings | None = None
     payload: PayloadRate = field(default_factory=PayloadRate)
 
@@ -67,9 +68,9 @@ class Top:
                         if address.role == "controller":
                             vehicle.payload.receive(status)
                     case "telemetry":
-                        vehicle.telemetry = Telemetry.model_validate_json(payload)
+                        vehicle.telemetry = time.monotonic(), Telemetry.model_validate_json(payload)
                     case "truth":
-                        vehicle.truth = Truth.model_validate_json(payload)
+                        vehicle.truth = time.monotonic(), Truth.model_validate_json(payload)
                     case "description" if address.role in ("plant", "controller"):
                         vehicle.settings = from_description(Description.model_validate_json(payload).config)
                     case "event":
@@ -78,52 +79,101 @@ class Top:
             except (ValidationError, ConfigError):
                 pass  # of another version; its other messages may still parse
 
-    def draw(self) -> RenderableType:
-        """The current view."""
+    def draw(self, width: int) -> RenderableType:
+        """The current view, for a terminal of this width."""
         with self._lock:
             if not self._vehicles:
                 return Text("no role on the network yet")
-            blocks: list[RenderableType] = []
+            now, blocks = time.monotonic(), list[RenderableType]()
             for name, vehicle in sorted(self._vehicles.items()):
-                blocks += [Text(name, style="bold"), _flight(vehicle), _roles(vehicle), Text("")]
-            return Group(*blocks, *(Text(event, overflow="ellipsis", no_wrap=True) for event in self._events))
+                statuses = {role: (now - at, status) for role, (at, status) in vehicle.statuses.items()}
+                values = Columns(_values(vehicle, statuses, now), padding=(0, 3, 0, 0))
+                blocks += [Text(name, style="bold"), values, roles_view(statuses, width), Text("")]
+            return Group(*blocks, *(Text(event) for event in self._events))
 
 
-def _flight(vehicle: Vehicle) -> Text:
-    parts = []
+def _values(vehicle: Vehicle, statuses: Mapping[str, tuple[float, Status]], now: float) -> Iterator[Text]:
+    """Attitude, error, voltages and payload, as far as they are those of now."""
     if vehicle.truth is not None:
-        roll, pitch, yaw = (degrees(part) for part in to_euler(vehicle.truth.attitude))
-        parts.append(f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°")
-    if vehicle.telemetry is not None:
-        parts.append(f"error {degrees(angle(*vehicle.telemetry.attitude_error)):5.2f}°")
-        parts.append("volts " + " ".join(f"{u:+6.1f}" for u in vehicle.telemetry.voltages))
-    if vehicle.settings is not None and "controller" in vehicle.statuses:
+        at, truth = vehicle.truth
+        roll, pitch, yaw = (degrees(part) for part in to_euler(truth.attitude))
+        text = f"roll {roll:+6.1f}°  pitch {pitch:+6.1f}°  yaw {yaw:+7.1f}°"
+        yield Text(text) if now - at < SILENT_S else Text(f"no attitude for {duration(now - at)}", style=WAITING)
+    at, telemetry = vehicle.telemetry or (now, None)
+    session = _session(statuses)
+    if session is None:
+        if statuses:
+            yield Text("no session: no error, no voltages", style=STALE)
+        return
+    if telemetry is None or telemetry.session != session:
+        yield Text("no telemetry yet", style=WAITING)
+    elif now - at >= SILENT_S:
+        yield Text(f"no telemetry for {duration(now - at)}", style=WAITING)
+    else:
+        yield Text(f"error {degrees(angle(*telemetry.attitude_error)):5.2f}°")
+        yield Text("voltages " + " ".join(f"{u:+6.1f}" for u in telemetry.voltages) + " V")
+    if vehicle.settings is not None and "controller" in statuses:
         measured, commanded = vehicle.payload.bits_per_s(vehicle.settings.wire)
-        parts.append(f"{measured / 1000:.1f} + {commanded / 1000:.1f} kbit/s")
-    return Text("   ".join(parts) or "no telemetry")
+        yield Text(f"payload {measured / 1000:.1f} + {commanded / 1000:.1f} kbit/s")
 
 
-def _roles(vehicle: Vehicle) -> Table:
-    table = Table(
-        "role", "state", "rate", "skipped", "latency", "answers in", "wake-up", "received", "", box=None, pad_edge=False
-    )
-    for role, (received, status) in sorted(vehicle.statuses.items()):
-        age, wake = time.monotonic() - received, status.timing.recent_wake if status.timing else None
-        table.add_row(
-            role,
-            status.state if age < SILENT_S else "silent",
-            f"{status.rate_hz:.0f}/s",
-            str(status.skipped),
-            *(p50_p99(spread) for spread in (status.latency_us, status.age_us, wake)),
-            f"{age:.1f} s ago",
-            status.cause or "",
-            style="" if age < SILENT_S else "dim",
-        )
-    return table
+def _session(statuses: Mapping[str, tuple[float, Status]]) -> str | None:
+    """The session that runs, by the plant, or by the controller where there is no plant; None if that is silent."""
+    age, status = statuses.get("plant") or statuses.get("controller") or (SILENT_S, None)
+    return status.session if status is not None and age < SILENT_S else None
 
 
-def watch(network: NetworkSettings, show: Callable[[RenderableType], None], stop: threading.Event) -> None:
-    """Subscribe, and draw five times a second until `stop` is set.
+class Footer:
+    """The keys and what they do: `q` quits; `s`, confirmed by `y`, stops.
+
+    Args:
+        stop: Stops the plants and returns a line for each that answered and for each that did not.
+        what: What it stops, in words.
+    """
+
+    def __init__(self, stop: Callable[[], tuple[list[str], list[str]]], what: str) -> None:
+        self._stop = stop
+        self._what = what
+        self._asked = False
+        self._shown = Text()
+
+    def press(self, key: str) -> bool:
+        """Take a key; whether it quits."""
+        asked, self._asked, self._shown = self._asked, False, Text()
+        if asked and key == "y":
+            self._shown = Text(f"stopping {self._what} …", style=WAITING)
+            threading.Thread(target=self._run, daemon=True).start()  # the view goes on meanwhile
+        elif not asked and key == "s":
+            self._asked, self._shown = True, Text(f"stop {self._what}? y: yes, any other key: no", style=BAD)
+        return not asked and key == "q"
+
+    def _run(self) -> None:
+        try:
+            answers, failures = self._stop()
+        except AeroloopError as error:
+            answers, failures = [], [str(error)]
+        self._shown = Text("; ".join([*failures, *answers]), style=BAD if failures else GOOD)
+
+    def draw(self) -> Text:
+        """The last two lines of the view: what was asked or done, and the keys."""
+        return Text("\n").join([self._shown, Text(f"s: stop {self._what}   q: quit", style=STALE)])
+
+
+def watch(
+    network: NetworkSettings,
+    show: Callable[[Callable[[int], RenderableType], Text], None],
+    stop: threading.Event,
+    read: Callable[[float], str] | None,
+    footer: Footer,
+) -> None:
+    """Subscribe, and draw five times a second until `stop` is set or `q` is pressed.
+
+    Args:
+        network: The network to watch.
+        show: Draws a view, given for a width, and a footer.
+        stop: Ends it.
+        read: Waits for keys up to a time [s]; None without a keyboard.
+        footer: Takes them.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -133,14 +183,20 @@ def watch(network: NetworkSettings, show: Callable[[RenderableType], None], stop
     def receive(sample: zenoh.Sample) -> None:
         top.receive(str(sample.key_expr), sample.payload.to_bytes())
 
+    def described(reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            receive(reply.ok)
+
     with join(network, listen=False) as session:
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), receive)
-        queried = 0.0
-        while not stop.wait(REFRESH_S):
+        queried = -inf
+        while not stop.is_set():
             if time.monotonic() - queried > 2.0:  # for roles that have joined since
                 queried = time.monotonic()
-                for reply in session.get(topics.key("description", "*"), timeout=1.0):
-                    if reply.ok is not None:
-                        top.receive(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
-            show(top.draw())
+                session.get(topics.key("description", "*"), described, timeout=1.0)
+            show(top.draw, footer.draw() if read else Text())
+            if read is None:
+                stop.wait(REFRESH_S)
+            elif any(footer.press(key) for key in read(REFRESH_S)):
+                return

@@ -31,14 +31,17 @@ from typing import Final
 
 _CODE: Final = struct.Struct("<i")
 _REQUEST_BYTES: Final = 1 << 20
-_COMMAND: Final = "aeroloop.service.cli.main"
+_COMMAND: Final = "aeroloop.service.cli.entry"
 _PRELOADED: Final = (
     _COMMAND,
+    "aeroloop.service.cli.main",
+    "aeroloop.service.terminal.encoding",
     "aeroloop.service.daemon.daemon",
     "aeroloop.service.daemon.plants",
     "aeroloop.service.recording.recorder",
     "aeroloop.service.viewers.channels",
     "aeroloop.plant_emulator.hosts.can_node",
+    "casadi",  # the modules above import it at its first use
 )
 
 

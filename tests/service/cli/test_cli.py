@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
 
+from aeroloop.service.cli.main import app
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import load
 
@@ -38,6 +42,10 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         (("lab", "experiment", "--duration", "0"), "--duration"),
         (("lab", "experiment", "--speed", "9"), "--speed"),
         (("lab", "fly"), "fly"),
+        (("stop",), "did you mean `aeroloop op stop`?"),
+        (("op", "stpo"), "did you mean `aeroloop op stop`?"),
+        (("lab", "replay"), "did you mean `aeroloop log replay`?"),
+        (("emulatr",), "did you mean `aeroloop emulator`?"),
         (("demo", "--set", "vehicle=a/b"), "vehicle"),
     ],
 )
@@ -47,6 +55,8 @@ def test_wrong_usage_and_configuration_exit_with_2_and_name_the_culprit(
     code, line = refusal(capfd, *arguments)
     assert code == 2
     assert names in line
+    if hint := re.search(r"see `aeroloop(.*)`", line):
+        assert run(hint[1].split()) == 0
 
 
 def test_a_broken_configuration_file_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -123,11 +133,41 @@ def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixtur
         assert figures["reasons"][name]
 
 
-def test_every_verb_states_what_it_does_in_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
-    verbs = ("demo", "controller", "emulator", "recorder", "lab experiment", "log review", "show config", "show spec")
-    for verb in verbs:
-        assert run([*verb.split(), "--help"]) == 0
-        assert "." in capfd.readouterr().out
+def commands() -> list[list[str]]:
+    """Every command, as the words that call it."""
+    root = typer.main.get_command(app)
+    groups: dict[str, Any] = root.commands  # type: ignore[attr-defined]  # of a group
+    verbs = [[name, verb] for name, group in groups.items() for verb in getattr(group, "commands", ())]
+    return [[], *([name] for name in groups), *verbs]
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_h_is_help_everywhere_and_shows_no_type_beside_a_flag(
+    words: list[str], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80" if words == ["lab", "certify"] else "60")  # which has a long option with a range
+    assert run([*words, "-h"]) == 0
+    short = capfd.readouterr().out
+    assert run([*words, "--help"]) == 0
+    assert capfd.readouterr().out == short
+    assert "." in short
+    assert "bool" not in short
+    assert "…" not in short.replace("2…16", "").replace("…`", "")  # nothing is cut off
+
+
+def test_shells_can_complete_verbs_and_options(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        run(["--show-completion"])
+    assert capfd.readouterr().out
+    for typed, completed in (("aeroloop op st", ["status", "stop"]), ("aeroloop op status --ch", ["--check"])):
+        monkeypatch.setenv("_AEROLOOP_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", typed)
+        monkeypatch.setenv("COMP_CWORD", str(len(typed.split()) - 1))
+        with pytest.raises(SystemExit):
+            run([])
+        assert capfd.readouterr().out.split() == completed
 
 
 def test_show_config_is_toml_that_names_every_section(capfd: pytest.CaptureFixture[str]) -> None:

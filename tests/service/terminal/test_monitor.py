@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import threading
 from io import StringIO
 
+import pytest
 from rich.console import Console
 
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import (
+    PROTOCOL_VERSION,
+    Description,
+    Event,
+    Percentiles,
+    Status,
+    Telemetry,
+    Truth,
+)
 from aeroloop.protocol.messages.operator import Message
 from aeroloop.service.config import load
-from aeroloop.service.terminal.monitor import SILENT_S, Top
+from aeroloop.service.host.health import SILENT_S
+from aeroloop.service.terminal.monitor import Footer, Top
+from tests.support.zenoh_network import eventually
 
 
-def text(top: Top) -> str:
-    """What a wide terminal would show."""
+def text(top: Top, width: int = 200) -> str:
+    """What a terminal of this width would show."""
     page = StringIO()
-    console = Console(width=200, file=page)
-    console.print(top.draw())
+    console = Console(width=width, file=page)
+    console.print(top.draw(width))
     return page.getvalue()
 
 
@@ -31,6 +43,12 @@ def top_of(**messages: Message) -> Top:
     return top
 
 
+TELEMETRY = Telemetry(
+    session="s", tick=1, counter=1, attitude_error=(0.0, 0.0, 0.008726535), rate_error=(0.0, 0.0, 0.0),
+    desired=(1.0, 0.0, 0.0, 0.0), damping_estimate=(0.0, 0.0, 0.0), voltages=(12.5, -3.0), sign=1,
+)  # fmt: skip
+
+
 def test_an_empty_network_is_shown_as_such() -> None:
     assert "no role" in text(Top())
 
@@ -39,19 +57,15 @@ def test_every_role_of_every_vehicle_is_shown_with_its_state() -> None:
     top = top_of(status__plant=status("plant", "driven"), status__controller=status("controller", "running"))
     top.receive("aeroloop/other/status/plant", status("plant", "tripped").encode())
     shown = text(top)
-    for word in ("aero", "other", "driven", "running", "tripped", "500/s", "7"):
+    for word in ("aero", "other", "driven", "running", "tripped", "500", "7"):
         assert word in shown
 
 
 def test_attitude_error_volts_and_bits_are_shown() -> None:
-    telemetry = Telemetry(
-        session="s", tick=1, counter=1, attitude_error=(0.0, 0.0, 0.008726535), rate_error=(0.0, 0.0, 0.0),
-        desired=(1.0, 0.0, 0.0, 0.0), damping_estimate=(0.0, 0.0, 0.0), voltages=(12.5, -3.0), sign=1,
-    )  # fmt: skip
     half = 2**-0.5
     shown = text(
         top_of(
-            status__controller=status("controller", "running"),
+            status__controller=status("controller", "running").model_copy(update={"session": "s"}),
             description__plant=Description(
                 protocol=PROTOCOL_VERSION,
                 role="plant",
@@ -60,7 +74,7 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
                 versions={},
                 config=load().description(),
             ),
-            telemetry=telemetry,
+            telemetry=TELEMETRY,
             truth=Truth(tick=1, attitude=(half, 0.0, 0.0, half), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0)),
             event=Event(role="plant", kind="tripped", text="no fresh command for 100 ms: 0 V"),
         )
@@ -77,22 +91,114 @@ def test_where_only_changes_are_sent_the_bits_are_those_of_the_frames_that_were(
         )
     )
     for uptime_s, sent in ((1.0, 40), (3.0, 440), (3.1, 441)):  # the last says nothing of a rate
-        report = status("controller", "running").model_copy(update={"uptime_s": uptime_s, "sent": sent, "received": 10})
+        report = status("controller", "running").model_copy(
+            update={"uptime_s": uptime_s, "sent": sent, "received": 10, "session": "s"}
+        )
         top.receive("aeroloop/aero/status/controller", report.encode())
     assert "28.0 + 4.8 kbit/s" in text(top)  # 500 measurements of 7 bytes, 200 commands of 3
-    again = status("controller", "running").model_copy(update={"uptime_s": 0.5, "sent": 3})
+    again = status("controller", "running").model_copy(update={"uptime_s": 0.5, "sent": 3, "session": "s"})
     after = again.model_copy(update={"uptime_s": 1.5, "sent": 103})
     for report in (again, after):  # started anew, and so are its counts
         top.receive("aeroloop/aero/status/controller", report.encode())
     assert "28.0 + 2.4 kbit/s" in text(top)
 
 
-def test_a_role_that_fell_silent_is_shown_so() -> None:
-    top = top_of(status__plant=status("plant", "driven"))
+def aged(top: Top, **ages_s: float) -> Top:
+    """The same view as if some of its messages had been received so long ago."""
     vehicle = top._vehicles["aero"]
-    at, last = vehicle.statuses["plant"]
-    vehicle.statuses["plant"] = at - SILENT_S - 1, last
-    assert "silent" in text(top)
+    for name, age_s in ages_s.items():
+        if name in vehicle.statuses:
+            at, last = vehicle.statuses[name]
+            vehicle.statuses[name] = at - age_s, last
+        else:
+            at, message = getattr(vehicle, name)
+            setattr(vehicle, name, (at - age_s, message))
+    return top
+
+
+def driven(**more: Message) -> Top:
+    """A loop that runs in session s."""
+    names = {"plant": "driven", "controller": "running"}
+    roles = {f"status__{role}": status(role, state) for role, state in names.items()}
+    return top_of(
+        **{name: one.model_copy(update={"session": "s"}) for name, one in roles.items()}, telemetry=TELEMETRY, **more
+    )
+
+
+def test_a_role_that_fell_silent_is_shown_so_with_its_age() -> None:
+    shown = text(aged(driven(), plant=SILENT_S + 1))
+    assert "silent" in shown
+    assert "no status for 4 s, then driven" in shown
+
+
+def test_error_and_voltages_of_a_session_that_is_over_are_not_shown() -> None:
+    assert "+12.5" in text(driven())
+    for plant in (status("plant", "tripped"), status("plant", "driven").model_copy(update={"session": "another"})):
+        top = driven()
+        top.receive("aeroloop/aero/status/plant", plant.encode())
+        assert "12.5" not in text(top)
+        assert "1.00°" not in text(top)
+    for late in ("plant", "telemetry"):
+        assert "12.5" not in text(aged(driven(), **{late: SILENT_S + 1}))
+
+
+def test_an_attitude_that_is_no_longer_published_is_not_shown() -> None:
+    truth = Truth(tick=1, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0))
+    assert "yaw" in text(driven(truth=truth))
+    shown = text(aged(driven(truth=truth), truth=SILENT_S + 1))
+    assert "yaw" not in shown
+    assert "no attitude for 4 s" in shown
+
+
+def test_a_vehicle_without_a_plant_is_marked() -> None:
+    assert "no plant" in text(top_of(status__controller=status("controller", "searching")))
+
+
+def test_sixty_columns_hold_every_figure_and_the_whole_cause() -> None:
+    top = driven()
+    spread = Percentiles(count=1, p50=12345, p99=67890, p999=1, max=1)
+    cause = "no command for 100 ms, the last one at tick 123456, from controller-1234-abcd: 0 V"
+    large = {"latency_us": spread, "cause": cause, "uptime_s": 86400 * 99, "skipped": 1234567}
+    top.receive("aeroloop/aero/status/plant", status("plant", "tripped").model_copy(update=large).encode())
+    shown = text(top, 60)
+    assert max(len(line) for line in shown.splitlines()) <= 60
+    for word in ("12345/67890", "1234567", "99 d", "tripped"):
+        assert word in shown
+    assert cause in " ".join(shown.split())
+
+
+class Plants:
+    """Plants that a footer stops; `stopped` is set when it has."""
+
+    def __init__(self) -> None:
+        self.stopped = threading.Event()
+
+    def stop(self) -> tuple[list[str], list[str]]:
+        """Their answers."""
+        self.stopped.set()
+        return ["aero is at 0 V"], []
+
+
+@pytest.mark.parametrize("keys", ["y", "sn", "snyy", "s\n", "sq"])
+def test_nothing_is_stopped_without_s_and_then_y(keys: str) -> None:
+    footer = Footer(Plants().stop, "aero")
+    assert not any(footer.press(key) for key in keys)
+    message, hint = footer.draw().plain.split("\n")
+    assert message == "" != hint
+
+
+def test_s_and_y_stop_and_say_what_was_answered() -> None:
+    plants = Plants()
+    footer = Footer(plants.stop, "aero")
+    assert not footer.press("s")
+    assert "stop aero? y" in footer.draw().plain
+    assert not footer.press("y")
+    eventually("the answer", lambda: "aero is at 0 V" in footer.draw().plain)
+    assert plants.stopped.is_set()
+
+
+def test_q_quits() -> None:
+    assert Footer(Plants().stop, "aero").press("q")
 
 
 def test_what_is_not_understood_is_left_out() -> None:

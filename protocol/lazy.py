@@ -1,0 +1,26 @@
+"""CasADi and NumPy, imported at their first use: reading a configuration or a message must not wait for them.
+
+They take most of the start of a command such as `aeroloop op stop`, which computes nothing. Modules that settings and
+messages are read with import them from here.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import casadi as casadi
+    import numpy as numpy
+else:
+
+    class _Lazy:
+        def __init__(self, name: str) -> None:
+            self._name = name
+
+        def __getattr__(self, attribute: str) -> Any:
+            value = getattr(import_module(self._name), attribute)
+            setattr(self, attribute, value)  # the next use costs what a module's does
+            return value
+
+    casadi, numpy = _Lazy("casadi"), _Lazy("numpy")

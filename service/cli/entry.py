@@ -1,0 +1,33 @@
+"""First code of the command `aeroloop`: takes ^C over before anything slow is imported.
+
+Until a verb's work begins, and after it ends, ^C ends the process at once, without a traceback. While it works, ^C is a
+KeyboardInterrupt, which cleans up (`common.guarded`); a second one ends the process at once. Daemons and live views
+install handlers of their own.
+"""
+
+from __future__ import annotations
+
+import _signal  # type: ignore[import-not-found]  # what `signal` wraps: it imports enum, during which ^C is a traceback
+import os
+import sys
+
+INTERRUPTED = 130
+"""Exit code after ^C, as of a process that SIGINT ends in a shell."""
+
+
+def end_at_once(*_: object) -> None:
+    """Signal handler: end this process without clean-up, and show the cursor, which a progress bar hides."""
+    if os.isatty(2):
+        os.write(2, b"\x1b[?25h\n")
+    os._exit(INTERRUPTED)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    if _signal.getsignal(_signal.SIGINT) is not _signal.SIG_IGN:  # as in a background job
+        _signal.signal(_signal.SIGINT, end_at_once)
+    from aeroloop.service.cli.main import execute
+    from aeroloop.service.terminal.encoding import replace_what_cannot_be_printed
+
+    replace_what_cannot_be_printed()
+    sys.exit(execute(sys.argv[1:]))

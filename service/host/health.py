@@ -1,0 +1,67 @@
+"""Health of the roles on the network: what is tripped, faulted, silent, late or missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, Literal, NamedTuple
+
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.messages.states import ControllerState, PlantState
+from aeroloop.service.host.operator import Gathered
+
+SILENT_S: Final = 3.0
+"""A role without a new status for this long, three of its periods, is silent [s]."""
+LATE_SHARE: Final = 0.01
+"""A loop that skipped more than this share of its ticks in the last 10 s is late."""
+NEEDED: Final = ("controller", "plant")
+"""Roles that every vehicle needs; a recorder may be absent."""
+
+
+class Trouble(NamedTuple):
+    """Something that is wrong.
+
+    Attributes:
+        kind: tripped (a plant), faulted (a controller), silent (no status for `SILENT_S`, or a process that accepts
+            connections and does not answer), late (more than `LATE_SHARE` of the last 10 s' ticks skipped, or commands
+            that take longer than a period at the 99th percentile), missing (a controller or a plant of a vehicle that
+            has another role).
+        vehicle: Its name; None for a process that does not answer.
+        role: Its role, likewise.
+        text: One line.
+    """
+
+    kind: Literal["tripped", "faulted", "silent", "late", "missing"]
+    vehicle: str | None
+    role: str | None
+    text: str
+
+
+def troubles(found: Gathered) -> list[Trouble]:
+    """Everything that is wrong, by vehicle and role; of one role the gravest."""
+    wrong: list[Trouble] = []
+    for vehicle, roles in sorted(found.statuses.items()):
+        for role in sorted({*roles, *NEEDED}):
+            if role not in roles:
+                wrong.append(Trouble("missing", vehicle, role, f"{vehicle} has no {role}"))
+            else:
+                wrong += list(_of_role(vehicle, role, roles[role]))[:1]
+    return wrong + [Trouble("silent", None, None, line) for line in found.silent]
+
+
+def _of_role(vehicle: str, role: str, status: Status) -> Iterator[Trouble]:
+    name = f"{vehicle}'s {role}"
+    if status.age_s > SILENT_S:
+        yield Trouble("silent", vehicle, role, f"{name}: no status for {status.age_s:.0f} s")
+    if status.state == PlantState.TRIPPED:
+        yield Trouble("tripped", vehicle, role, f"{name} tripped: {status.cause}; `aeroloop op arm` arms it")
+    if status.state == ControllerState.FAULTED:
+        yield Trouble("faulted", vehicle, role, f"{name} faulted; `aeroloop op arm` lets it claim again")
+    period = status.timing.recent_period if status.timing else None
+    if period is None:
+        return
+    if status.recent_skipped > LATE_SHARE * period.count:
+        yield Trouble("late", vehicle, role, f"{name} is late: {status.recent_skipped} ticks skipped in the last 10 s")
+    if status.recent_latency_us and status.recent_latency_us.p99 > period.p50:
+        took, due = status.recent_latency_us.p99, period.p50
+        text = f"{name} is late: commands take {took:.0f} µs at the 99th percentile, and a period is {due:.0f} µs"
+        yield Trouble("late", vehicle, role, text)

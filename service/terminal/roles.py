@@ -1,0 +1,101 @@
+"""Roles of a vehicle as `op status` and `op top` draw them: a table, and a line for each cause and note.
+
+What is silent is dimmed, and marked with the age of its last status. The table fits in 60 columns; at `WIDE`, more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from rich.console import Group
+from rich.table import Column, Table
+from rich.text import Text
+
+from aeroloop.protocol.messages.models import Percentiles, Status
+from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
+from aeroloop.service.host.operator import Gathered
+from aeroloop.service.terminal.console import Console
+
+WIDE: Final = 90
+"""Columns of the terminal from which on all columns of the table are drawn."""
+GOOD, BAD, WAITING, STALE = "green", "bold red", "yellow", "dim"
+_STYLES: Final = {"running": GOOD, "driven": GOOD, "recording": GOOD, "tripped": BAD, "faulted": BAD}
+
+
+def roles_view(statuses: Mapping[str, tuple[float, Status]], width: int) -> Group:
+    """The roles of one vehicle, for a terminal of this width.
+
+    Args:
+        statuses: By role: the age of its status [s], and the status.
+        width: Columns of the terminal.
+    """
+    wide = width >= WIDE
+    titles = ["rate\n1/s", "skipped\nticks", "latency\np50/p99 µs"]
+    titles += ["answers in\np50/p99 µs", "wake-up\np50/p99 µs"] if wide else []
+    numbers = (Column(title, justify="right", no_wrap=True) for title in (*titles, "up"))
+    table = Table(Column("role", no_wrap=True), "state", *numbers, box=None, pad_edge=False, header_style="dim")
+    lines: list[Text] = []
+    for role, (age, status) in sorted(statuses.items()):
+        silent = age > SILENT_S
+        state = Text("silent", style=BAD) if silent else Text(status.state, style=_STYLES.get(status.state, WAITING))
+        wake = status.timing.recent_wake if status.timing else None
+        table.add_row(
+            role,
+            state,
+            f"{status.rate_hz:.0f}",
+            str(status.skipped),
+            *(_p50_p99(spread) for spread in (status.latency_us, status.age_us, wake)[: 3 if wide else 1]),
+            duration(status.uptime_s),
+            style=STALE if silent else "",
+        )
+        lines += _lines(role, age, status, silent)
+    lines += [Text(f"no {role}", style=WAITING) for role in NEEDED if role not in statuses]
+    return Group(table, *lines)
+
+
+def status_view(found: Gathered) -> None:
+    """Print every vehicle's roles, as gathered."""
+    console = Console()
+    for i, (vehicle, roles) in enumerate(sorted(found.statuses.items())):
+        console.print(*([""] if i else []), Text(vehicle, style="bold"), sep="\n")
+        console.print(roles_view({role: (status.age_s, status) for role, status in roles.items()}, console.width))
+
+
+def troubles_view(found: Gathered) -> None:
+    """Print a line for each trouble; without any, one for each vehicle."""
+    console, wrong = Console(), troubles(found)
+    for trouble in wrong:
+        console.print(Text(trouble.text, style=BAD), soft_wrap=True)
+    for vehicle, roles in sorted(found.statuses.items()) if not wrong else []:
+        states = ", ".join(f"{role} {status.state}" for role, status in sorted(roles.items()))
+        console.print(Text(f"{vehicle} is well: {states}", style=GOOD), soft_wrap=True)
+
+
+def _lines(role: str, age: float, status: Status, silent: bool) -> Iterator[Text]:
+    if silent:
+        yield Text(f"{role}: no status for {duration(age)}, then {status.state}", style=BAD)
+    if status.cause:
+        yield Text(f"{role}: {status.cause}", style=_STYLES.get(status.state, WAITING))
+    for note in status.notes:
+        yield Text(f"{role}: {note}", style=WAITING)
+    for fault in status.faults:
+        begins, ends = fault.begin_tick, fault.end_tick
+        if begins is not None and begins < status.ticks and (ends is None or status.ticks <= ends):
+            yield Text(f"{role}: {fault.fault} ({fault.source}): {fault.changed} {fault.effect}", style=BAD)
+    if status.gains is not None:
+        gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in status.gains if gain)
+        yield Text(f"{role}: reference {status.reference} ({status.reference_from})")
+        yield Text(f"{role}: gains {gains} ({status.gains_from})")
+
+
+def duration(seconds: float) -> str:
+    """A duration in the unit that leaves two or three digits."""
+    for unit, name in ((86400, "d"), (3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.0f} {name}"
+    return f"{seconds:.0f} s"
+
+
+def _p50_p99(spread: Percentiles | None) -> str:
+    return f"{spread.p50:.0f}/{spread.p99:.0f}" if spread else "–"
