@@ -84,7 +84,7 @@ def certify(
 
 
 class RecordedRun(NamedTuple):
-    """The longest session of a log.
+    """A session of a log.
 
     Attributes:
         settings: Configuration of the run.
@@ -102,15 +102,17 @@ class RecordedRun(NamedTuple):
         return self.ticks.k * self.settings.loop.period
 
 
-def read_run(*paths: Path | str) -> RecordedRun:
-    """Read the longest session of a log as arrays.
+def read_run(*paths: Path | str, session: str | None = None, vehicle: str | None = None) -> RecordedRun:
+    """Read a session of a log as arrays.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
+        session: Its name, or its number from 1 in the order of recording; the longest if None.
+        vehicle: Its vehicle; that of the longest session if None.
 
     Raises:
-        AeroloopError: Not a log, or one without a session.
+        AeroloopError: Not a log, several unrelated runs, or no such session.
     """
     blocks: list[Ticks] = []
-    read = review.read(*map(Path, paths), watch=blocks.append)
+    read = review.read(*map(Path, paths), session=session, vehicle=vehicle, watch=blocks.append)
     return RecordedRun(read.session.settings, read.figures, Ticks.joined(blocks))

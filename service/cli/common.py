@@ -50,6 +50,7 @@ BitsOut = Annotated[
 ]
 BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files; never a log.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Log only warnings and errors.")]
 LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="Format of the log lines on stderr.")]
 WithParent = Annotated[int, typer.Option("--with-parent", metavar="PID", help="End with this process.", hidden=True)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Json, checked, fail, guarded
+from aeroloop.service.cli.common import Force, Json, checked, fail, guarded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +31,7 @@ def compare(
             show_default=False,
         ),
     ] = None,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Compare the figures and the configurations of several runs, side by side."""
@@ -40,6 +41,8 @@ def compare(
         fail("log compare takes two logs or more", 2)
     with checked():
         limits = [Limit.parse(text) for text in require or []]
+    if html is not None:
+        check_page(html, logs, force)
 
     from aeroloop.service.review.compare import Comparison, broken_limits, read_runs
     from aeroloop.service.terminal.display import share_bar
@@ -49,7 +52,7 @@ def compare(
         with share_bar("reading", hidden=json) as update:
             reports = read_runs(logs, limits, update)
         if html is not None:
-            write_html(reports, html)
+            write_html(reports, html, logs, force)
     if json:
         typer.echo(Comparison.of(reports).model_dump_json(indent=2))
     else:
@@ -58,9 +61,19 @@ def compare(
         fail("; ".join(broken), 1)
 
 
-def write_html(reports: Sequence[Report], out: Path) -> None:
+def check_page(out: Path, logs: Sequence[Path], force: bool) -> None:
+    """Check, before the logs are read, that their page may be written; else the command ends."""
+    from aeroloop.service.logs.outputs import check_output
+
+    with guarded():
+        check_output(out, logs, force=force)
+
+
+def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
     """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
+    from aeroloop.service.logs.outputs import writing
     from aeroloop.service.report.page.page import write_page
 
-    write_page(reports, out)
+    with writing(out, logs, force=force) as part:
+        write_page(reports, part)
     typer.echo(f"aeroloop: wrote {out}", err=True)

@@ -13,6 +13,7 @@ from aeroloop.service.cli.common import (
     BitsOut,
     Config,
     Duration,
+    Force,
     Json,
     Overrides,
     checked,
@@ -146,6 +147,7 @@ def burden(
     figure: Annotated[
         Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
     ] = None,
+    force: Force = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
     json: Json = False,
     config: Config = None,
@@ -162,14 +164,17 @@ def burden(
     with checked():
         if figure is not None:
             from aeroloop.service.lab.burden_figure import check_path
+            from aeroloop.service.logs.outputs import check_output
 
             check_path(figure)
+            check_output(figure, [config], force=force)
         cells = grid(settings, bits or (), quantizer or (), sensors or ())
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = measure_burden(settings, cells, duration, update)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else burden_table)
     if figure is not None:  # last: a full disk must not cost the table
         from aeroloop.service.lab.burden_figure import draw_burden
+        from aeroloop.service.logs.outputs import writing
 
-        with guarded():
-            draw_burden(result, figure)
+        with guarded(), writing(figure, [config], force=force) as part:
+            draw_burden(result, part)

@@ -10,6 +10,7 @@ import typer
 from aeroloop.service.cli.common import (
     Config,
     DaemonOptions,
+    Force,
     Json,
     Overrides,
     checked,
@@ -19,7 +20,7 @@ from aeroloop.service.cli.common import (
     settings_of,
     show,
 )
-from aeroloop.service.cli.compare import Html, compare, write_html
+from aeroloop.service.cli.compare import Html, check_page, compare, write_html
 
 if TYPE_CHECKING:
     from threading import Event
@@ -29,6 +30,11 @@ if TYPE_CHECKING:
     from aeroloop.service.logs.ticks import Ticks
 
 Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)]
+
+Vehicle = Annotated[
+    str | None,
+    typer.Option("--vehicle", metavar="NAME", help="Vehicle; the longest session's if left out.", show_default=False),
+]
 
 group = typer.Typer(no_args_is_help=True, help="Review, compare, replay, recover and export logs; view a live loop.")
 
@@ -48,7 +54,13 @@ def review(
             show_default=False,
         ),
     ] = None,
+    session: Annotated[
+        str | None,
+        typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.", show_default=False),
+    ] = None,
+    vehicle: Vehicle = None,
     html: Html = None,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Compute every figure of a run from its logs, check limits, and draw the paper's figures."""
@@ -56,7 +68,10 @@ def review(
 
     with checked():
         limits = [Limit.parse(text) for text in require or []]
+    if html is not None:
+        check_page(html, logs, force)
 
+    from aeroloop.service.logs.outputs import writing_into
     from aeroloop.service.review.review import read
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import review_account
@@ -64,16 +79,18 @@ def review(
     kept: list[Ticks] = []
     with guarded():
         with share_bar("reading", hidden=json) as update:
-            judged = read(*logs, watch=None if figures is None else kept.append, progress=update)
+            watch = None if figures is None else kept.append
+            judged = read(*logs, session=session, vehicle=vehicle, watch=watch, progress=update)
         report = judged.report(limits)
         if figures is not None:
             from aeroloop.service.report.plots import draw_figures, draw_theorem
 
-            drawn = draw_figures(judged.session.settings, kept, figures)
-            for path in [*drawn, *draw_theorem(report, figures)]:
-                typer.echo(f"aeroloop: drew {path}", err=True)
+            with writing_into(figures, logs, force=force) as folder:
+                drawn = [*draw_figures(judged.session.settings, kept, folder), *draw_theorem(report, folder)]
+            for path in drawn:
+                typer.echo(f"aeroloop: drew {figures / path.name}", err=True)
         if html is not None:
-            write_html([report], html)
+            write_html([report], html, logs, force)
         findings = report.findings
     show(findings, json, review_account)
     broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
@@ -113,6 +130,7 @@ def replay(
 def recover(
     broken: Annotated[Path, typer.Argument(help="A log that was cut or damaged; it is not changed.")],
     out: Annotated[Path, typer.Argument(help="The new file.")],
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Copy the whole records of a broken log into a new log and report what was lost."""
@@ -125,7 +143,7 @@ def recover(
             typer.echo(f"not recovered, {line}")
 
     with guarded(), share_bar("recovering", hidden=json) as update:
-        recovery = recover(broken, out, update)
+        recovery = recover(broken, out, update, force=force)
     show(recovery, json, account)
 
 
@@ -163,8 +181,10 @@ def export(
     ] = None,
     session: Annotated[
         str | None,
-        typer.Option("--session", metavar="NAME|all", help="The longest session if left out.", show_default=False),
+        typer.Option("--session", metavar="N|NAME|all", help="The longest session if left out.", show_default=False),
     ] = None,
+    vehicle: Vehicle = None,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Write a log as a table with a row per tick or, with --to mcap, as a log with every message decoded."""
@@ -180,5 +200,5 @@ def export(
             typer.echo(f"not read, {line}")
 
     with guarded(), share_bar("exporting", hidden=json) as update:
-        exported = export(logs, to, out, session=session, progress=update)
+        exported = export(logs, to, out, session=session, vehicle=vehicle, force=force, progress=update)
     show(exported, json, account)

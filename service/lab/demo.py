@@ -84,7 +84,7 @@ def run_demo(
     Args:
         settings: The configuration; the rendezvous is replaced by a free one.
         duration_s: Length on the law's clock [s].
-        log: Path of the log; None for a new file in the recorder's directory.
+        log: Path of the log, or a folder for it; None for the recorder's.
         show: Called ten times a second with the progress.
 
     Returns:
@@ -94,7 +94,9 @@ def run_demo(
         ProcessGroupError: A process did not start, or failed, or the log exists.
         ReviewError: The log cannot be reviewed.
     """
-    path = log or settings.recorder.directory / datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
+    path = log or settings.recorder.directory
+    if log is None or log.is_dir():
+        path /= datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
     settings = standalone(settings, path, duration_s=duration_s)
     progress = Progress(settings)
     interrupted = threading.Event()

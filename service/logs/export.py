@@ -5,8 +5,8 @@ A table has the ticks that a review judges: both use `TickReader`. Each block is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final, Literal
@@ -18,7 +18,8 @@ from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.host_facts import versions
 from aeroloop.service.config import ConfigError, Settings
-from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
+from aeroloop.service.logs.files import LogFiles, Progress
+from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.runs import Block, Run, Taker
 from aeroloop.service.logs.table import Rows, TruthColumns, groups
 from aeroloop.service.logs.table_files import FILES, ExportError, TableFile
@@ -50,6 +51,8 @@ def export(
     out: Path | None = None,
     *,
     session: str | None = None,
+    vehicle: str | None = None,
+    force: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
     """Write a run's ticks as a table, or all of it as a log with everything decoded.
@@ -57,28 +60,31 @@ def export(
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         to: Format.
-        out: The file, which must not exist; the first log's name with another ending if None.
-        session: Name of a session, alone or as `vehicle/session`; `all`; the longest session if None.
+        out: The file; the first log's name with another ending if None.
+        session: Name or number of a session, as of `Run.choose`; `all` of the vehicle; the longest if None.
+        vehicle: Its vehicle; that of the longest session if None.
+        force: Replace an existing file, unless it is a log.
         progress: Called repeatedly with the share done, 0…1.
 
     Raises:
-        ExportError: There is nothing to export, or it cannot be written.
+        ExportError: There is nothing to export.
+        OutputError: The file must not be written, or cannot.
         ReviewError: The log cannot be read.
     """
     out = out or beside(paths[0], ENDINGS[to])
     sessions: list[str] | None = None
     try:
-        with writing(out) as part:
+        with writing(out, paths, force=force) as part:
             if to == "mcap":
                 from aeroloop.service.logs.decoded_log import write_decoded
 
-                if session is not None:
+                if session is not None or vehicle is not None:
                     raise ExportError(
-                        "--session chooses the rows of a table; --to mcap writes the log with all its sessions"
+                        "--session and --vehicle choose the rows of a table; --to mcap writes the log with all of them"
                     )
                 rows, columns, damages = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
             else:
-                sessions, rows, columns, damages = _table(paths, to, part, session, progress)
+                sessions, rows, columns, damages = _table(paths, to, part, session, vehicle, progress)
             size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
@@ -86,26 +92,38 @@ def export(
 
 
 def _table(
-    paths: Sequence[Path], to: Format, part: Path, session: str | None, progress: Progress | None
+    paths: Sequence[Path],
+    to: Format,
+    part: Path,
+    session: str | None,
+    vehicle: str | None,
+    progress: Progress | None,
 ) -> tuple[list[str], int, list[str], list[str]]:
     """Write a table; returns its sessions, number of rows and columns' names, and what could not be read."""
     run = Run(paths, progress)
-    chosen = _chosen(run, session)
-    settings = run.files.settings(chosen[0][0])
+    first = run.choose(None if session == ALL else session, vehicle)
+    chosen = run.sessions_of(first[0]) if session == ALL else [first]
+    settings = run.settings(first)
     table = groups(settings.wire, settings.loop.period)
     names = ["/".join(which) for which in chosen]
     facts = {
         "config": settings.description(),
         "sessions": names,
         "logs": [str(path) for path in run.files.paths],
-        "recorded_by": {role: found.versions for (_, role), found in run.files.descriptions.items()},
+        "recorded_by": {role: found.versions for role, found in run.described(first).items()},
         "exported_by": versions(),
     }
     file = FILES[to](part, table, facts)
-    writers = {which: _Writer(which, file, run.files.settings(which[0])) for which in chosen}
+    writers = {which: _Writer(which, file, run.settings(which)) for which in chosen}
+
+    malformed = Counter[str]()
 
     def truth(vehicle: str, payload: bytes, _: int) -> None:
-        true = Truth.model_validate_json(payload)
+        try:
+            true = Truth.model_validate_json(payload)
+        except ValidationError:  # a stranger may publish anything
+            malformed[vehicle] += 1
+            return
         writer = writers.get((vehicle, true.session or ""))
         if writer is not None and true.session_tick is not None:
             writer.truths.append((true.session_tick, *true.attitude, *true.rate, *true.voltages))
@@ -113,16 +131,14 @@ def _table(
     def route(address: Address) -> Taker | None:
         return partial(truth, address.vehicle) if address.topic.name == "truth" else None
 
-    try:
-        for block in run.read(chosen, route):
-            writers[block.which].take(block)
-    except ValidationError as error:
-        raise ReviewError(f"{run.files.name} is not a log of this version: {str(error).splitlines()[0]}") from None
+    for block in run.read(chosen, route):
+        writers[block.which].take(block)
     rows = sum(writer.rows for writer in writers.values())
     if not rows:
         raise ExportError(f"{run.files.name} has no answered measurement to export")
     file.close()
-    return names, rows, [column.name for group in table for column in group.columns], run.files.unread
+    damages = [*run.files.unread, *([f"malformed: {malformed.total()} of truth"] if malformed else [])]
+    return names, rows, [column.name for group in table for column in group.columns], damages
 
 
 class _Writer:
@@ -134,10 +150,14 @@ class _Writer:
         self._which = which
         self._file = file
         self._actuators = settings.wire.actuators
+        self._lockstep = settings.loop.lockstep
         self._reader = TickReader(settings)
 
     def take(self, block: Block) -> None:
         judged = self._reader.take(block).judged
+        if self._lockstep:  # the plant waits for each command
+            unknown = np.full(len(judged.k), np.nan)
+            judged = judged._replace(latency_ns=unknown, measurement_delay_ns=unknown, command_delay_ns=unknown)
         if len(judged.k):
             self._file.write(Rows(*self._which, judged, self._true_at(judged.k)))
             self.rows += len(judged.k)
@@ -158,33 +178,3 @@ def beside(log: Path, ending: str) -> Path:
         log = log.resolve()  # "." has no name
         return log.with_name(log.name + ending)
     return log.with_name(log.stem + ending)
-
-
-@contextmanager
-def writing(out: Path) -> Iterator[Path]:
-    """Temporary path of a new file: renamed on success, removed on failure.
-
-    Raises:
-        ExportError: It exists, or cannot be written.
-    """
-    if out.exists():
-        raise ExportError(f"{out} exists already; name another file with --out")
-    part = out.with_name(f"{out.name}.part")
-    try:
-        yield part
-        part.rename(out)
-    except OSError as error:
-        raise ExportError(f"cannot write {out}: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _chosen(run: Run, session: str | None) -> list[SessionKey]:
-    known = [which for which, extent in run.extents.items() if extent.rows["controller"]]
-    if session is None:
-        return [run.longest]
-    chosen = [which for which in known if session in (ALL, which[1], "/".join(which))]
-    if not chosen:
-        names = ", ".join("/".join(which) for which in known[:5]) + (", …" if len(known) > 5 else "")
-        raise ExportError(f"{run.files.name} has no session {session!r} with a tick; it has {names}")
-    return chosen

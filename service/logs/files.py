@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mcap.records import Channel, Message, Metadata
+from mcap.records import Channel
 
-from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
+from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.service.config import Settings, from_description
-from aeroloop.service.logs.mcap_file import (
-    CHANGE_METADATA,
-    DESCRIPTION_METADATA,
-    Damage,
-    Logged,
-    NotMcapError,
-    messages,
-    records,
-    skim,
-)
-from aeroloop.service.logs.traces import SessionKey
+from aeroloop.service.logs.mcap_file import Damage, Logged, messages
+from aeroloop.service.logs.prelude import Prelude, ReviewError, address_of
+from aeroloop.service.logs.traces import SessionKey, identified
+
+__all__ = ["LogFiles", "Progress", "ReviewError"]
 
 Progress = Callable[[float], None]
 
 T = TypeVar("T")
-
-
-class ReviewError(AeroloopError):
-    """A log cannot be reviewed; one line with the reason."""
 
 
 class LogFiles:
@@ -51,7 +38,7 @@ class LogFiles:
         metadata: Other metadata, by name without prefix (`aeroloop.recorder` is `recorder`); the last of each.
 
     Raises:
-        ReviewError: There is no log, it cannot be read, or it has another version of the protocol.
+        ReviewError: There is no log, it cannot be read, has another version of the protocol, or is of another run.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -60,33 +47,14 @@ class LogFiles:
         self.changes: dict[SessionKey, list[Change]] = {}
         self.damages: dict[Path, list[Damage]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
-        starts = {path: self._prelude(path) for path in _files(paths)}
-        self.paths = sorted(starts, key=lambda path: starts[path])
-        if not self.descriptions:  # a damaged one may have a copy; if none can be read, the version differs
-            for path, damages in self.damages.items():
-                for damage in damages:
-                    if DESCRIPTION_METADATA in damage.what:
-                        raise ReviewError(f"{path} is not a log of this version: {damage.what}")
+        preludes = {path: Prelude(path) for path in _files(paths)}
+        self.paths = sorted(preludes, key=lambda path: preludes[path].begins_ns)
+        for path in self.paths:
+            self._add(path, preludes[path])
         self._size = sum(path.stat().st_size for path in self.paths)
-
-    def settings(self, vehicle: str) -> Settings:
-        """The configuration of a vehicle's controller if the logs have it, else its plant's.
-
-        Raises:
-            ReviewError: They have neither.
-            ConfigError: It is not of this version.
-        """
-        for role in ("controller", "plant"):
-            if description := self.descriptions.get((vehicle, role)):
-                return from_description(description.config)
-        raise ReviewError(
-            f"{self.name} has no description of {vehicle}'s controller or plant: its frames cannot be read"
-        )
-
-    def plant(self, vehicle: str) -> PlantSettings:
-        """The plant's own configuration if the logs have it, else what the controller assumed. Raises as `settings`."""
-        description = self.descriptions.get((vehicle, "plant"))
-        return self.settings(vehicle).plant if description is None else from_description(description.config).plant
+        recordings = {path: preludes[path].recording or path for path in self.paths}
+        if len(set(recordings.values())) > 1:
+            self._check_that_all_are_of_one_run(recordings)
 
     @property
     def name(self) -> str:
@@ -114,70 +82,60 @@ class LogFiles:
             damages: list[Damage] = []
             yield from messages(path, wanted, damages, report)
             read += path.stat().st_size
-            if damages:
-                self.damages[path] = damages
+            if damages:  # reading again finds the same
+                self.damages[path] = list(dict.fromkeys([*self.damages.get(path, ()), *damages]))
 
     @property
     def unread(self) -> list[str]:
         """What could not be read, a line each."""
         return [f"{path}: {damage.what}" for path, found in self.damages.items() for damage in found]
 
-    def _prelude(self, path: Path) -> int:
-        """Collect descriptions and other metadata; returns when the first message was recorded [ns]."""
-        first = 0
-        descriptions: set[int] = set()
-        damages: list[Damage] = []
-        try:
-            for record in skim(path, _is_description) or records(path, damages):
-                if isinstance(record, Message):
-                    first = first or record.log_time
-                    if record.channel_id in descriptions:
-                        self._add_description(record.data, path)
-                elif isinstance(record, Channel) and _is_description(record.topic):
-                    descriptions.add(record.id)
-                elif isinstance(record, Metadata):
-                    try:
-                        self._add_metadata(record, path)
-                    except (ValueError, KeyError) as error:
-                        damages.append(Damage(0, f"metadata {record.name}: {str(error).splitlines()[0]}"))
-        except NotMcapError as error:
-            raise ReviewError(f"{error}, so it is no log") from None
-        except OSError as error:
-            raise ReviewError(f"cannot read {path}: {error.strerror}") from None
-        except (ValueError, KeyError) as error:
-            raise ReviewError(f"{path} is not a log of this version: {str(error).splitlines()[0]}") from None
-        if damages:
+    def _add(self, path: Path, prelude: Prelude) -> None:
+        """Add what a file holds beside its traces. Raises ReviewError if it has none but unreadable descriptions."""
+        found = prelude.descriptions()
+        if prelude.unreadable and not found:
+            raise ReviewError(f"{path} is not a log of this version: {prelude.unreadable[0]}")
+        for which, copies in found.items():
+            self.descriptions[which] = copies[-1]
+            self.first_descriptions.setdefault(which, copies[0])
+        for which, changes in prelude.changes.items():
+            known = self.changes.setdefault(which, [])
+            known += [change for change in changes if change not in known]  # every file of a rotated run repeats it
+        self.metadata |= prelude.metadata
+        if damages := [
+            *prelude.damages,
+            *(Damage(0, f"a description: {text}") for text in dict.fromkeys(prelude.unreadable)),
+        ]:
             self.damages[path] = damages
-        return first
 
-    def _add_metadata(self, record: Metadata, path: Path) -> None:
-        text = record.metadata.get("json", "{}")
-        if record.name == DESCRIPTION_METADATA:
-            self._add_description(text.encode(), path)
-        elif record.name == CHANGE_METADATA:
-            change, address = Change.model_validate_json(text), topics.read_key(record.metadata["key"])
-            known = self.changes.setdefault((address.vehicle if address else "", change.session), [])
-            if change not in known:  # every file of a rotated run repeats it
-                known.append(change)
-        elif record.name.startswith("aeroloop."):
-            content = json.loads(text)
-            self.metadata[record.name.removeprefix("aeroloop.")] = content if isinstance(content, dict) else {}
+    def _check_that_all_are_of_one_run(self, recordings: Mapping[Path, Hashable]) -> None:
+        """Check that files of different recordings have traces of the same processes or sessions.
 
-    def _add_description(self, text: bytes, path: Path) -> None:
-        content = json.loads(text)
-        old = isinstance(content, dict) and content.keys() <= Description.model_fields.keys() - {"protocol"}
-        if old or content["protocol"] != PROTOCOL_VERSION:
-            version = 1 if old else content["protocol"]
-            written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
-            raise ReviewError(f"{path} is a log of protocol version {version}; read it with {written_by} wrote it")
-        description = Description.model_validate(content)
-        self.descriptions[description.vehicle, description.role] = description
-        self.first_descriptions.setdefault((description.vehicle, description.role), description)
+        Why: a recorder that was restarted goes on in a file of its own, but unrelated runs must not be mixed.
 
-
-def _is_description(key: str) -> bool:
-    address = topics.read_key(key)
-    return address is not None and address.topic.name == "description"
+        Raises:
+            ReviewError: They do not.
+        """
+        runs: list[tuple[set[Hashable], list[Path]]] = []
+        for path in self.paths:
+            marks: set[Hashable] = set()
+            for found in messages(path, lambda channel: address_of(channel.topic, "trace")):
+                if known := identified(found.answer.vehicle, found.data):
+                    source, header = known
+                    marks |= {source, (source.vehicle, header.session)} if header.session else {source}
+            if not marks:
+                continue  # it has no trace to be mixed with others
+            marks.add(recordings[path])
+            related = [run for run in runs if run[0] & marks]
+            runs = [run for run in runs if run not in related]
+            runs.append((marks.union(*(run[0] for run in related)), [*chain(*(run[1] for run in related)), path]))
+        if len(runs) > 1:
+            names = [f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}" for _, files in runs]
+            some = "; ".join(names[:8]) + ("; …" if len(names) > 8 else "")
+            raise ReviewError(
+                f"these are {len(runs)} unrelated runs ({some}): name one of them, or see them side by side with "
+                "`aeroloop log compare`"
+            )
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:

@@ -14,7 +14,7 @@ from typing import BinaryIO
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
 
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES, Damage, records
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, DESCRIPTION_METADATA, Damage, records
 
 Follow = Callable[[Message], None]
 """Called with each message of a channel after it was copied."""
@@ -35,7 +35,7 @@ class McapCopy:
         self._schemas: dict[Hashable, int] = {}
         self._channels: dict[Hashable, int] = {}
         self._attachments: set[Hashable] = set()
-        self._metadata: dict[Hashable, dict[str, str]] = {}  # the last of each name and key
+        self._metadata: dict[tuple[str, str | None], dict[str, str]] = {}  # the last of each name and key
         self._writer.start(profile="aeroloop", library=library)
 
     def file(
@@ -108,5 +108,8 @@ class McapCopy:
         return self._channels[what]
 
     def finish(self) -> None:
-        """Write the index. Nothing more can be added."""
+        """Write the last descriptions again, as the recorder does, and the index. Nothing more can be added."""
+        for (name, _), entries in self._metadata.items():
+            if name == DESCRIPTION_METADATA:
+                self._writer.add_metadata(name, entries)
         self._writer.finish()

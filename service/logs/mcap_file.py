@@ -5,8 +5,9 @@ and reports it. A file cut at any byte yields all that was complete before the c
 reading resumes after a damaged record. `messages` is fast: it parses a few channels and skips the others. `skim` reads
 metadata and a few topics by the index.
 
-Memory is bounded: a record over `MAX_RECORD` or a chunk over `MAX_CHUNK` is damage, and so is a chunk of another size
-than it claims.
+Memory and time are bounded by the file's size: damage is a record over `MAX_RECORD`, a chunk that claims over
+`MAX_CHUNK` or another size than it has, and one that is compressed beyond `MAX_RATIO` when `DENSE_BYTES` are used up.
+Of a chunk, the first record that cannot be read is damage, and no later one is read.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import BinaryIO, Final, Generic, NamedTuple, TypeVar
 
 import lz4.frame
 import zstandard
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Metadata, MetadataIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
@@ -37,7 +38,10 @@ CHANGE_METADATA: Final = "aeroloop.change"
 """Name of a metadata record with a change in force when the file began: a Change as JSON, and its key."""
 
 RECORDER_METADATA: Final = "aeroloop.recorder"
-"""Name of the metadata record about the file itself: its run, its part, when it was begun."""
+"""Name of the metadata record about the file itself: its run, the recording's identity, its part, its beginning."""
+
+CHECKSUM: Final = "crc32"
+"""Entry of a metadata record with the checksum of the others: outside of chunks, MCAP has none."""
 
 CHUNK_BYTES: Final = 64 * 1024
 """A 64 KiB chunk compresses in under 3 ms; the writer's default of 1 MiB takes 39 ms at once."""
@@ -45,8 +49,17 @@ CHUNK_BYTES: Final = 64 * 1024
 MAX_CHUNK: Final = 64 << 20
 """Bytes that a chunk may hold, uncompressed."""
 
-MAX_RECORD: Final = 256 << 20
-"""Bytes of one record, or of a whole index."""
+MAX_RATIO: Final = 100
+"""Times its compressed bytes that a chunk may hold; ours compress to a tenth."""
+
+DENSE_BYTES: Final = 64 << 20
+"""Bytes that all chunks beyond `MAX_RATIO` may hold together: zeros on the network must not cost the log."""
+
+MAX_RECORD: Final = 72 << 20
+"""Bytes of one record: a chunk that does not compress, and its head."""
+
+MAX_INDEX: Final = 16 << 20
+"""Bytes of a whole index; a larger one is not used. An hour's has 1 MB."""
 
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_AND_ID: Final = struct.Struct("<BQH")  # schemas, channels and messages begin with an id
@@ -115,7 +128,7 @@ def records(
                 record = _parsed(data[start:end])
             except _MALFORMED as error:
                 damages.append(Damage(offset, f"a record cannot be read: {error}"))
-                continue
+                break
             if isinstance(record, Channel):
                 described[record.id] = True
             elif isinstance(record, Message):
@@ -148,8 +161,8 @@ def messages(
                 start = at
                 opcode, length, identifier = head_of(data, start)
                 at += _HEAD.size + length
-                if at > size:
-                    raise struct.error("it is longer than its chunk")
+                if at > size or not opcode:
+                    raise struct.error("it is longer than its chunk" if opcode else "it has no kind")
                 if opcode == _MESSAGE_OPCODE:
                     if identifier not in answers:
                         if identifier not in channels:
@@ -189,13 +202,14 @@ def skim(path: Path, wanted: Callable[[str], bool]) -> list[McapRecord] | None:
         found: list[McapRecord] = [record for record in index if isinstance(record, (Schema, Channel))]
         ids = {record.id for record in found if isinstance(record, Channel) and wanted(record.topic)}
         found += [_parsed(_at(file, place, Opcode.METADATA)) for place in sorted(places)]
-        first = True
+        first, room = True, DENSE_BYTES
         for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
             if not first and ids.isdisjoint(chunk.message_index_offsets):
                 continue
             block = _at(file, chunk.chunk_start_offset, Opcode.CHUNK)
             with suppress(*_MALFORMED):
-                data = _plain(block)
+                data = _plain(block, room)
+                room -= len(data) if len(data) > MAX_RATIO * len(block) else 0
                 for opcode, start, end in _scan(data, 0, []):
                     if opcode == Opcode.MESSAGE and (first or _HEAD_AND_ID.unpack_from(data, start)[2] in ids):
                         found.append(_parsed(data[start:end]))
@@ -224,7 +238,7 @@ def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] |
         starts = sorted(
             int.from_bytes(record[_STARTS[opcode] :][:8], "little") for opcode, record in index if opcode in _STARTS
         )
-        chunked = False
+        chunked, room = False, DENSE_BYTES
         for offset, opcode, block in _blocks(file, starts, damages):
             if opcode != Opcode.CHUNK:
                 if chunked and opcode in _IN_CHUNKS:  # a flipped bit turns a message index into this
@@ -234,9 +248,12 @@ def _pieces(path: Path, damages: list[Damage], progress: Callable[[int], None] |
                 continue
             chunked = True
             try:
-                yield offset, _plain(block)
+                data = _plain(block, room)
             except _MALFORMED as error:
-                damages.append(Damage(offset, f"a chunk cannot be read: {str(error).splitlines()[0]}"))
+                damages.append(Damage(offset, f"a chunk cannot be read: {error}"))
+            else:
+                room -= len(data) if len(data) > MAX_RATIO * len(block) else 0
+                yield offset, data
             if progress is not None:
                 progress(file.tell())
 
@@ -288,7 +305,7 @@ def _index(file: BinaryIO) -> list[tuple[int, bytes]]:
     file.seek(end)
     footer = file.read(_END)
     opcode, _, start, _, checksum = _FOOTER.unpack_from(footer)
-    if opcode != Opcode.FOOTER or footer[_FOOTER.size :] != MAGIC or not 0 < start <= end or end - start > MAX_RECORD:
+    if opcode != Opcode.FOOTER or footer[_FOOTER.size :] != MAGIC or not 0 < start <= end or end - start > MAX_INDEX:
         return []
     file.seek(start)
     data = file.read(end - start)
@@ -320,15 +337,23 @@ def _at(file: BinaryIO, offset: int, opcode: int) -> bytes:
     return head + file.read(length)
 
 
-def _plain(block: bytes) -> bytes:
-    """The records that a chunk holds, decompressed and checked. Raises one of `_MALFORMED` if it is damaged."""
+def _plain(block: bytes, room: int) -> bytes:
+    """The records that a chunk holds, decompressed and checked.
+
+    Args:
+        block: The chunk's record.
+        room: The most bytes that it may hold if they are more than `MAX_RATIO` times its own.
+
+    Raises:
+        Exception: One of `_MALFORMED`: it is damaged.
+    """
     chunk = _parsed(block)
     assert isinstance(chunk, Chunk)
     size = chunk.uncompressed_size
     # what a zstd frame claims would be allocated; -1 if it claims nothing
     claimed = zstandard.frame_content_size(chunk.data) if chunk.compression == "zstd" else -1
-    if size > MAX_CHUNK or claimed not in (-1, size):
-        raise ValueError(f"it claims to hold {max(size, claimed)} bytes")
+    if size > min(MAX_CHUNK, max(room, MAX_RATIO * len(block))) or claimed not in (-1, size):
+        raise ValueError(f"it claims to hold {max(size, claimed)} bytes in {len(chunk.data)}")
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
     elif chunk.compression == "lz4":
@@ -350,6 +375,8 @@ def _scan(data: bytes, offset: int, damages: list[Damage]) -> Iterator[tuple[int
     while at + _HEAD.size <= size:
         start = at
         opcode, length = _HEAD.unpack_from(data, start)
+        if not opcode:
+            break
         at += _HEAD.size + length
         if at <= size:
             yield opcode, start, at
@@ -366,7 +393,23 @@ def _parsed(record: bytes) -> McapRecord:
         checksum = int.from_bytes(record[-_CRC_BYTES:], "little")
         if checksum and zlib.crc32(record[_HEAD.size : -_CRC_BYTES]) != checksum:
             raise ValueError("an attachment does not match its checksum")
-    return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
+    try:
+        parsed = next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
+    except (StopIteration, EndOfFile):
+        raise ValueError("it ends too early") from None
+    if isinstance(parsed, Metadata) and parsed.metadata.get(CHECKSUM, (right := _checksum(parsed))) != right:
+        raise ValueError(f"metadata {parsed.name} does not match its checksum")
+    return parsed
+
+
+def with_checksum(name: str, entries: dict[str, str]) -> dict[str, str]:
+    """The entries of a metadata record, and their checksum."""
+    return entries | {CHECKSUM: _checksum(Metadata(name, entries))}
+
+
+def _checksum(record: Metadata) -> str:
+    texts = [record.name, *(f"{key}={value}" for key, value in record.metadata.items() if key != CHECKSUM)]
+    return f"{zlib.crc32(chr(0).join(texts).encode()):08x}"
 
 
 def _undescribed(channel: int, offset: int, damages: list[Damage]) -> None:

@@ -5,6 +5,7 @@ A log without its end, as a killed recorder leaves it, is read from the front. D
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.logs.mcap_copy import McapCopy
 from aeroloop.service.logs.mcap_file import Damage, NotMcapError
+from aeroloop.service.logs.outputs import writing
 
 
 class RecoverError(AeroloopError):
@@ -28,36 +30,35 @@ class Recovery(BaseModel, frozen=True):
     lost: list[str] = Field(description="what could not be read, a line each; empty if the file was whole")
 
 
-def recover(broken: Path, out: Path, progress: Callable[[float], None] | None = None) -> Recovery:
+def recover(
+    broken: Path, out: Path, progress: Callable[[float], None] | None = None, *, force: bool = False
+) -> Recovery:
     """Write all that can be read of a log into a new file.
 
     Args:
         broken: The log; it is not changed.
-        out: The new file, which must not exist; it is removed again on any error.
+        out: The new file.
         progress: Called repeatedly with the share done, 0…1.
+        force: Replace an existing file, unless it is a log.
 
     Raises:
-        RecoverError: It is not an MCAP file, or the new one cannot be written.
+        OutputError: The new file must not be written, or cannot.
+        RecoverError: It is not an MCAP file, or cannot be read.
     """
     damages: list[Damage] = []
     try:
-        size = broken.stat().st_size
-        with out.open("xb") as file:
-            try:
-                copy = McapCopy(file, "aeroloop log recover")
-                copy.file(broken, damages, lambda read: progress(read / size) if progress else None)
-                if not copy.messages:
-                    raise RecoverError(f"{broken} holds no whole message")
-                copy.finish()
-                file.flush()
-            except BaseException:
-                out.unlink()
-                raise
+        with broken.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+        with writing(out, [broken], force=force) as part, part.open("xb") as new:
+            copy = McapCopy(new, "aeroloop log recover")
+            copy.file(broken, damages, lambda read: progress(read / size) if progress else None)
+            if not copy.messages:
+                raise RecoverError(f"{broken} holds no whole message")
+            copy.finish()
+            new.flush()
     except NotMcapError as error:
         raise RecoverError(f"{error}, so there is nothing to recover") from None
-    except FileExistsError:
-        raise RecoverError(f"{out} exists already; name another file") from None
     except OSError as error:
-        raise RecoverError(f"cannot recover {broken} into {out}: {error.strerror}") from None
+        raise RecoverError(f"cannot read {broken}: {error.strerror}") from None
     lost = [f"at byte {damage.offset}: {damage.what}" for damage in damages]
     return Recovery(out=str(out), messages=copy.messages, channels=len(copy.topics), lost=lost)

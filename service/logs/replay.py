@@ -209,7 +209,7 @@ def replay(
     """
     try:
         run = Run(paths, progress)
-        run.longest  # noqa: B018  # raises where there is no session
+        run.choose()  # raises where there is no session
         return _replayed(run, overrides, ends)
     except ValidationError as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
@@ -232,7 +232,7 @@ def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Repl
         if which not in run.extents or "controller" not in ends:
             continue
         if which not in joins:
-            settings = load_over(run.files.settings(source.vehicle), overrides)
+            settings = load_over(run.settings(which), overrides)
             evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
             replayers[which] = Replayer(which, evaluator, settings)
             joins[which] = run.join(which, alone=True)

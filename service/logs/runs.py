@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from math import inf
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,9 +17,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import NEVER, End, Header, Outcome, Received, join_columns
+from aeroloop.service.config import Settings
+from aeroloop.service.logs.described import merged, read_description
 from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
 from aeroloop.service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, SessionKey, TraceIndex
 
@@ -88,24 +92,82 @@ class Run:
         self._progress = progress
         self._index = TraceIndex()
 
-        def of(address: Address) -> str | None:
-            return address.vehicle if address.topic.name == "trace" else None
+        self._described: dict[SessionKey, dict[str, Description]] = {}
 
+        def of(address: Address) -> Address | None:
+            return address if address.topic.name in ("trace", "description") else None
+
+        known: dict[tuple[str, str], Description] = {}
         for found in self.files.routed(of, self._share(0.0, _INDEXING)):
-            self._index.add(found.answer, found.data)
+            vehicle = found.answer.vehicle
+            if found.answer.topic.name == "description":
+                with suppress(ValueError):  # the prelude has reported it
+                    description = read_description(found.data, found.answer)
+                    known[vehicle, description.role] = description
+            elif (header := self._index.add(vehicle, found.data)) and (vehicle, header.session) not in self._described:
+                now = {role: description for (whose, role), description in known.items() if whose == vehicle}
+                self._described[vehicle, header.session] = now
         self._index.finish()
         self.extents: dict[SessionKey, Extent] = self._index.extents
         self.missing: list[Missing] = self._index.missing
         self.reached: dict[SessionKey, int] = {}
         self.open_sessions: dict[str, str] = {}
 
-    @property
-    def longest(self) -> SessionKey:
-        """The session with the most ticks. Raises ReviewError if there is none."""
-        which = max(self.extents, key=lambda which: self.extents[which].ticks, default=None)
-        if which is None:
+    def choose(self, session: str | None = None, vehicle: str | None = None) -> SessionKey:
+        """A session.
+
+        Args:
+            session: Its name, alone or as `vehicle/session`, or its number, from 1 in the order of recording; the one
+                with the most ticks if None.
+            vehicle: Its vehicle; any if None, and that of the longest session for a number.
+
+        Raises:
+            ReviewError: There is none.
+        """
+        known = self.extents if vehicle is None else self.sessions_of(vehicle)
+        if not self.extents:
             raise ReviewError(f"{self.files.name} holds no session: no trace of a controller or a plant was recorded")
-        return which
+        if not known:
+            vehicles = ", ".join(dict.fromkeys(vehicle for vehicle, _ in self.extents))
+            raise ReviewError(f"{self.files.name} holds no session of {vehicle}, only of {vehicles}")
+        longest = max(known, key=lambda which: self.extents[which].ticks)
+        if session is None:
+            return longest
+        for which in known:
+            if session in (which[1], "/".join(which)):
+                return which
+        numbered = self.sessions_of(longest[0])
+        if session.isdecimal() and 0 < int(session) <= len(numbered):
+            return numbered[int(session) - 1]
+        names = ", ".join(f"{i} {which[1]}" for i, which in enumerate(numbered[:20], 1))
+        more = f" and {len(numbered) - 20} more" if len(numbered) > 20 else ""
+        raise ReviewError(f"{self.files.name} holds no session {session!r}; of {longest[0]} it holds {names}{more}")
+
+    def sessions_of(self, vehicle: str) -> list[SessionKey]:
+        """Sessions of a vehicle, in the order of recording."""
+        return [which for which in self.extents if which[0] == vehicle]
+
+    def described(self, which: SessionKey) -> dict[str, Description]:
+        """Descriptions of a session's vehicle when it began, by role; and of the recorder."""
+        found = {role: found for (_, role), found in self.files.descriptions.items() if role == "recorder"}
+        found |= {role: found for (vehicle, role), found in self.files.descriptions.items() if vehicle == which[0]}
+        return found | self._described.get(which, {})
+
+    def settings(self, which: SessionKey) -> Settings:
+        """The configuration of a session, each section from the role that owns it.
+
+        Raises:
+            ReviewError: The logs have no description of its controller or plant.
+            ConfigError: One is not of this version.
+        """
+        try:
+            return merged(self.described(which))
+        except KeyError:
+            damaged = "".join(f"; not read, {line}" for line in self.files.unread[:1])
+            raise ReviewError(
+                f"{self.files.name} has no description of {which[0]}'s controller or plant: its frames cannot be read"
+                f"{damaged}"
+            ) from None
 
     def batches(self, route: Callable[[Address], Taker | None] = lambda _: None) -> Iterator[Arrived]:
         """Batches of the traces, each end's in the order of its rows and none twice.
@@ -149,7 +211,7 @@ class Run:
         extent = self.extents[which]
         begins = extent.first["controller"]
         before = [change for change in self.files.changes.get(which, ()) if change.tick < begins]
-        margin = self.files.settings(which[0]).loop.ticks(ANSWER_S)
+        margin = self.settings(which).loop.ticks(ANSWER_S)
         return TraceJoin(which, margin, extent.of("controller") if alone else extent, block, before)
 
     def _follow(self, which: SessionKey, arrived: Arrived) -> None:

@@ -135,12 +135,14 @@ class TraceIndex:
         self.missing: list[Missing] = []
         self._names: dict[str, int] = {"": 0}
 
-    def add(self, vehicle: str, payload: bytes) -> None:
-        """Add a batch; a malformed one is dropped."""
-        if found := _identified(vehicle, payload):
-            source, header = found
-            batches = self.sources.setdefault(source, Batches())
-            batches.add(header, payload, self._names.setdefault(header.session, len(self._names)))
+    def add(self, vehicle: str, payload: bytes) -> Header | None:
+        """Add a batch and return its header; a malformed one is dropped."""
+        if (found := identified(vehicle, payload)) is None:
+            return None
+        source, header = found
+        batches = self.sources.setdefault(source, Batches())
+        batches.add(header, payload, self._names.setdefault(header.session, len(self._names)))
+        return header
 
     def finish(self) -> None:
         """Find sessions and their missing rows, once all batches are added."""
@@ -241,7 +243,7 @@ class InOrder:
 
     def take(self, vehicle: str, payload: bytes) -> Iterator[Arrived]:
         """Add a batch; yields every batch that is next in order."""
-        if found := _identified(vehicle, payload):
+        if found := identified(vehicle, payload):
             source, header = found
             yield from self._queues[source].take(header, payload)
 
@@ -270,7 +272,7 @@ class _Queue:
             yield Arrived(self._source, header, payload, gap, self._last[at], self._next[at])
 
 
-def _identified(vehicle: str, payload: bytes) -> tuple[Source, Header] | None:
+def identified(vehicle: str, payload: bytes) -> tuple[Source, Header] | None:
     """Source and header of a batch; None if it is malformed."""
     header = read_header(payload)
     if header is None or len(payload) != batch_bytes(header):

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.runtime.host_facts import versions
 from aeroloop.protocol.transport.publication import Delivery
-from aeroloop.service.logs.mcap_file import CHUNK_BYTES
+from aeroloop.service.logs.mcap_file import CHUNK_BYTES, with_checksum
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
 FRAME_ENCODING: Final = "x-aeroloop-frame"
@@ -128,8 +128,8 @@ class LogFile:
             self._add(channel, one.at_ns, one.at_ns, one.data, 0)
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
-        """Add a metadata record."""
-        self._writer.add_metadata(name, entries)
+        """Add a metadata record, under a checksum."""
+        self._writer.add_metadata(name, with_checksum(name, entries))
 
     def attach_specification(self, at_ns: int) -> None:
         """Attach the wire's specification, which a reader of frames needs."""

@@ -12,6 +12,7 @@ import errno
 import json
 import re
 import time
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -65,11 +66,10 @@ class RollingLog:
         self.written = 0
         self.trouble = ""
         self._report = report
-        path = settings.path
-        self._named = path is not None and not path.is_dir()
-        if path is None or not self._named:
-            path = (path or settings.directory) / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap")
-        self._base = path
+        self._id = uuid.uuid4().hex
+        place = settings.path or settings.directory
+        self._named_by_time = place is settings.directory or place.is_dir()
+        self._base = place / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap") if self._named_by_time else place
         self._descriptions: dict[str, bytes] = {}
         self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []
@@ -107,7 +107,7 @@ class RollingLog:
         """Put a role's description into this file and all later ones."""
         if self._descriptions.get(key) != payload:
             self._descriptions[key] = payload
-            self._file.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": payload.decode()})
+            _describe(self._file, key, payload)
 
     def add_change(self, key: str, change: Change) -> None:
         """Keep a change from the tail of the trace `key` for later files; this file has it in the trace."""
@@ -146,7 +146,7 @@ class RollingLog:
         try:
             self._file.commit()
             self._unwritten.clear()
-            self._file.end()
+            self._end(self._file)
         except OSError as error:
             self._file.abandon()
             lost = waiting + len(self._unwritten)
@@ -231,12 +231,21 @@ class RollingLog:
         if replaced:
             self._report(f"{last.path} was moved or removed while it was written", True)
         try:
-            last.end()
+            self._end(last)
         except OSError as error:
             last.abandon()
             what = f"the index of {last.path} could not be written: {error.strerror}"
             self._report(f"{what}; `aeroloop log recover` gives it one", True)
         self._remove_oldest()
+
+    def _end(self, file: LogFile) -> None:
+        """Put the descriptions at the file's end, too, and close it. Raises OSError.
+
+        Why twice: a damaged copy must not cost the log.
+        """
+        for key, description in self._descriptions.items():
+            _describe(file, key, description)
+        file.end()
 
     def _begin(self) -> LogFile:
         """Create the next file and write its header. Raises OSError."""
@@ -244,11 +253,16 @@ class RollingLog:
         file = LogFile(path)
         try:
             started = datetime.now(UTC)
-            run = {"run": self._base.stem, "part": path.stem, "started": started.isoformat(timespec="seconds")}
+            run = {
+                "run": self._base.stem,
+                "id": self._id,
+                "part": path.stem,
+                "started": started.isoformat(timespec="seconds"),
+            }
             file.add_metadata(RECORDER_METADATA, {"json": json.dumps(run)})
             file.attach_specification(round(started.timestamp() * 1e9))
             for key, description in self._descriptions.items():
-                file.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": description.decode()})
+                _describe(file, key, description)
             for key, changes in self._changes.items():
                 for change in changes:
                     file.add_metadata(CHANGE_METADATA, {"key": key, "json": change.model_dump_json()})
@@ -294,6 +308,10 @@ class RollingLog:
             head = opening(path)
             if head is not None and head.name == RECORDER_METADATA:
                 run = json.loads(head.metadata["json"])
-                runs = re.escape(self._base.stem) if self._named else r"aeroloop-\d{8}-\d{6}"
+                runs = r"aeroloop-\d{8}-\d{6}" if self._named_by_time else re.escape(self._base.stem)
                 return run["part"] == path.stem and re.fullmatch(runs, run["run"]) is not None
         return False
+
+
+def _describe(file: LogFile, key: str, description: bytes) -> None:
+    file.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": description.decode()})

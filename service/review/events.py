@@ -7,9 +7,12 @@ log with a storm of events fits in memory and can be read.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final
+
+from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Loss, Status
@@ -62,17 +65,27 @@ class EventLog:
         period: Time between its ticks [s].
         reached: The last tick of each session that the traces have reached in the files so far.
         open_sessions: The session of each vehicle that is open at that point of the files.
+        alone: Leave out the trips of other sessions.
 
     Attributes:
         statuses: The last status of every vehicle and role.
-        trips: Reason of every trip, in which a plant goes to 0 V by itself.
+        trips: Reason of every trip of the vehicle, in which the plant goes to 0 V by itself.
         losses: Messages of the vehicle that the recorder lost, by topic.
         faults: Faults of its plant.
+        unreadable: Malformed messages, by topic.
     """
 
     def __init__(
-        self, which: SessionKey, period: float, reached: Mapping[SessionKey, int], open_sessions: Mapping[str, str]
+        self,
+        which: SessionKey,
+        period: float,
+        reached: Mapping[SessionKey, int],
+        open_sessions: Mapping[str, str],
+        *,
+        alone: bool = False,
     ) -> None:
+        self.unreadable: Counter[str] = Counter()
+        self._alone = alone
         self.statuses: dict[tuple[str, str], Status] = {}
         self.trips: list[str] = []
         self.losses: dict[str, int] = {}
@@ -89,14 +102,24 @@ class EventLog:
     def route(self, address: Address) -> Taker | None:
         """Callback for the messages of a key; None if they are not used."""
         vehicle, role = address.vehicle, address.role
-        match address.topic.name:
+        take: Taker
+        match name := address.topic.name:
             case "event":
-                return lambda payload, at_ns: self._event(vehicle, payload, at_ns)
+                take = partial(self._event, vehicle)
             case "loss":
-                return lambda payload, at_ns: self._loss(vehicle, payload, at_ns)
+                take = partial(self._loss, vehicle)
             case "status" if role is not None:
-                return lambda payload, at_ns: self._status(vehicle, role, payload, at_ns)
-        return None
+                take = partial(self._status, vehicle, role)
+            case _:
+                return None
+
+        def checked(payload: bytes, at_ns: int) -> None:
+            try:
+                take(payload, at_ns)
+            except ValidationError:  # a stranger may publish anything
+                self.unreadable[name] += 1
+
+        return checked
 
     def changed(self, changes: Sequence[Change]) -> None:
         """Add changes of gains and reference."""
@@ -118,12 +141,12 @@ class EventLog:
         if self._is_duplicate(vehicle, payload, at_ns):
             return
         event = Event.model_validate_json(payload)
-        if event.kind == "tripped":
-            self.trips.append(event.text)
         of_session = event.session == self._which[1]
         repeats_a_change = event.kind == "changed" and event.role == "controller" and of_session
         if vehicle != self._which[0] or repeats_a_change:
             return
+        if event.kind == "tripped" and (of_session or not self._alone):
+            self.trips.append(event.text)
         tick = event.tick if of_session else None
         self._add(event.kind, event.role, event.text, tick, event.session)
 

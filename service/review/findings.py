@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from aeroloop.protocol.messages.models import Description, Percentiles
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.review.events import EventLog
-from aeroloop.service.review.report import Findings
+from aeroloop.service.review.report import Disagreement, Findings, Mark, Recorded, flat
 from aeroloop.service.review.session import Session
+
+LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration is a loop's"
+"""Why a session in lockstep has no durations."""
+
+OWN_AFFAIRS: Final = (
+    "loop.realtime",
+    "loop.priority",
+    "loop.cpus",
+    "loop.trace_s",
+    "plant.via",
+    "plant.faults",
+    "plant.fault_seed",
+)
+"""Keys that each end has for itself, or that a command sets at the plant alone."""
 
 FrameCounts = dict[str, dict[str, int]] | None
 """Of `WireCheck`."""
@@ -24,21 +39,31 @@ def findings_of(
     observer, offset = session.observer, session.reader.offset
     timing, age = observer.timing, events.age_us
     reasons = dict(figures.reasons)
+    lockstep = session.settings.loop.lockstep
+    if lockstep:
+        timing, age = {}, None
     if age is None:
-        reasons["age_us"] = "the log has no status of the controller with an age"
+        reasons["age_us"] = LOCKSTEP if lockstep else "the log has no status of the controller with an age"
     for name, why in (("period", "fewer than two measurements"), ("latency", "no measurement was answered")):
         if name not in timing:
-            reasons[f"timing.{name}"] = why
-    known = offset.first_ns == offset.first_ns
+            reasons[f"timing.{name}"] = LOCKSTEP if lockstep else why
+    known = offset.first_ns == offset.first_ns and not lockstep
     if not known:
-        reasons["clock_offset_us"] = "too few ticks have all four times of sending and receiving"
+        few = "too few ticks have all four times of sending and receiving"
+        reasons["clock_offset_us"] = LOCKSTEP if lockstep else few
     theorem, unknown = observer.trial.findings()
+    gaps = [gap for gap in run.missing if gap.vehicle == which[0]]
     return Findings(
         **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},
         reasons=reasons | unknown,
         vehicle=which[0],
         session=which[1],
-        sessions=len(run.extents),
+        sessions=len(run.sessions_of(which[0])),
+        recorded=[
+            Recorded(vehicle=vehicle, session=name, duration_s=round(extent.ticks * session.settings.loop.period, 9))
+            for (vehicle, name), extent in run.extents.items()
+        ],
+        disagreements=disagreements(run.described(which)),
         started=observer.started,
         timing=timing,
         clock_offset_us=[round(ns * 1e-3, 1) for ns in (offset.first_ns, offset.last_ns)] if known else None,
@@ -48,26 +73,54 @@ def findings_of(
         saturated=observer.saturated,
         invalid=observer.invalid,
         losses=events.losses,
-        missing_ticks={end: sum(gap.rows for gap in run.missing if gap.end == end) for end in ("controller", "plant")},
-        missing=run.missing,
+        missing_ticks={end: sum(gap.rows for gap in gaps if gap.end == end) for end in ("controller", "plant")},
+        missing=gaps,
         lapses={name: count for name, count in session.lapses.items() if count},
         frames=frames,
         theorem=theorem,
-        marks=events.marks(),
+        marks=[mark for mark in events.marks() if not _repeats(mark, theorem.verdict)],
         faults=events.faults.intervals(),
     )
 
 
-def facts_of(run: Run, events: EventLog, vehicle: str) -> dict[str, dict[str, Any]]:
+def latency_of(session: Session) -> tuple[Percentiles | None, str]:
+    """Loop latency of a session, or the reason why there is none."""
+    if session.settings.loop.lockstep:
+        return None, LOCKSTEP
+    spread = session.observer.timing.get("latency")
+    if spread is None:
+        return None, "no measurement was answered"
+    return Percentiles(**spread.model_dump(include=set(Percentiles.model_fields))), ""
+
+
+def _repeats(mark: Mark, verdict: str) -> bool:
+    """Whether an event of the controller states the certificate that the findings have."""
+    return mark.role == "controller" and mark.kind in ("started", "changed") and mark.text.startswith(verdict[:-1])
+
+
+def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:
+    """Keys of the loop, the wire and the plant in which the two ends' configurations differ."""
+    if not {"controller", "plant"} <= described.keys():
+        return []
+    tables = [flat(described[role].config) for role in ("controller", "plant")]
+    keys = sorted(set().union(*tables))
+    return [
+        Disagreement(key=key, controller=values[0], plant=values[1])
+        for key in keys
+        if key.startswith(("loop.", "wire.", "plant.")) and not key.startswith(OWN_AFFAIRS)
+        if (values := [table.get(key) for table in tables])[0] != values[1]
+    ]
+
+
+def facts_of(run: Run, events: EventLog, which: SessionKey) -> dict[str, dict[str, Any]]:
     """Facts about software and host, by role: from descriptions, the log's metadata, and notes in statuses."""
     facts: dict[str, dict[str, Any]] = {}
-    for (owner, role), description in run.files.descriptions.items():
-        if owner == vehicle:
-            facts[role] = {"host": description.host, **description.facts, "versions": description.versions}
+    for role, description in run.described(which).items():
+        facts[role] = {"host": description.host, **description.facts, "versions": description.versions}
     for name, values in run.files.metadata.items():
         facts.setdefault(name, {}).update(values)
     for (owner, role), status in events.statuses.items():
-        if owner == vehicle and status.notes:
+        if owner == which[0] and status.notes:
             facts.setdefault(role, {})["notes"] = status.notes
     return facts
 

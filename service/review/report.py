@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, Field
 
@@ -54,6 +54,22 @@ class FaultInterval(BaseModel, frozen=True):
     end_s: float | None = Field(description="when it ended [s]; null if not within the session")
     changed: int = Field(description="frames, samples or voltages that it changed, at the plant")
     effect: str = Field(description="what it changed, and how: `commands dropped`")
+
+
+class Recorded(BaseModel, frozen=True):
+    """A session in the log."""
+
+    vehicle: str
+    session: str
+    duration_s: float = Field(description="from the controller's first to its last row [s]")
+
+
+class Disagreement(BaseModel, frozen=True):
+    """A key of the configuration that the two ends have different values of; each acts by its own."""
+
+    key: str = Field(description="dotted, such as `plant.aero.mass`")
+    controller: Any
+    plant: Any
 
 
 class Check(BaseModel, frozen=True):
@@ -115,7 +131,11 @@ class Findings(Figures):
 
     vehicle: str
     session: str
-    sessions: int = Field(description="sessions in the log; the longest is judged")
+    sessions: int = Field(description="the vehicle's sessions in the log; the longest is judged if none is named")
+    recorded: list[Recorded] = Field(default_factory=list, description="every session, in the order of recording")
+    disagreements: list[Disagreement] = Field(
+        default_factory=list, description="of loop, wire and plant, between the controller's and the plant's end"
+    )
     started: str = Field(description="when the session's first measurement was sent, UTC")
     timing: dict[str, Spread] = Field(
         description="`period`: between measurements, and `latency`: from a measurement to the command that answers it, "
@@ -134,7 +154,9 @@ class Findings(Figures):
     )
     invalid: dict[str, int] = Field(description="frames with a component that has no valid value, by frame")
     losses: dict[str, int] = Field(description="messages that the recorder lost, by topic")
-    missing_ticks: dict[str, int] = Field(description="rows of either end that were never recorded, in all sessions")
+    missing_ticks: dict[str, int] = Field(
+        description="rows of either end that were never recorded, in all of the vehicle's sessions"
+    )
     missing: list[Missing] = Field(description="where they are, and sessions of whose last batch there is none")
     lapses: dict[str, int] = Field(
         description="deviations from one frame each way per tick. At the controller: measurements received "
@@ -209,7 +231,7 @@ class Report:
         thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
             and the largest value.
         bands: Shaded spans of time.
-        settings: The effective configuration, as nested tables.
+        settings: The effective configuration, as nested tables; each section is of the role that owns it.
         facts: Facts about software and host, by role: versions, git revision, kernel, notes.
     """
 
@@ -234,9 +256,25 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
+ADDRESSES: Final = (
+    "network.",
+    "recorder.path",
+    "recorder.directory",
+    "can.channel",
+    "can.node",
+    "can.options.",
+    "plant.quanser.card_identifier",
+)
+"""Keys that only say where something is."""
+
+
 def differences(reports: Sequence[Report]) -> list[tuple[str, list[Any]]]:
-    """What differs in the configurations of several runs: a dotted key, and each run's value (None if it has none)."""
+    """What differs in the configurations of several runs, but addresses and paths.
+
+    Returns:
+        Dotted keys, and each run's value (None if it has none).
+    """
     tables = [flat(report.settings) for report in reports]
-    keys = sorted(set().union(*tables))
+    keys = sorted(key for key in set().union(*tables) if not key.startswith(ADDRESSES))
     rows = [(key, [table.get(key) for table in tables]) for key in keys]
     return [(key, values) for key, values in rows if any(value != values[0] for value in values)]

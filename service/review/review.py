@@ -1,16 +1,15 @@
 """Review of a log: every figure, from the log alone.
 
 The log holds the configuration (roles' descriptions) and what each end did (traces), so the review recomputes the
-controller, bit for bit. Of several sessions, it judges the longest.
+controller, bit for bit. Of several sessions, it judges the longest, unless one is named.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from pydantic import ValidationError
 
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.topics import Address
@@ -24,7 +23,7 @@ from aeroloop.service.logs.wire_check import WireCheck
 from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.faults import bands
-from aeroloop.service.review.findings import facts_of, findings_of, name_of
+from aeroloop.service.review.findings import facts_of, findings_of, latency_of, name_of
 from aeroloop.service.review.report import Findings, Report
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.session import Session
@@ -32,7 +31,7 @@ from aeroloop.service.review.theorem_check import TheoremCheck
 
 
 class Review(NamedTuple):
-    """Review of a log's longest session.
+    """Review of a session.
 
     Attributes:
         figures: The figures of merit alone.
@@ -54,6 +53,8 @@ class Review(NamedTuple):
         """The review as data, checked against limits."""
         observer = self.session.observer
         time, panels = observer.lines()
+        if self.session.settings.loop.lockstep:
+            panels = [panel for panel in panels if panel.group not in ("latency", "period")]
         return Report(
             name=self.name,
             findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),
@@ -82,51 +83,63 @@ def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progre
     return read(*paths, progress=progress).report(limits)
 
 
-def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: Progress | None = None) -> Review:
-    """Read a run and judge its longest session. The figures list what cannot be read of a broken file.
+def read(
+    *paths: Path,
+    session: str | None = None,
+    vehicle: str | None = None,
+    watch: Callable[[Ticks], None] | None = None,
+    progress: Progress | None = None,
+) -> Review:
+    """Read a run and judge a session. The figures list what cannot be read of a broken file.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
+        session: Its name or number, as of `Run.choose`; the longest if None.
+        vehicle: Its vehicle; that of the longest session if None.
         watch: Called with every block of the session's ticks.
         progress: Called repeatedly with the share done, 0…1.
 
     Raises:
-        ReviewError: Not a log, or one without a session.
+        ReviewError: Not a log, several unrelated runs, or no such session.
     """
     try:
         run = Run(paths, progress)
-        which = run.longest
-        vehicle, files = which[0], run.files
-        settings, plant = files.settings(vehicle), files.plant(vehicle)
-        description = files.descriptions.get((vehicle, "controller"))
+        which = run.choose(session, vehicle)
+        settings, description = run.settings(which), run.described(which).get("controller")
 
         def check(changes: Sequence[Change]) -> TheoremCheck:
             certified = certified_bounds(settings, changes, description.certificate if description else None)
-            return TheoremCheck(certified, settings.loop.period, damping_of(plant))
+            return TheoremCheck(certified, settings.loop.period, damping_of(settings.plant))
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
-        session = Session(settings, plant.watchdog_s, check, missing, watch)
+        judged = Session(settings, check, missing, watch)
         frames = WireCheck(which, settings.wire, run.reached)
-        events = EventLog(which, settings.loop.period, run.reached, run.open_sessions)
+        events = EventLog(which, settings.loop.period, run.reached, run.open_sessions, alone=session is not None)
 
         def route(address: Address) -> Taker | None:
             if address.topic.name == "truth":
-                return session.truth if address.vehicle == vehicle else None
+                return judged.truth if address.vehicle == which[0] else None
             return frames.route(address) or events.route(address)
 
         for block in run.read([which], route):
             events.changed(block.changes)
             events.faults.take(block)
             frames.take(block)
-            session.take(block)
-        session.finish()
-    except (ValidationError, ConfigError) as error:
+            judged.take(block)
+        judged.finish()
+    except ConfigError as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    status = events.statuses.get((vehicle, "plant"))
-    latency = status.latency_us if status else None
-    reasons = {} if latency else {"latency_us": "the log has no status of the plant with a latency"}
-    figures = session.score.figures(
-        latency=latency, log=files.name, trips=events.trips, reasons=reasons, damages=files.unread
+    latency, reason = latency_of(judged)
+    unreadable = Counter(events.unreadable)
+    if judged.unreadable:
+        unreadable["truth"] += judged.unreadable
+    damages = [f"malformed: {count} of {topic}" for topic, count in sorted(unreadable.items())]
+    figures = judged.score.figures(
+        latency=latency,
+        log=run.files.name,
+        trips=events.trips,
+        reasons={} if latency else {"latency_us": reason},
+        damages=[*run.files.unread, *damages],
     )
-    findings = findings_of(figures, which, session, events, run, frames.findings())
-    return Review(figures, findings, session, which, name_of(paths), facts_of(run, events, vehicle))
+    findings = findings_of(figures, which, judged, events, run, frames.findings())
+    return Review(figures, findings, judged, which, name_of(paths), facts_of(run, events, which))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Final
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.operator import Change
@@ -36,8 +37,7 @@ class Session:
     """Reviews one session.
 
     Args:
-        settings: The configuration of its controller.
-        watchdog_s: How long its plant holds the last command [s].
+        settings: Its configuration.
         check: Creates its check against the theorem, from the changes that it began with.
         missing: Its rows that the log lacks.
         watch: Called with every block of ticks, in order.
@@ -46,18 +46,18 @@ class Session:
         score: Its figures of merit.
         lapses: How many ticks were late, missed and so on; see `Findings`.
         reader: Reads its ticks.
+        unreadable: Malformed messages with a true state.
     """
 
     def __init__(
         self,
         settings: Settings,
-        watchdog_s: float,
         check: Callable[[Sequence[Change]], TheoremCheck],
         missing: Sequence[Missing] = (),
         watch: Callable[[Ticks], None] | None = None,
     ) -> None:
         self.settings = settings
-        self.score = Score(settings.wire, settings.loop.period, watchdog_s)
+        self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
         self.lapses: Counter[str] = Counter()
         self.reader = TickReader(settings)
         self._check = check
@@ -66,6 +66,7 @@ class Session:
         self._observer: Observer | None = None
         self._truths: deque[bytes] = deque(maxlen=WAITING)
         self._session: str | None = None
+        self.unreadable = 0
 
     @property
     def observer(self) -> Observer:
@@ -104,7 +105,13 @@ class Session:
             self._observer.trial.finish()
 
     def _add_truths(self, check: TheoremCheck) -> None:
-        for truth in _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]"):
+        try:
+            truths = _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]")
+        except ValidationError:  # a stranger may publish anything
+            readable = [truth for text in self._truths if (truth := _truth(text)) is not None]
+            self.unreadable += len(self._truths) - len(readable)
+            truths = readable
+        for truth in truths:
             if truth.session == self._session:
                 check.truth(truth.session_tick, truth.attitude, truth.rate)
         self._truths.clear()
@@ -118,3 +125,9 @@ class Session:
             outcomes = block.plant["outcome"][: int((block.at_plant >= 0).sum())]
             for name, kinds in _OUTCOMES.items():
                 self.lapses[name] += int(np.isin(outcomes, kinds).sum())
+
+
+def _truth(text: bytes) -> Truth | None:
+    with suppress(ValidationError):
+        return Truth.model_validate_json(text)
+    return None

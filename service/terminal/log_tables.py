@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 from rich.table import Column, Table
 from rich.text import Text
 
+from aeroloop.service.report.page.data import grave
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Spread, TheoremFindings
 from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
@@ -17,6 +19,10 @@ if TYPE_CHECKING:
     from aeroloop.service.logs.replay import Replay
 
 MARKS_SHOWN: Final = 12
+"""Events that do not matter."""
+DISAGREEMENTS_SHOWN: Final = 5
+SESSIONS_SHOWN: Final = 9
+DAMAGES_SHOWN: Final = 20
 _TIMINGS: Final = {
     "period": "period",
     "latency": "latency",
@@ -27,9 +33,16 @@ _BARS: Final = "▁▂▃▄▅▆▇█"
 
 
 def review_account(findings: Findings) -> None:
-    """Print figures of merit, timing, events, and whether the limits hold."""
-    figures_table(findings)
+    """Print the events that matter, figures of merit, timing, other events, and whether the limits hold."""
     console = Console()
+    marks = timed(findings.marks)
+    timed_faults = ("fault begins", "fault ends") if findings.faults else ()  # stand in a table of their own
+    matter = [entry for entry in marks if grave(entry[1]) and not entry[1].text.startswith(timed_faults)]
+    console.print(_grave_table(matter) if matter else "no trip, failure, loss or refusal")
+    if findings.faults:
+        console.print(_faults_table(findings.faults))
+    console.print()
+    figures_table(findings.model_copy(update={"trips": [], "damages": _some(findings.damages)}))
     console.print()
     if findings.timing:
         console.print(_timing_table(findings, drawn=console.width >= 80))
@@ -41,12 +54,9 @@ def review_account(findings: Findings) -> None:
     if findings.theorem is not None:
         console.print()
         console.print(theorem_table(findings, findings.theorem))
-    if findings.faults:
+    if others := [entry for entry in marks if not grave(entry[1])]:
         console.print()
-        console.print(_faults_table(findings.faults))
-    if findings.marks:
-        console.print()
-        console.print(_marks_table(findings.marks))
+        console.print(_marks_table(others))
     if findings.checks:
         console.print()
         checks = Table(show_header=False, box=None, pad_edge=False)
@@ -109,9 +119,25 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
         yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
     for kind, counts in (findings.frames or {}).items():
         yield f"{kind} frames", f"{counts['recorded']} on the wire, {counts['differ']} differ from the traces"
-    began = findings.started.replace("T", " ").replace("+00:00", " UTC")
-    others = f", the longest of {findings.sessions}" if findings.sessions > 1 else ""
-    yield "session", f"{findings.session} of {findings.vehicle}, {began}{others}"
+    for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
+        yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
+    if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
+        yield "", f"… and {more} more keys; --json has them all"
+    yield "session", f"{findings.session} of {findings.vehicle}, {_utc(findings.started)}"
+    vehicles = dict.fromkeys(one.vehicle for one in findings.recorded)
+    if len(vehicles) > 1:
+        yield "vehicles", f"{', '.join(vehicles)}; shown is {findings.vehicle}, --vehicle shows another"
+    its = [one for one in findings.recorded if one.vehicle == findings.vehicle]
+    if len(its) > 1:
+        for i, one in enumerate(its, 1):
+            shown = ", shown" if one.session == findings.session else ""
+            if shown or i <= SESSIONS_SHOWN:
+                yield "sessions" if i == 1 else "", f"{i}  {one.session}, {one.duration_s:.1f} s{shown}"
+        yield "", f"--session N shows another of {len(its)}"
+
+
+def _utc(started: str) -> str:
+    return started.replace("T", " ").replace("+00:00", " UTC")
 
 
 def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
@@ -163,17 +189,49 @@ def _faults_table(faults: Sequence[FaultInterval]) -> Table:
     return table
 
 
-def _marks_table(marks: Sequence[Mark]) -> Table:
+def timed(marks: Sequence[Mark]) -> list[tuple[str, Mark]]:
+    """Events in order, each with its time on the law's clock, or `before` or `after` the session."""
+    within = [i for i, mark in enumerate(marks) if mark.time_s is not None] or [len(marks)]
+
+    def when(i: int, time_s: float | None) -> str:
+        outside = "before" if i < within[0] else "after"
+        return outside if time_s is None else f"{round(time_s, 3) + 0.0:.3f} s"
+
+    return [(when(i, mark.time_s), mark) for i, mark in enumerate(marks)]
+
+
+def _grave_table(marks: Sequence[tuple[str, Mark]]) -> Table:
+    """Every event that matters; of faults that differ in numbers only, the first, with count and time of the last."""
+    alike: dict[tuple[str, str, str], list[tuple[str, Mark]]] = {}
+    for i, (when, mark) in enumerate(marks):
+        text = str(i) if mark.kind == "tripped" else re.sub(r"\d+([.,]\d+)?", "#", mark.text)
+        alike.setdefault((mark.role, mark.kind, text), []).append((when, mark))
+    table = _marks()
+    for (when, first), *more in alike.values():
+        again = f" (and {len(more)} more like it, the last: {more[-1][0]})" if more else ""
+        style = "bold red" if first.kind in ("tripped", "fault") else ""
+        table.add_row(when, first.role, first.kind, Text(first.text + again), style=style)
+    return table
+
+
+def _marks_table(marks: Sequence[tuple[str, Mark]]) -> Table:
+    table = _marks()
+    for when, mark in marks[:MARKS_SHOWN]:
+        table.add_row(when, mark.role, mark.kind, Text(mark.text))
+    if (more := len(marks) - MARKS_SHOWN) > 0:
+        table.add_row("", "", "", f"… and {more} more such events; --json has them all")
+    return table
+
+
+def _marks() -> Table:
     times, texts = Column(justify="right", no_wrap=True), Column(overflow="fold")
     roles, kinds = Column(no_wrap=True), Column(no_wrap=True)
-    table = Table(times, roles, kinds, texts, show_header=False, box=None, pad_edge=False)
-    for mark in marks[:MARKS_SHOWN]:
-        style = "bold red" if mark.kind in ("tripped", "fault") else ""
-        when = "–" if mark.time_s is None else f"{round(mark.time_s, 3) + 0.0:.3f} s"
-        table.add_row(when, mark.role, mark.kind, Text(mark.text), style=style)
-    if (more := len(marks) - MARKS_SHOWN) > 0:
-        table.add_row("", "", "", f"… and {more} more; --json has them all")
-    return table
+    return Table(times, roles, kinds, texts, show_header=False, box=None, pad_edge=False)
+
+
+def _some(lines: Sequence[str]) -> list[str]:
+    more = len(lines) - DAMAGES_SHOWN
+    return [*lines[:DAMAGES_SHOWN], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
 
 
 def replay_table(replay: Replay) -> None:

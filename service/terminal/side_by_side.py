@@ -11,6 +11,7 @@ from aeroloop.service.report.page.setup import shown
 from aeroloop.service.report.rows import figure_rows
 from aeroloop.service.review.report import Report, differences
 from aeroloop.service.terminal.console import Console
+from aeroloop.service.terminal.log_tables import DAMAGES_SHOWN, timed
 
 
 def comparison_tables(reports: Sequence[Report]) -> None:
@@ -30,5 +31,6 @@ def comparison_tables(reports: Sequence[Report]) -> None:
     console.print()
     console.print(differing if differing.row_count else "the configurations are the same")
     for report in reports:
-        for line in [*report.findings.trips, *report.findings.damages]:
+        trips = [f"{when} {mark.text}" for when, mark in timed(report.findings.marks) if mark.kind == "tripped"]
+        for line in [*trips, *report.findings.damages[:DAMAGES_SHOWN]]:
             console.print(f"{report.name}: {line}", markup=False)

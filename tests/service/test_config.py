@@ -85,7 +85,8 @@ def test_every_key_is_described_and_a_quantity_has_a_unit(key: str) -> None:
          'reference.kind must be "file", "hold", "points", "sinusoid" or "stream", not "hole"'),
         ("reference.frequency=[0,1,-1]", "element 3 of reference.frequency must be a number from 0 to 100, not -1"),
         ("network.rendezvous=7547",
-         "element 1 of network.rendezvous must be a Zenoh endpoint, PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447, not 7547"),
+         "element 1 of network.rendezvous must be a Zenoh endpoint, "
+         "PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447, not 7547"),
         ("plant.rigid_body.allocation=2", "plant.rigid_body.allocation must be three lists of three numbers, not 2"),
     ],
 )  # fmt: skip

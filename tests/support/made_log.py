@@ -99,13 +99,15 @@ def write(
     messages: list[Logged],
     chunk_every: int = 50,
     roles: tuple[str, ...] = ("controller", "plant"),
+    its: Mapping[str, Settings] | None = None,
 ) -> Path:
-    """Write a log with both roles' descriptions and these messages."""
+    """Write a log with both roles' descriptions and these messages; `its` has the settings of roles that differ."""
     path.unlink(missing_ok=True)
     log = LogFile(path)
     for role in roles:
         key = topics.key("description", VEHICLE, role=role)
-        log.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": description(settings, role).model_dump_json()})
+        said = description((its or {}).get(role, settings), role).model_dump_json()
+        log.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": said})
     numbers: Counter[str] = Counter()
     for i, (at_ns, key, payload, published_ns) in enumerate(messages):
         log.add(Message(key, payload, numbers[key], published_ns, None), at_ns)

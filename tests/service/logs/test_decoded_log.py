@@ -96,7 +96,7 @@ def test_what_several_files_repeat_is_written_once_and_the_last_description_stay
     export([tmp_path / "run"], "mcap", tmp_path / "out.mcap")
     with (tmp_path / "out.mcap").open("rb") as file:
         reader = make_reader(file)
-        assert [one.metadata["json"] for one in reader.iter_metadata()] == [now, before, now]
+        assert [one.metadata["json"] for one in reader.iter_metadata()] == [now, before, now, now]
         assert len(list(reader.iter_attachments())) == 1
         summary = reader.get_summary()
         assert summary is not None

@@ -21,10 +21,11 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, from_description, load
 from aeroloop.service.logs.export import export
-from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.files import LogFiles, ReviewError
+from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.logs.table import Rows, TruthColumns, euler_deg, groups
-from aeroloop.service.logs.table_files import ExportError, ParquetFile
+from aeroloop.service.logs.table_files import ParquetFile
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
@@ -269,8 +270,10 @@ def test_the_longest_session_is_exported_or_the_one_that_is_named_or_all(log: Pa
     assert ticks(None) == first
     assert ticks(SHORT) == ticks(f"{VEHICLE}/{SHORT}") == second
     assert ticks("all") == first + second
-    with pytest.raises(ExportError, match=f"{VEHICLE}/{SHORT}"):  # says what there is
-        ticks("none")
+    assert ticks("2") == second
+    for session in ("none", "3", "0"):
+        with pytest.raises(ReviewError, match=f"of {VEHICLE} it holds 1 {SESSION}, 2 {SHORT}"):
+            ticks(session)
 
 
 def test_the_table_does_not_depend_on_how_it_is_cut_into_blocks(
@@ -310,7 +313,7 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(ParquetFile, "write", full)
-    with pytest.raises(ExportError, match="No space left"):
+    with pytest.raises(OutputError, match="No space left"):
         export([log], "parquet", tmp_path / "a.parquet")
     assert sorted(tmp_path.iterdir()) == before
     assert (tmp_path / "there.csv").read_text() == "mine"

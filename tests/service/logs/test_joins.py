@@ -15,7 +15,7 @@ from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Missing
 from aeroloop.service.review.review import read, review
-from tests.support.edited_log import Said, edited, message_of, rewrite
+from tests.support.edited_log import Said, edited, message_of, rewrite, write_messages
 from tests.support.made_log import SESSION, VEHICLE, Logged, made, make_log, write
 from tests.support.rough_log import Known, rough_loop
 
@@ -176,12 +176,15 @@ def test_one_end_alone_is_read_for_what_it_has(tmp_path: Path) -> None:
 
 def test_a_log_of_the_first_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 100)
-    path = rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", metadata=[old_description()])
-    says = "is a log of protocol version 1; read it with aeroloop 0.1, which wrote it"
+    path = write_messages(tmp_path / "b.mcap", [], [old_description()])
+    says = "is not a log of this version: it is of protocol version 1; read it with aeroloop 0.1, which wrote it"
     for reader in (review, lambda path: replay([path])):
         with pytest.raises(ReviewError, match=says) as refused:
             reader(path)
         assert str(refused.value) == f"{path} {says}"
+    both = rewrite(tmp_path / "a.mcap", tmp_path / "c.mcap", metadata=[old_description()])
+    assert review(both).z_track == review(tmp_path / "a.mcap").z_track
+    assert "protocol version 1" in review(both).damages[0]
 
 
 def old_description() -> tuple[str, dict[str, str]]:

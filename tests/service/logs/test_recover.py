@@ -12,9 +12,14 @@ from typing import NamedTuple
 import pytest
 from mcap.reader import make_reader
 
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
+from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recover import RecoverError, recover
+from aeroloop.service.recording.log_file import LogFile
 from aeroloop.service.review.review import review
-from tests.support.made_log import make_log
+from tests.support.made_log import START_NS, VEHICLE, description, lockstep, made, make_log
 
 TICKS = 400
 
@@ -109,7 +114,7 @@ def test_what_is_no_log_or_stands_in_the_way_is_reported_in_one_line(whole: Path
             recover(broken, out)
         assert len(str(refused.value).splitlines()) == 1
         assert not out.exists()
-    with pytest.raises(RecoverError, match="exists already"):
+    with pytest.raises(OutputError, match="is an input"):
         recover(whole, whole)
 
 
@@ -117,8 +122,61 @@ def test_what_a_full_disk_cut_short_is_removed(whole: Path, tmp_path: Path) -> N
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
-        with pytest.raises(RecoverError, match=os.strerror(errno.EFBIG)):
+        with pytest.raises(OutputError, match=os.strerror(errno.EFBIG)):
             recover(whole, tmp_path / "out.mcap")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not (tmp_path / "out.mcap").exists()
+
+
+# Descriptions
+
+
+@pytest.fixture(scope="module", params=["a run's first file", "a later file"])
+def described(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with its descriptions where the recorder puts them: at both ends and, in the first, as messages."""
+    settings, path = lockstep(), tmp_path_factory.mktemp("log") / f"{request.param}.mcap"
+    log = LogFile(path)
+    descriptions = {
+        topics.key("description", VEHICLE, role=role): description(settings, role).encode()
+        for role in ("controller", "plant")
+    }
+
+    def add_metadata() -> None:
+        for key, text in descriptions.items():
+            log.add_metadata(DESCRIPTION_METADATA, {"key": key, "json": text.decode()})
+
+    add_metadata()
+    for key, text in descriptions.items() if "first" in request.param else ():
+        log.add(Delivery(key, text, 0, START_NS, None), START_NS)
+    log.commit()
+    for i, one in enumerate(made(settings, 100)):
+        log.add(Delivery(one.key, one.payload, i, one.published_ns, None), one.at_ns)
+    log.commit()
+    add_metadata()
+    log.end()
+    return path
+
+
+def test_one_flipped_bit_in_a_description_costs_no_log_and_changes_no_figure(described: Path, tmp_path: Path) -> None:
+    """Wherever it flips: in JSON, in a name, in a length, in a chunk; and what is recovered of it is read as well."""
+    data, rng = described.read_bytes(), random.Random(4)
+    at = [i for i in range(len(data)) if data.startswith(b'{"protocol":2', i)]
+    assert len(at) == 4  # uncompressed, of two roles, at both ends
+    chunk = data.index(b"zstd")
+    spots = [place - 120 + rng.randrange(3000) for place in at for _ in range(4)]
+    spots += [at[0] - d for d in (2, 4, 60, 100)]
+    if "first" in described.name:  # the first chunk has nothing but descriptions
+        spots += [chunk + 12 + 9 * i for i in range(4)]
+    clean = review(described)
+    bent, out = tmp_path / "bent.mcap", tmp_path / "out.mcap"
+    for spot in spots:
+        damaged = bytearray(data)
+        damaged[spot] ^= 1 << rng.randrange(8)
+        bent.write_bytes(damaged)
+        assert recover(bent, out).lost, spot
+        for path in (bent, out):
+            figures = review(path)
+            assert (figures.z_track, figures.u_total) == (clean.z_track, clean.u_total), spot
+        assert review(bent).damages, spot
+        out.unlink()

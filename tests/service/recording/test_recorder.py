@@ -293,8 +293,9 @@ def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothi
     running = record(decoded_hz=25.0)
     session = gathering.join()
     names = {topics.key(name, "aero", role="plant"): name for name in topics.RECORDED}
-    for key in names:
-        CachedPublisher(session, key, per_s=1).put(b"\xff\x00")
+    publishers = [CachedPublisher(session, key, per_s=1) for key in names]  # as long as they live, so do their caches
+    for publisher in publishers:
+        publisher.put(b"\xff\x00")
     eventually("all", lambda: running.recorder.log.written >= len(names) + 2)
     running.end()
     assert running.error is None

@@ -207,7 +207,7 @@ KEYS = {
     "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
     "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
     "gaps", "gap_count", "saturated", "invalid", "losses", "lapses", "marks", "theorem", "checks", "missing_ticks",
-    "missing", "frames", "clock_offset_us", "faults",
+    "missing", "frames", "clock_offset_us", "faults", "recorded", "disagreements",
 }  # fmt: skip
 THEOREM_KEYS = {
     "verdict", "holds", "radius", "radius_deg", "transient_s", "since_s", "until_s", "z_norm", "z_norm_share",
@@ -243,8 +243,9 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
 ) -> None:
     make_log(tmp_path / "whole.mcap", TICKS, settings=load(), lost=range(50, 53))
     more = [
-        message_of("event", Event(role="plant", kind="refused", text=f"no {i}"), START_NS + 500_000_000 + i)
+        message_of("event", Event(role="plant", kind=kind, text=f"no {i} {kind}"), START_NS + 500_000_000 + i)
         for i in range(15)
+        for kind in ("refused", "armed")
     ]
     more.append(
         message_of("event", Event(role="plant", kind="tripped", text="the [red] limit"), START_NS + 410_000_000)
@@ -254,6 +255,7 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
     assert "latency 298 298 298 300 µs" in out
-    assert "0.406 s plant tripped the [red] limit" in out
-    assert "… and 5 more" in out
+    assert out.startswith("0.406 s plant tripped the [red] limit 0.4")
+    assert "plant refused no 0 refused (and 14 more like it, the last: 0.406 s)" in out
+    assert "… and 4 more such events" in out  # beside what the session began with
     assert "✗ gaps ≤ 0 1" in out

@@ -15,7 +15,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Truth
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Stream
 from aeroloop.service.config import Settings, load
-from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, with_checksum
 from aeroloop.service.logs.runs import BLOCK
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.report.plots import draw_theorem
@@ -336,7 +336,7 @@ def with_description(path: Path, out: Path, certificate: dict[str, Any]) -> Path
         certificate=certificate,
     )
     entry = {"key": "aeroloop/aero/description/controller", "json": description.model_dump_json()}
-    return rewrite(path, out, metadata=[(DESCRIPTION_METADATA, entry)])
+    return rewrite(path, out, metadata=[(DESCRIPTION_METADATA, with_checksum(DESCRIPTION_METADATA, entry))])
 
 
 def test_the_contracts_certificate_is_what_counts_unless_the_session_began_with_other_gains(

@@ -1,0 +1,249 @@
+"""Which session and vehicle a review judges, whose settings it shows, and that it never mixes unrelated runs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event
+from aeroloop.protocol.messages.operator import Gains
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import Settings, load
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.mcap_file import RECORDER_METADATA
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.runs import Run
+from aeroloop.service.review.compare import Comparison, read_runs
+from aeroloop.service.review.review import read, report, review
+from tests.support.edited_log import message_of, rewrite
+from tests.support.made_log import START_NS, VEHICLE, Logged, description, lockstep, made, write
+
+HOUR_NS = 3_600_000_000_000
+OTHER = "beta"
+
+
+def of_vehicle(messages: list[Logged], vehicle: str) -> list[Logged]:
+    return [one._replace(key=one.key.replace(f"/{VEHICLE}/", f"/{vehicle}/")) for one in messages]
+
+
+def described(settings: Settings, role: str, vehicle: str = VEHICLE, at_ns: int = 0) -> Logged:
+    """A description as a message."""
+    text = description(settings, role).model_copy(update={"vehicle": vehicle}).model_dump_json()
+    return Logged(START_NS + at_ns, topics.key("description", vehicle, role=role), text.encode(), START_NS + at_ns)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sessions of a vehicle, whose controller was restarted with other gains, and one of another vehicle."""
+    first, second, other = load(), load(overrides=["law.C2=[0.3, 0.3, 0.3]"]), load(overrides=["plant.aero.mass=1.3"])
+    messages = [
+        *(described(first, role) for role in ("controller", "plant")),
+        *(described(other, role, OTHER) for role in ("controller", "plant")),
+        *made(first, 200),
+        *of_vehicle(made(other, 150, session="b1", at_ns=HOUR_NS), OTHER),
+        described(second, "controller", at_ns=2 * HOUR_NS),
+        *made(second, 100, session="s2", at_ns=2 * HOUR_NS),
+    ]
+    path = tmp_path_factory.mktemp("log") / "log.mcap"
+    write(path.with_name("plain"), first, messages, roles=())
+    trips = [
+        message_of(
+            "event", Event(role="plant", kind="tripped", text=f"trip of {session}", session=session, tick=50), at
+        )
+        for session, at in (("s1", START_NS + 10**8), ("s2", START_NS + 2 * HOUR_NS + 10**8))
+    ]
+    trips.append(trips[0]._replace(key=topics.key("event", OTHER)))
+    rewrite(path.with_name("plain"), path, more=trips)
+    path.with_name("plain").unlink()
+    return path
+
+
+# Sessions and vehicles
+
+
+def test_the_longest_session_is_judged_unless_one_is_named_or_numbered(log: Path) -> None:
+    def which(**chosen: Any) -> tuple[str, str]:
+        return read(log, **chosen).which
+
+    assert which() == which(session="1") == which(session="s1") == (VEHICLE, "s1")
+    assert which(session="2") == which(session="aero/s2") == which(session="s2", vehicle=VEHICLE) == (VEHICLE, "s2")
+    assert which(vehicle=OTHER) == which(session="1", vehicle=OTHER) == which(session="b1") == (OTHER, "b1")
+    for session, vehicle in (("3", None), ("0", None), (None, "x"), ("s1", OTHER)):
+        with pytest.raises(ReviewError):
+            read(log, session=session, vehicle=vehicle)
+
+
+def test_a_session_is_judged_by_the_configuration_that_it_began_with(log: Path, tmp_path: Path) -> None:
+    """And as if it stood alone; else its gains would be those of the controller that came later."""
+    alone = {"1": load(), "2": load(overrides=["law.C2=[0.3, 0.3, 0.3]"])}
+    for number, settings in alone.items():
+        found = read(log, session=number)
+        assert found.session.settings.law == settings.law
+        messages = made(settings, 200 if number == "1" else 100)
+        assert found.figures.z_track == review(write(tmp_path / "a.mcap", settings, messages)).z_track
+    replayed = replay([log])
+    assert [(one.session, one.differ) for one in replayed.sessions] == [("s1", 0), ("b1", 0), ("s2", 0)]
+
+
+def test_trips_are_of_the_vehicle_and_of_a_named_session_alone(log: Path) -> None:
+    assert read(log).findings.trips == ["trip of s1", "trip of s2"]
+    assert read(log, session="2").findings.trips == ["trip of s2"]
+    assert read(log, vehicle=OTHER).findings.trips == ["trip of s1"]
+    assert [mark.time_s for mark in read(log, session="2").findings.marks if mark.kind == "tripped"] == [None, 0.1]
+
+
+def test_the_account_lists_vehicles_and_sessions_and_which_is_shown(
+    log: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.html"
+    assert execute(["log", "review", str(log), "--session", "2", "--html", str(page)]) == 0
+    out = " ".join(capfd.readouterr().out.split())
+    assert out.startswith("before plant tripped trip of s1 0.100 s plant tripped trip of s2 duration")
+    assert "session s2 of aero" in out
+    assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out
+    assert "sessions 1 s1, 0.4 s 2 s2, 0.2 s, shown --session N shows another of 2" in out
+    assert "session s2" in page.read_text()
+    assert export([log], "csv", tmp_path / "b.csv", vehicle=OTHER).sessions == ["beta/b1"]
+    assert export([log], "csv", tmp_path / "all.csv", session="all").sessions == ["aero/s1", "aero/s2"]
+
+
+# Runs
+
+
+def recorded(path: Path, messages: list[Logged], identity: str | None) -> Path:
+    """A log that a recorder of this identity wrote."""
+    settings = load()
+    write(path.with_suffix(".plain"), settings, messages)
+    entry = {"json": f'{{"run": "a", "part": "a", "id": "{identity}"}}'}
+    out = rewrite(path.with_suffix(".plain"), path, metadata=[(RECORDER_METADATA, entry)] if identity else [])
+    path.with_suffix(".plain").unlink()
+    return out
+
+
+@pytest.mark.parametrize("identities", [("x", "y"), (None, None), ("x", None)])
+def test_unrelated_runs_are_refused_by_every_reader(
+    tmp_path: Path, identities: tuple[str | None, str | None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    a = recorded(tmp_path / "a.mcap", made(load(), 200), identities[0])
+    b = recorded(tmp_path / "b.mcap", made(load(), 100, session="s2", at_ns=HOUR_NS), identities[1])
+    for command in (("review",), ("replay",), ("export", "--to", "csv"), ("export", "--to", "mcap")):
+        for logs in ([str(a), str(b)], [str(tmp_path)]):
+            assert execute(["log", *command, *logs]) == 1
+            (line,) = capfd.readouterr().err.splitlines()
+            assert f"2 unrelated runs ({a}; {b})" in line
+            assert "log compare" in line
+    assert execute(["log", "compare", str(a), str(b)]) == 0
+
+
+def test_what_a_restarted_recorder_wrote_is_one_run(tmp_path: Path) -> None:
+    """The loop went on meanwhile: its processes are the same. So is a recorder's run, even if the loop is another."""
+    messages = made(load(), 400)
+    parts = [recorded(tmp_path / f"{i}.mcap", messages[i::2], f"id{i}") for i in range(2)]
+    assert review(*parts).z_track == review(recorded(tmp_path / "whole", messages, None)).z_track
+    later = recorded(tmp_path / "later.mcap", made(load(), 100, session="s2", at_ns=HOUR_NS), "id1")
+    assert len(Run([later, *parts]).extents) == 2
+
+
+# Whose settings
+
+
+def test_settings_are_those_of_the_role_that_owns_them_and_disagreements_are_findings(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    controller = load()
+    plant = load(
+        overrides=["plant.aero.mass=2.0", 'plant.faults=["rate:off@5"]', "law.C2=[9, 9, 9]", "loop.priority=7"]
+    )
+    recorder = load(overrides=["recorder.decoded_hz=50"])
+    its: Mapping[str, Settings] = {"plant": plant, "recorder": recorder}
+    roles = ("controller", "plant", "recorder")
+    path = write(tmp_path / "a.mcap", controller, made(controller, 100), roles=roles, its=its)
+    shown = report([path])
+    assert shown.settings["plant"] == plant.description()["plant"]
+    assert shown.settings["recorder"]["decoded_hz"] == 50
+    assert shown.settings["law"] == controller.description()["law"]
+    differ = [(one.key, one.controller, one.plant) for one in shown.findings.disagreements]
+    assert differ == [("plant.aero.mass", controller.plant.aero.mass, 2.0)]
+    assert execute(["log", "review", str(path)]) == 0
+    out = " ".join(capfd.readouterr().out.split())
+    assert f"ends disagree plant.aero.mass: controller {controller.plant.aero.mass}, plant 2.0" in out
+
+
+def test_runs_differ_by_what_their_plants_were_and_not_by_addresses(tmp_path: Path) -> None:
+    runs = []
+    for name, mass in (("a", "1.1"), ("b", "2.0")):
+        mine = [f"network.rendezvous=tcp/127.0.0.1:{len(name)}", f"recorder.path={name}", f"can.options.port={mass}"]
+        plant = load(overrides=[*mine, f"plant.aero.mass={mass}"])
+        controller = load(overrides=mine)
+        runs.append(write(tmp_path / f"{name}.mcap", controller, made(controller, 60), its={"plant": plant}))
+    assert [one.key for one in Comparison.of(read_runs(runs)).differences] == ["plant.aero.mass"]
+
+
+def test_lockstep_has_no_durations_and_says_why(tmp_path: Path) -> None:
+    shown = report([write(tmp_path / "a.mcap", lockstep(), made(lockstep(), 100))])
+    findings = shown.findings
+    assert (findings.latency_us, findings.timing, findings.age_us) == (None, {}, None)
+    for name in ("latency_us", "age_us", "timing.latency", "timing.period"):
+        assert "lockstep" in findings.reasons[name]
+    assert not {"latency", "period"} & {panel.group for panel in shown.panels}
+    export([tmp_path / "a.mcap"], "csv", tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row[name] for row in rows for name in ("latency_us", "measurement_delay_us", "command_delay_us")} == {""}
+
+
+def test_the_latency_is_that_of_the_session(tmp_path: Path) -> None:
+    """Not that of the plant's process since its start, as its status has it."""
+    findings = read(write(tmp_path / "a.mcap", load(), made(load(), 100))).findings
+    assert findings.latency_us is not None
+    assert (findings.latency_us.p50, findings.latency_us.count) == (
+        findings.timing["latency"].p50,
+        findings.timing["latency"].count,
+    )
+
+
+# What is said
+
+
+def test_events_that_matter_come_first_and_the_certificate_once(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    settings = load()
+    path = write(tmp_path / "a.mcap", settings, made(settings, 300, {20: (Gains(C2=(0.2, 0.2, 0.2)), None)}))
+    verdict = read(path).session.observer.trial.findings()[0].verdict
+    happened = [("controller", "started", verdict.rstrip(".")), ("controller", "changed", verdict.rstrip("."))]
+    happened += [("plant", "armed", f"armed {i}") for i in range(30)]
+    happened += [("controller", "fault", f"{i} ticks missed") for i in range(5)]
+    happened += [("plant", "tripped", f"no command for {i} ms: 0 V") for i in (100, 101)]
+    more = [
+        message_of("event", Event.model_validate({"role": role, "kind": kind, "text": text}), START_NS + 4 * 10**8 + i)
+        for i, (role, kind, text) in enumerate(happened)
+    ]
+    assert execute(["log", "review", str(rewrite(path, tmp_path / "b.mcap", more=more))]) == 0
+    out = " ".join(capfd.readouterr().out.split())
+    assert out.index("no command for 101 ms") < out.index("duration") < out.index("armed 0")
+    assert "0 ticks missed (and 4 more like it" in out
+    assert "no command for 100 ms: 0 V" in out
+    assert out.count(verdict[:60]) == 1
+
+
+def test_messages_of_strangers_cost_nothing_but_themselves(tmp_path: Path) -> None:
+    settings = load()
+    path = write(tmp_path / "a.mcap", settings, made(settings, 200, truth_every=10))
+    junk = [
+        message_of(topic, data, START_NS + 10**8 + i * 10 + j, role="plant")
+        for i, topic in enumerate(("event", "status", "loss", "truth", "description", "trace"))
+        for j, data in enumerate((b"", b"[" * 100_000, b"\xff", b'{"protocol": 7}'))
+    ]
+    found, clean = read(rewrite(path, tmp_path / "b.mcap", more=junk)), read(path)
+    assert found.figures.z_track == clean.figures.z_track
+    assert found.findings.theorem == clean.findings.theorem
+    assert export([tmp_path / "b.mcap"], "csv", tmp_path / "b.csv").damages[-1] == "malformed: 4 of truth"
+    for topic in ("event", "status", "loss", "truth"):
+        assert f"malformed: 4 of {topic}" in found.figures.damages
