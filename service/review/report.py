@@ -1,6 +1,6 @@
 """Report of a run as data: what `log review --json` prints and what its page draws.
 
-A `Report` has figures, events, and lines thinned out so that a page can hold hours of them. review.py fills it; it does
+A `Report` has figures, events, and lines: of minutes every tick, of hours an outline. review.py fills it; it does
 not depend on how it is shown.
 """
 
@@ -149,6 +149,11 @@ class Line:
     desired: bool = False
     """Whether it is the desired value."""
 
+    @property
+    def held(self) -> bool:
+        """Whether it holds its value from one tick to the next; desired and true values do not."""
+        return not self.desired and not self.label.startswith("true")
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -169,6 +174,21 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class Band:
+    """A span of time that is shaded on every drawing over time, with a label: such as an injected fault.
+
+    Attributes:
+        start_s: On the law's clock [s].
+        end_s: None if it did not end within the session.
+        label: In a few words.
+    """
+
+    start_s: float
+    end_s: float | None
+    label: str
+
+
+@dataclass(frozen=True)
 class Report:
     """A run.
 
@@ -179,6 +199,8 @@ class Report:
         panels: What is drawn over time, in the order of the paper's figures.
         thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
             and the largest value.
+        part: The span of the law's clock that is drawn, if it is not the whole session [s].
+        bands: Shaded spans of time.
         settings: The effective configuration, as nested tables.
         facts: Facts about software and host, by role: versions, git revision, kernel, notes.
     """
@@ -190,6 +212,8 @@ class Report:
     thinned: int
     settings: dict[str, Any]
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    part: tuple[float, float] | None = None
+    bands: Sequence[Band] = ()
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

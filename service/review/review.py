@@ -7,6 +7,7 @@ controller, bit for bit. Of several sessions, it judges the longest.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from aeroloop.service.logs.wire_check import WireCheck
 from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.findings import facts_of, findings_of, name_of
+from aeroloop.service.review.observe import WHOLE, DrawnPart
 from aeroloop.service.review.report import Findings, Report
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.session import Session
@@ -50,9 +52,14 @@ class Review(NamedTuple):
     facts: dict[str, dict[str, Any]]
 
     def report(self, limits: Sequence[Limit] = ()) -> Report:
-        """The review as data, checked against limits."""
-        observer = self.session.observer
+        """The review as data, checked against limits. Raises ReviewError if the part to draw has no tick."""
+        observer, part = self.session.observer, self.session.part
         time, panels = observer.lines()
+        if not len(time) and part[:2] != WHOLE[:2]:
+            lasts = self.findings.duration_s
+            raise ReviewError(
+                f"nothing to draw from {part.since_s:g} s to {part.until_s:g} s: the session has {lasts:g} s"
+            )
         return Report(
             name=self.name,
             findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),
@@ -61,6 +68,7 @@ class Review(NamedTuple):
             thinned=observer.thinned,
             settings=self.session.settings.description(),
             facts=self.facts,
+            part=None if part[:2] == WHOLE[:2] else part[:2],
         )
 
 
@@ -69,24 +77,36 @@ def review(*paths: Path) -> Figures:
     return read(*paths).figures
 
 
-def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
+def report(
+    paths: Sequence[Path],
+    limits: Sequence[Limit] = (),
+    progress: Progress | None = None,
+    part: DrawnPart = WHOLE,
+) -> Report:
     """Report of a run's longest session. Raises as `read` does.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         limits: Limits that its figures must keep.
         progress: Called repeatedly with the share done, 0…1.
+        part: What of it is drawn.
     """
-    return read(*paths, progress=progress).report(limits)
+    return read(*paths, progress=progress, part=part).report(limits)
 
 
-def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: Progress | None = None) -> Review:
+def read(
+    *paths: Path,
+    watch: Callable[[Ticks], None] | None = None,
+    progress: Progress | None = None,
+    part: DrawnPart = WHOLE,
+) -> Review:
     """Read a run and judge its longest session. The figures list what cannot be read of a broken file.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         watch: Called with every block of the session's ticks.
         progress: Called repeatedly with the share done, 0…1.
+        part: What of it is drawn.
 
     Raises:
         ReviewError: Not a log, or one without a session.
@@ -103,7 +123,7 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
             return TheoremCheck(certified, settings.loop.period, damping_of(plant))
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
-        session = Session(settings, plant.watchdog_s, check, missing, watch)
+        session = Session(settings, plant.watchdog_s, check, missing, watch, part)
         frames = WireCheck(which, settings.wire, run.reached)
         events = EventLog(which, settings.loop.period, run.reached, run.open_sessions)
 
@@ -119,9 +139,8 @@ def read(*paths: Path, watch: Callable[[Ticks], None] | None = None, progress: P
         session.finish()
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    status = events.statuses.get((vehicle, "plant"))
-    latency = status.latency_us if status else None
-    reasons = {} if latency else {"latency_us": "the log has no status of the plant with a latency"}
+    latency = session.observer.latency
+    reasons = {} if latency else {"latency_us": "the plant received no answer to a measurement of this session"}
     figures = session.score.figures(
         latency=latency, log=files.name, trips=events.trips, reasons=reasons, damages=files.unread
     )
