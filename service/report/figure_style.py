@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from aeroloop.service.logs.files import ReviewError
 
@@ -32,7 +33,7 @@ FORMATS: Final[dict[str, dict[str, Any]]] = {
 BLUE, ORANGE, GREEN, PURPLE, BLACK = "#0072b2", "#d55e00", "#009e73", "#b0568c", "#222222"
 
 MEASURED: Final[dict[str, Any]] = {"color": BLUE, "linewidth": 0.7}
-DESIRED: Final[dict[str, Any]] = {"color": ORANGE, "linewidth": 1.0, "linestyle": (0, (4, 1.5))}
+DESIRED: Final[dict[str, Any]] = {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (3.5, 2.5))}
 TRUE: Final[dict[str, Any]] = {"color": GREEN, "linewidth": 0.9, "linestyle": (0, (1, 1))}
 
 _STYLE: Final[dict[str, Any]] = {
@@ -73,6 +74,7 @@ def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure
     axes: list[Axes] = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
     for axis in axes:
         axis.margins(x=0)
+        axis.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     return figure, axes
@@ -83,6 +85,8 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once, not for each format
         for path, options in zip(paths, FORMATS.values(), strict=True):
             figure.savefig(path, **options)
     except OSError as error:

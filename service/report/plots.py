@@ -30,13 +30,10 @@ FIGURES: Final[dict[str, Sequence[str]]] = {
 """Figures by name, with the groups of panels in each."""
 
 _LETTERS: Final = {
-    "η": r"\eta",
-    "ε": r"\epsilon",
-    "ε̃": r"\tilde{\epsilon}",
-    "ω": r"\omega",
-    "u": "u",
-    "ω_e": r"\omega_{e",
-}
+    "η": r"\eta", "ε": r"\epsilon_{}", "ε̃": r"\tilde{{\epsilon}}_{}", "ω": r"\omega_{}", "ω_e": r"\omega_{{e,{}}}",
+    "u": "u_{}",
+}  # fmt: skip
+_NORMS: Final = {"‖z‖": r"$\|z\|$", "V": "$V$"}
 _AXES: Final = {"₁": "1", "₂": "2", "₃": "3", "1": "1", "2": "2", "3": "3"}
 
 
@@ -65,9 +62,12 @@ def draw_figures(report: Report, settings: Settings, folder: Path, columns: Colu
                 _draw(axis, panel, report)
                 axis.set_ylabel(_label(panel, quantized=case != "continuous"))
             _shade(axes, report)
-            entries = {str(line.get_label()): line for axis in axes for line in axis.get_lines()}
-            if len(entries) > 1:
-                figure.legend(handles=list(entries.values()), loc="outside upper center", ncols=len(entries))
+            labels = [[line.get_label() for line in axis.get_lines()] for axis in axes]
+            if any(each != labels[0] for each in labels):
+                for axis in axes:
+                    axis.legend(loc="upper right")
+            elif len(labels[0]) > 1:
+                figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(labels[0]))
             number = NUMBERS.get((name, case))
             paths += save(figure, folder, f"{number}-{name}" if number else name)
     return paths
@@ -94,11 +94,13 @@ def _stroke(line: Line) -> dict[str, Any]:
 
 def _label(panel: Panel, *, quantized: bool) -> str:
     """An axis label: the panel's letter in mathematics, and the unit if it has one."""
-    letter, axis = panel.label[:-1], _AXES.get(panel.label[-1], "")
-    text = panel.label
-    if letter in _LETTERS or panel.label in _LETTERS:
-        index = f"_{axis}" if letter != "ω_e" else f",{axis}}}"
-        text = f"${_LETTERS.get(letter) or _LETTERS[panel.label]}{index if axis else ''}{'^Q' if quantized else ''}$"
+    axis = _AXES.get(panel.label[-1], "")
+    letter, text = panel.label[:-1] if axis else panel.label, panel.label
+    if letter in _LETTERS:
+        above = "^Q" if quantized else ""
+        text = f"${_LETTERS[letter].format(axis)}{above}$"
+    elif letter in _NORMS:
+        text = _NORMS[letter]
     return text if panel.unit == "1" else f"{text} [{panel.unit}]"
 
 

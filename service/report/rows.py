@@ -97,7 +97,7 @@ THEOREM: Final = "theorem."
 """Prefix of the theorem's keys."""
 
 FIGURES: Final = (
-    _Figure("z_track", "tracking error z_track", "10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
+    _Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
             "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured"),
     _Figure("u_total", "control effort u_total", "V²·s", _tenth, True, "∫ uᵀu dt, u the voltages as sent"),
     _Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,

@@ -56,10 +56,8 @@ class Review(NamedTuple):
         observer, part = self.session.observer, self.session.part
         time, panels = observer.lines()
         if not len(time) and part[:2] != WHOLE[:2]:
-            lasts = self.findings.duration_s
-            raise ReviewError(
-                f"nothing to draw from {part.since_s:g} s to {part.until_s:g} s: the session has {lasts:g} s"
-            )
+            until, lasts = "" if part.until_s == inf else f" and before {part.until_s:g} s", self.findings.duration_s
+            raise ReviewError(f"nothing to draw after {max(0.0, part.since_s):g} s{until}: the session has {lasts:g} s")
         return Report(
             name=self.name,
             findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),

@@ -25,7 +25,7 @@ function stroke(line) {
   if (isMain(line)) return runStroke(line.run);
   const color = colour(lineColour(line));
   if (several && !line.shared) return { color, width: 1, dash: line.desired ? "1px,3px" : "5px,5px" };
-  return { color, width: line.desired ? 2.5 : 1.1 };
+  return { color, width: line.desired ? 2.5 : 1.1, dash: line.held || line.desired ? "solid" : "6px,4px" };
 }
 
 /** What a line needs to be drawn between two times, in a drawing so many pixels wide.
@@ -207,7 +207,7 @@ async function drawGroup(figure) {
 
 /** How a line's swatch looks in the key. */
 function keyDash(line) {
-  if (!several || line.shared) return "";
+  if (!several || line.shared) return line.held || line.desired ? "" : "dash";
   return isMain(line) ? runDash(line.run) : "dot";
 }
 

@@ -111,15 +111,15 @@ def _moments(report: Report, index: int) -> list[Html]:
 def _facts(report: Report) -> list[str]:
     run, facts = report.findings, []
     if run.sessions > 1:
-        facts.append(f"the longest of {run.sessions} sessions is judged")
+        facts.append(f"The longest of {run.sessions} sessions is judged.")
     if report.settings.get("loop", {}).get("lockstep"):
-        facts.append("the loop ran in lockstep: its durations are not those of real time")
+        facts.append("The loop ran in lockstep: its durations are not those of real time.")
     if run.losses:
-        facts.append(f"the recorder lost {_count(sum(run.losses.values()), 'message')}")
+        facts.append(f"The recorder lost {_count(sum(run.losses.values()), 'message')}.")
     if missing := sum(run.missing_ticks.values()):
-        facts.append(f"{_count(missing, 'tick')} were not recorded")
+        facts.append(f"{_count(missing, 'tick')} were not recorded.")
     if run.damages:
-        facts.append("not all of the log could be read")
+        facts.append("Not all of the log could be read.")
     return facts
 
 
