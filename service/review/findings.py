@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from aeroloop.service.figures import Figures
 from aeroloop.service.logs.runs import Run
@@ -12,6 +12,8 @@ from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.session import Session
+
+IN_LOCKSTEP: Final = "in lockstep nothing is in real time"
 
 FrameCounts = dict[str, dict[str, int]] | None
 """Of `WireCheck`."""
@@ -24,7 +26,9 @@ def findings_of(
     observer, offset = session.observer, session.reader.offset
     timing, age = observer.timing, events.age_us
     reasons = dict(figures.reasons)
-    if age is None:
+    if session.settings.loop.lockstep:
+        age, reasons["age_us"] = None, IN_LOCKSTEP
+    elif age is None:
         reasons["age_us"] = "the log has no status of the controller with an age"
     for name, why in (("period", "fewer than two measurements"), ("latency", "no measurement was answered")):
         if name not in timing:

@@ -24,7 +24,7 @@ from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.logs.wire_check import WireCheck
 from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
 from aeroloop.service.review.events import EventLog
-from aeroloop.service.review.findings import facts_of, findings_of, name_of
+from aeroloop.service.review.findings import IN_LOCKSTEP, facts_of, findings_of, name_of
 from aeroloop.service.review.observe import WHOLE, DrawnPart
 from aeroloop.service.review.report import Findings, Report
 from aeroloop.service.review.requirements import Limit
@@ -137,8 +137,10 @@ def read(
         session.finish()
     except (ValidationError, ConfigError) as error:
         raise ReviewError(f"{paths[0]} is not a log of this version: {str(error).splitlines()[0]}") from None
-    latency = session.observer.latency
-    reasons = {} if latency else {"latency_us": "the plant received no answer to a measurement of this session"}
+    lockstep = settings.loop.lockstep
+    latency = None if lockstep else session.observer.latency
+    why = IN_LOCKSTEP if lockstep else "the plant received no answer to a measurement of this session"
+    reasons = {} if latency else {"latency_us": why}
     figures = session.score.figures(
         latency=latency, log=files.name, trips=events.trips, reasons=reasons, damages=files.unread
     )

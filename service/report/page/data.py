@@ -151,11 +151,13 @@ def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]
     """Whether the desired values of all runs agree, so that one line can stand for all."""
     desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
     one_each = len(desired) in (0, len(alike)) and len(alike) == len(reports)
-    return one_each and all(_agree(*desired[0], *other) for other in desired[1:])
+    least, most = _extent([line.values for _, panel in alike for line in panel.lines])
+    visible = 0.02 * max(abs(least), abs(most))
+    return one_each and all(_agree(visible, *desired[0], *other) for other in desired[1:])
 
 
-def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
-    """Whether two lines are the same, as far as can be seen, for as long as both last.
+def _agree(visible: float, time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
+    """Whether two lines are nowhere further apart than what is visible, for as long as both last.
 
     They need not be the same to the last bit: each was sampled, and perhaps thinned out, in its own way.
     """
@@ -164,7 +166,7 @@ def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -
     both = (time >= other_time[0]) & (time <= other_time[-1]) & np.isfinite(values)
     apart = np.abs(np.interp(time[both], other_time, other_values) - values[both])
     apart = apart[np.isfinite(apart)]
-    return bool(len(apart) and apart.max() <= 0.02 * np.abs(values[both]).max())
+    return bool(len(apart) and apart.max() <= visible)
 
 
 def _sparse(values: Array) -> bool:

@@ -200,15 +200,15 @@ async function drawGroup(figure) {
   plot.on("plotly_doubleclick", () => moveTime("whole"));
   plot.addEventListener("keydown", moveByKey);
   const lines = group.panels.flatMap((panel) => panel.lines).sort((one, other) => one.desired - other.desired);
-  const meanings = new Map(lines.map((line) => [lineName(line), line]));
-  if (meanings.size > 1 || several)
-    showKey(figure, [...meanings].map(([name, line]) => [name, lineColour(line), keyDash(line), isMain(line) ? line.run : undefined]));
+  const meanings = new Map(lines.map((line) => [isMain(line) ? line.run : line.label, line]));
+  if (meanings.size > 1 || several) showKey(figure, [...meanings.values()].map(keyEntry));
 }
 
-/** How a line's swatch looks in the key. */
-function keyDash(line) {
-  if (!several || line.shared) return line.held || line.desired ? "" : "dash";
-  return isMain(line) ? runDash(line.run) : "dot";
+/** A line's entry in the key: its name, colour, kind of dashes, and the run that it stands for. */
+function keyEntry(line) {
+  if (isMain(line)) return [data.runs[line.run].name, `--run-${line.run % 8}`, runDash(line.run), line.run];
+  if (several) return [line.label, "--quiet", line.shared ? "" : line.desired ? "dot" : "dash"];
+  return [line.label, lineColour(line), line.held || line.desired ? "" : "dash"];
 }
 
 /** The kind of border that is nearest to a run's dashes. */

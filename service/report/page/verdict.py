@@ -178,7 +178,7 @@ def _delta(row: Row, run: int) -> Html:
     if delta is None:
         return tag("td", "–", class_="number delta")
     sign = {"better": "▼ ", "worse": "▲ "}.get(delta.word or "", "")
-    word = tag("span", f"{sign}{delta.word}", class_=f"word {delta.word}") if delta.word else None
+    word = tag("span", f"{sign}{delta.word or ''}", class_=f"word {delta.word or ''}")
     return tag("td", delta.text, " ", word, class_="number delta")
 
 

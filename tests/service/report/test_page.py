@@ -206,6 +206,10 @@ def test_a_comparison_states_differences_to_the_first_run_in_words() -> None:
     assert row("final attitude error") == ["0.46", "0.46", "0", "same"]
     assert row("trips")[2:] == ["−1 (−100.0 %)", "▼ better"]
     assert "Δ to a" in texts
+    longer = first.findings.model_copy(update={**update, "duration_s": 20.0})
+    texts = Texts(page([first, replace(first, name="b", findings=longer)])).texts
+    assert row("tracking error z_track")[2:] == ["+45.80 (+100.0 %)", "×10⁻⁴ s"]  # a sum over twice the time
+    assert row("largest attitude error")[3] == "▼ better"
 
 
 def test_a_missing_figure_states_why() -> None:
