@@ -68,7 +68,8 @@ def _figure(burden: Burden) -> Figure:
     for panel, name in zip(panels, names, strict=False):
         _draw(panel, [point for point in burden.under(name) if point.reason is None])
         panel.annotate(f"sensors: {name}", (1, 1), xycoords="axes fraction", xytext=(-4, -4),
-                       textcoords="offset points", ha="right", va="top")  # fmt: skip
+                       textcoords="offset points", ha="right", va="top",
+                       bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
     errors = [_place(point)[1] for point in burden.points if point.reason is None]
     panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
     for i, panel in enumerate(panels):

@@ -65,7 +65,7 @@ def draw_figures(report: Report, settings: Settings, folder: Path, columns: Colu
             labels = [[line.get_label() for line in axis.get_lines()] for axis in axes]
             if any(each != labels[0] for each in labels):
                 for axis in axes:
-                    axis.legend(loc="upper right")
+                    axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0)
             elif len(labels[0]) > 1:
                 figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(labels[0]))
             number = NUMBERS.get((name, case))
@@ -109,7 +109,7 @@ def _shade(axes: Sequence[Axes], report: Report) -> None:
     for band in report.bands:
         end_s = float(report.time[-1]) if band.end_s is None else band.end_s
         for axis in axes:
-            axis.axvspan(band.start_s, end_s, facecolor="0.85", edgecolor="0.7", linewidth=0.4, zorder=0)
+            axis.axvspan(band.start_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
         axes[0].annotate(
             band.label, (band.start_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
             textcoords="offset points", va="top", fontsize=6,

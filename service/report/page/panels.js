@@ -111,13 +111,15 @@ function bandsShown() {
   return data.bands.filter((band) => band.to >= from && band.from <= to && !hiddenRuns.has(band.run));
 }
 
-/** Labels of the bands, within the top of the first panel. */
+const BAND_ROWS = Math.min(3, data.bands.length); // of labels, so that neighbours do not overlap
+
+/** Labels of the bands, above the first panel. */
 function bandLabels() {
   const [from, to] = timeWindow.shown;
   return bandsShown().map((band, i) => ({
     text: plain(several ? `${data.runs[band.run].name}: ${band.label}` : band.label), x: Math.max(band.from, from), y: 1,
-    yref: "y domain", xanchor: band.from > (from + to) / 2 ? "right" : "left", yanchor: "top", xshift: 3, yshift: -14 * (i % 4),
-    showarrow: false, font: { size: 11, color: colour("--ink") }, bgcolor: colour("--paper"), opacity: 0.85, borderpad: 1,
+    yref: "y domain", xanchor: band.from > (from + to) / 2 ? "right" : "left", yanchor: "bottom", yshift: 15 + 14 * (i % BAND_ROWS),
+    showarrow: false, font: { size: 11, color: colour("--ink") }, borderpad: 0,
   }));
 }
 
@@ -131,7 +133,7 @@ function marks() {
     shapes.push({ ...across, path: `M${timeWindow.marked},0 L${timeWindow.marked},1`, opacity: 0.35,
       line: { color: colour("--accent"), width: 9 } });
   for (const { run, ...band } of bandsShown())
-    shapes.push({ ...across, path: `M${band.from},0 L${band.to},0 L${band.to},1 L${band.from},1 Z`, opacity: 0.2,
+    shapes.push({ ...across, path: `M${band.from},0 L${band.to},0 L${band.to},1 L${band.from},1 Z`, opacity: 0.15,
       line: { width: 0 }, fillcolor: colour(several ? `--run-${run % 8}` : "--band") });
   data.runs.forEach((run, index) => {
     if (hiddenRuns.has(index)) return;
@@ -158,7 +160,7 @@ function timeLayout(group) {
   const rows = group.panels.length;
   const layout = {
     ...plainLayout(),
-    margin: { l: 54, r: 10, t: 22, b: 36 },
+    margin: { l: 54, r: 10, t: 22 + 14 * BAND_ROWS, b: 36 },
     hovermode: "x unified",
     hoversubplots: "axis",
     dragmode: pointed ? "zoom" : false,
