@@ -66,7 +66,7 @@ _STYLE: Final[dict[str, Any]] = {
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Every figure that is drawn and saved within has the style."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]  # its keys are literals in the stubs
         yield
 
 

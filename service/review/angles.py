@@ -13,7 +13,7 @@ def roll_pitch_yaw(q: Array) -> Array:
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.degrees(np.column_stack([roll, pitch, yaw]))
+    return np.asarray(np.degrees(np.column_stack([roll, pitch, yaw])))
 
 
 def without_jumps(angles: Array, last: Array) -> Array:

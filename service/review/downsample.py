@@ -42,8 +42,14 @@ class Buckets(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Several, one after the other."""
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))  # type: ignore[arg-type]  # as they were
+        """Several, at least one, one after the other; no copy where one suffices."""
+        filled = [part for part in parts if len(part.rows)] or parts[:1]
+        if len(filled) == 1:
+            return filled[0]
+        low = np.concatenate([part.low for part in filled])
+        exact = all(part.low is part.high for part in filled)
+        high = low if exact else np.concatenate([part.high for part in filled])
+        return cls(low, high, *map(np.concatenate, zip(*(part[2:] for part in filled), strict=True)))
 
     def followed_by(self, other: Self) -> Self:
         """These buckets, followed by others."""
@@ -94,7 +100,10 @@ class DownsampledLines:
         self._parts.append(part)
         self._count += len(part.rows)
         while self._count * (1 if self.per_bucket == 1 else 2) > self._max_points:
-            whole = Buckets.joined(self._parts).paired()
+            parts, self._parts = self._parts, []
+            whole = Buckets.joined(parts)
+            del parts  # a third of the memory
+            whole = whole.paired()
             self._parts = [whole.part(slice(-1)), whole.part(slice(-1, None))]  # the last may not be full
             self._count = len(whole.rows)
             self.per_bucket *= 2

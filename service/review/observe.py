@@ -148,7 +148,7 @@ class Observer:
     def latency(self) -> Percentiles | None:
         """Loop latency of this session [µs]; None if it is not known."""
         spread = self._timing["latency"].spread()
-        return spread and Percentiles(**spread.model_dump(include=set(Percentiles.model_fields)))
+        return None if spread is None else Percentiles(**spread.model_dump(include=set(Percentiles.model_fields)))
 
     @property
     def gaps(self) -> list[Gap]:

@@ -390,6 +390,7 @@ def test_the_guarantee_is_drawn_after_the_transient_and_until_gains_or_reference
     (level,) = (line for panel in panels if panel.group == "z_norm" for line in panel.lines if line.desired)
     assert changed_s == 32.0
     assert 0 < settled_s < 32.0
+    assert check.radius is not None
     np.testing.assert_array_equal(level.values, np.where((time >= settled_s) & (time < 32.0), check.radius, np.nan))
 
 
