@@ -100,6 +100,13 @@ def test_the_loop_latency_is_that_of_the_session_whatever_the_plant_counted_befo
     assert findings.latency_us.p50 == findings.timing["latency"].p50 == pytest.approx(300, rel=0.044)
 
 
+def test_in_lockstep_there_is_no_latency_and_no_age_and_the_reason_is_stated(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 100, settings=load(overrides=["loop.lockstep=true"]))
+    findings = found(tmp_path / "a.mcap")
+    assert (findings.latency_us, findings.age_us) == (None, None)
+    assert findings.reasons["latency_us"] == findings.reasons["age_us"] == "in lockstep nothing is in real time"
+
+
 def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: Path, tmp_path: Path) -> None:
     def status(i: int, p50: float, p99: float, most: float, session: str | None = "s1") -> Said:
         age = Percentiles(count=9, p50=p50, p99=p99, p999=p99, max=most)
