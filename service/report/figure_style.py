@@ -1,6 +1,6 @@
 """Style of figures for print: a journal's column widths, one colour scheme, PDF, SVG and PNG, no titles.
 
-Colours are those of Okabe and Ito, which the colour-blind can tell apart; in grey, line styles and markers do the same.
+Colours are those of Okabe and Ito, which differ for the colour-blind, too; in grey, line styles and markers differ.
 The same bytes come out for the same figure: files have no date, and SVG ids no salt.
 """
 
