@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from aeroloop.service.logs.export import Exported
     from aeroloop.service.logs.recover import Recovery
-    from aeroloop.service.logs.ticks import Ticks
 
 Logs = Annotated[list[Path], typer.Argument(help="MCAP logs, folders, or a rotated run.", show_default=False)]
 
@@ -43,7 +43,17 @@ group = typer.Typer(no_args_is_help=True, help="Review, compare, replay, recover
 def review(
     logs: Logs,
     figures: Annotated[
-        Path | None, typer.Option("--figures", help="Draw the paper's figures into this folder.", show_default=False)
+        Path | None,
+        typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.", show_default=False),
+    ] = None,
+    columns: Annotated[
+        Literal["1", "2"], typer.Option("--columns", help="Width of the figures: 3.5 in, or 7.16 in for two columns.")
+    ] = "1",
+    since_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Draw from this time on only.", show_default=False)
+    ] = None,
+    until_s: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Draw to this time only.", show_default=False)
     ] = None,
     require: Annotated[
         list[str] | None,
@@ -72,23 +82,25 @@ def review(
         check_page(html, logs, force)
 
     from aeroloop.service.logs.outputs import writing_into
+    from aeroloop.service.review.observe import DrawnPart
     from aeroloop.service.review.review import read
     from aeroloop.service.terminal.display import share_bar
     from aeroloop.service.terminal.log_tables import review_account
 
-    kept: list[Ticks] = []
+    if since_s is not None and until_s is not None and since_s >= until_s:
+        fail(f"--from {since_s:g} is not before --to {until_s:g}", 2)
+    part = DrawnPart(-inf if since_s is None else since_s, inf if until_s is None else until_s)
     with guarded():
         with share_bar("reading", hidden=json) as update:
-            watch = None if figures is None else kept.append
-            judged = read(*logs, session=session, vehicle=vehicle, watch=watch, progress=update)
+            judged = read(*logs, session=session, vehicle=vehicle, progress=update, part=part)
         report = judged.report(limits)
         if figures is not None:
-            from aeroloop.service.report.plots import draw_figures, draw_theorem
+            from aeroloop.service.report.plots import draw_figures
 
             with writing_into(figures, logs, force=force) as folder:
-                drawn = [*draw_figures(judged.session.settings, kept, folder), *draw_theorem(report, folder)]
-            for path in drawn:
-                typer.echo(f"aeroloop: drew {figures / path.name}", err=True)
+                drawn = draw_figures(report, judged.session.settings, folder, 1 if columns == "1" else 2)
+            names = ", ".join(dict.fromkeys(path.stem for path in drawn))
+            typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
         if html is not None:
             write_html([report], html, logs, force)
         findings = report.findings

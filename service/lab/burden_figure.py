@@ -18,18 +18,18 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from aeroloop.service.lab.burden import Burden, Point
 from aeroloop.service.lab.burden_grid import BurdenError
 from aeroloop.service.lab.burden_table import short_name
+from aeroloop.service.report.figure_style import BLACK, BLUE, FORMATS, GREEN, ORANGE, PURPLE, WIDTH_IN, figure_style
 
-SUFFIXES: Final = (".png", ".svg", ".pdf")
-# Colours that differ in brightness as well, for print and for red-blind readers.
+SUFFIXES: Final = tuple(f".{name}" for name in FORMATS)
 _STYLES: Final = {
-    "uniform": ("#1f5fa8", "o"),
-    "hysteresis-uniform": ("#d9731a", "s"),
-    "logarithmic-uniform": ("#2a9d74", "^"),
-    "hysteresis-rate": ("#8b3fa0", "p"),
-    None: ("#222222", "D"),
+    "uniform": (BLUE, "o"),
+    "hysteresis-uniform": (ORANGE, "s"),
+    "logarithmic-uniform": (GREEN, "^"),
+    "hysteresis-rate": (PURPLE, "p"),
+    None: (BLACK, "D"),
 }
-_LABEL_WIDTH: Final = 0.15
-_LABEL_HEIGHT: Final = 0.045
+_LABEL_WIDTH: Final = 0.2
+_LABEL_HEIGHT: Final = 0.055
 """Decades that a label covers."""
 _TICKS: Final = [digit * 10**power for power in range(-1, 6) for digit in (1, 2, 3, 5)]
 
@@ -50,14 +50,26 @@ def draw_burden(burden: Burden, path: Path) -> None:
         BurdenError: The file cannot be written.
     """
     check_path(path)
+    with figure_style():
+        figure = _figure(burden)
+        try:
+            figure.savefig(path, **FORMATS[path.suffix[1:]])
+        except OSError as error:
+            raise BurdenError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _figure(burden: Burden) -> Figure:
     names = list(burden.sensors)
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure(figsize=(1.2 + 4.4 * columns, 1.2 + 3.3 * rows), layout="constrained")
+    width = WIDTH_IN[1 if columns == 1 else 2]
+    figure = Figure(figsize=(width, 0.75 + 2.5 * rows), layout="constrained")
     panels: list[Axes] = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten().tolist()
     for panel, name in zip(panels, names, strict=False):
         _draw(panel, [point for point in burden.under(name) if point.reason is None])
-        panel.set_title(f"sensors: {name}", fontsize=11)
+        panel.annotate(f"sensors: {name}", (1, 1), xycoords="axes fraction", xytext=(-4, -4),
+                       textcoords="offset points", ha="right", va="top",
+                       bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
     errors = [_place(point)[1] for point in burden.points if point.reason is None]
     panels[0].set_ylim(0.78 * min(errors), 1.2 * max(errors))
     for i, panel in enumerate(panels):
@@ -66,13 +78,10 @@ def draw_burden(burden: Burden, path: Path) -> None:
         if i % columns == 0:
             panel.set_ylabel(r"$z_\mathrm{track}$ [$10^{-4}$ s]")
         if i + columns >= len(names):  # the last of its column
-            panel.set_xlabel("payload of measurements and commands [kbit/s]", fontsize=9)
+            panel.set_xlabel("payload of measurements and commands [kbit/s]")
             panel.tick_params(labelbottom=True)
-    figure.legend(handles=_legend(burden), loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    try:
-        figure.savefig(path, dpi=150)
-    except OSError as error:
-        raise BurdenError(f"cannot write {path}: {error.strerror}") from None
+    figure.legend(handles=_legend(burden), loc="outside lower center", ncols=3)
+    return figure
 
 
 def _place(point: Point) -> tuple[float, float]:
@@ -86,30 +95,27 @@ def _draw(panel: Axes, points: list[Point]) -> None:
     panel.set_xscale("log")
     panel.set_yscale("log")
     panel.margins(x=0.08)
-    panel.grid(visible=True, color="0.92")
-    panel.set_axisbelow(True)
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_major_locator(FixedLocator(_TICKS))
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.tick_params(labelsize=9)
     front = sorted({_place(point): point for point in points if point.pareto}.items())
-    panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=1.2, zorder=2)
+    panel.plot(*zip(*(place for place, _ in front), strict=True), color="0.45", linewidth=0.9, zorder=2)
     for point in points:
         color, marker = _STYLES[point.quantizer]
         panel.plot(
             *_place(point),
             marker,
             color=color,
-            markersize=6,
+            markersize=4,
             markerfacecolor=color if point.transmit == "on_change" else "white",
             linestyle="none",
             zorder=4 if point.pareto else 3,
         )
         if point.is_baseline:
             payload, error = _place(point)
-            panel.axvline(payload, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
-            panel.axhline(error, color="0.3", linewidth=0.9, linestyle=":", zorder=1)
+            panel.axvline(payload, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
+            panel.axhline(error, color="0.3", linewidth=0.6, linestyle=":", zorder=1)
     _label(panel, [(point.label, place) for place, point in front])
 
 
@@ -122,7 +128,7 @@ def _label(panel: Axes, labels: list[tuple[str, tuple[float, float]]]) -> None:
         ):
             continue
         placed.append((x, y))
-        panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
+        panel.annotate(label, (x, y), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", fontsize=6)
 
 
 def _legend(burden: Burden) -> list[Line2D]:
@@ -135,11 +141,11 @@ def _legend(burden: Burden) -> list[Line2D]:
         _key(color, marker, "float64"),
         _key("0.4", "o", "sent on change"),
         _key("0.4", "o", "sent at every tick", full=False),
-        Line2D([], [], color="0.45", linewidth=1.2, label="Pareto front, bits out/in"),
-        Line2D([], [], color="0.3", linewidth=0.9, linestyle=":", label="float64 at every tick"),
+        Line2D([], [], color="0.45", linewidth=0.9, label="Pareto front, bits out/in"),
+        Line2D([], [], color="0.3", linewidth=0.6, linestyle=":", label="float64 at every tick"),
     ]
 
 
 def _key(color: str, marker: str, label: str, *, full: bool = True) -> Line2D:
     face = color if full else "white"
-    return Line2D([], [], color=color, marker=marker, markerfacecolor=face, linestyle="none", markersize=6, label=label)
+    return Line2D([], [], color=color, marker=marker, markerfacecolor=face, linestyle="none", markersize=4, label=label)

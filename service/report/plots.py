@@ -1,115 +1,116 @@
-"""Figures C.4–C.14 of the paper, drawn from a log into PNG files; and one of the theorem's bounds.
+"""Figures of a session for a paper: roll, pitch and yaw, Figures C.4–C.14, and what the theorem bounds.
 
-All five quantities are drawn in every case; `NUMBERS` of review/panels.py has the paper's number of each.
+All quantities are drawn in every case; `NUMBERS` of review/panels.py has the paper's number of each.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from aeroloop.service.config import Settings
 from aeroloop.service.logs.files import ReviewError
-from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.panels import NUMBERS, case_of, title_of
-from aeroloop.service.review.report import Report
+from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, Columns, figure_style, save, stacked
+from aeroloop.service.review.panels import NUMBERS, case_of
+from aeroloop.service.review.report import Line, Panel, Report
 
-Array = npt.NDArray[np.float64]
+FIGURES: Final[dict[str, Sequence[str]]] = {
+    "angles": ["angles"],
+    "attitude": ["attitude"],
+    "rate": ["rate"],
+    "error": ["attitude_error"],
+    "rate_error": ["rate_error"],
+    "input": ["input"],
+    "theorem": ["z_norm", "lyapunov"],
+}
+"""Figures by name, with the groups of panels in each."""
+
+_LETTERS: Final = {
+    "η": r"\eta", "ε": r"\epsilon_{}", "ε̃": r"\tilde{{\epsilon}}_{}", "ω": r"\omega_{}", "ω_e": r"\omega_{{e,{}}}",
+    "u": "u_{}",
+}  # fmt: skip
+_NORMS: Final = {"‖z‖": r"$\|z\|$", "V": "$V$"}
+_AXES: Final = {"₁": "1", "₂": "2", "₃": "3", "1": "1", "2": "2", "3": "3"}
 
 
-def draw_figures(settings: Settings, blocks: Sequence[Ticks], folder: Path) -> list[Path]:
-    """Draw every quantity of a session into PNG files and return their paths.
+def draw_figures(report: Report, settings: Settings, folder: Path, columns: Columns = 1) -> list[Path]:
+    """Draw what a report has, each figure as PDF, SVG and PNG, and return the paths.
 
     Args:
+        report: Its lines are drawn, every tick where it has them, and its bands.
         settings: The configuration of its controller.
-        blocks: Its ticks.
         folder: Target folder; created if missing.
+        columns: How many of a journal's columns the figures are wide.
 
     Raises:
         ReviewError: The session has no ticks, or the folder cannot be written.
     """
-    ticks = Ticks.joined(blocks) if blocks else None
-    if ticks is None or not len(ticks.k):
+    if not len(report.time):
         raise ReviewError("the log has no answered measurement to draw")
-    case, actuators = case_of(settings), settings.wire.actuators
-    t = np.asarray(ticks.k * settings.loop.period, dtype=np.float64)
-    q, axes = "" if case == "continuous" else "^Q", (1, 2, 3)
-    desired = ticks.desired
-    attitude = ticks.attitude * np.sign(np.sum(ticks.attitude * desired, axis=1, keepdims=True))  # of ±q, the nearer
-    euler = [rf"$\eta{q}$", *(rf"$\epsilon_{i}{q}$" for i in axes)]
-    errors, rates = [rf"$\tilde{{\epsilon}}_{i}{q}$" for i in axes], [rf"$\omega_{i}{q}$" for i in axes]
-    rate_errors, motors = [rf"$\omega_{{e,{i}}}{q}$" for i in axes], [rf"$u_{i}{q}$" for i in axes[3 - actuators :]]
-    drawings: list[tuple[str, str, Array, Array | None, list[str], str]] = [
-        ("attitude", "Attitude", attitude, desired, euler, "1"),
-        ("rate", "Angular velocity", ticks.rate, ticks.desired_rate, rates, "rad/s"),
-        ("error", "Attitude error", ticks.attitude_error, None, errors, "1"),
-        ("rate_error", "Angular velocity error", ticks.rate_error, None, rate_errors, "rad/s"),
-        ("input", "Input", ticks.voltages, None, motors, "V"),
-    ]
-    paths = []
-    for name, quantity, values, wanted, labels, unit in drawings:
-        figure = _stack(title_of(name, quantity, case), t, values, wanted, [f"{label} [{unit}]" for label in labels])
-        number = NUMBERS.get((name, case))
-        paths.append(_save(figure, folder / f"{f'{number}-' if number else ''}{name}.png"))
+    case, paths = case_of(settings), list[Path]()
+    with figure_style():
+        for name, groups in FIGURES.items():
+            panels = [panel for group in groups for panel in report.panels if panel.group == group]
+            if not panels:
+                continue
+            figure, axes = stacked(len(panels), columns)
+            for axis, panel in zip(axes, panels, strict=True):
+                _draw(axis, panel, report)
+                axis.set_ylabel(_label(panel, quantized=case != "continuous"))
+            _shade(axes, report)
+            labels = [[line.get_label() for line in axis.get_lines()] for axis in axes]
+            if any(each != labels[0] for each in labels):
+                for axis in axes:
+                    axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0)
+            elif len(labels[0]) > 1:
+                figure.legend(handles=axes[0].get_lines(), loc="outside upper center", ncols=len(labels[0]))
+            number = NUMBERS.get((name, case))
+            paths += save(figure, folder, f"{number}-{name}" if number else name)
     return paths
 
 
-def draw_theorem(report: Report, folder: Path) -> list[Path]:
-    """Draw ‖z‖ with its guaranteed radius, and V, into a PNG file, and return its path; none without ticks.
-
-    The folder is created if missing. Raises ReviewError if it cannot be written.
-    """
-    drawn = [panel for panel in report.panels if panel.group in ("z_norm", "lyapunov")]
-    if not drawn:
-        return []
-    figure, axes = _figure("What the theorem bounds", len(drawn), 2.0)
-    for axis, panel in zip(axes, drawn, strict=True):
-        for line in panel.lines:
-            known = np.isfinite(line.values)  # true states are published less often than ticks
-            color, style = ("#c8401e", ":") if line.desired else (None, "-")
-            axis.plot(
-                report.time[known], line.values[known], linewidth=0.9, label=line.label, color=color, linestyle=style
-            )
-        axis.set_ylabel(f"{panel.label}{f' [{panel.unit}]' if panel.unit != '1' else ''}")
-        axis.legend(fontsize=9)
-    return [_save(figure, folder / "theorem.png")]
+def _draw(axis: Axes, panel: Panel, report: Report) -> None:
+    for line in sorted(panel.lines, key=lambda line: line.label != "measured"):
+        known = np.isfinite(line.values) if not line.held else slice(None)
+        steps = "steps-post" if line.held and report.thinned <= 2 else "default"
+        axis.plot(
+            report.time[known],
+            line.values[known],
+            label=line.label.replace("θ̃", r"$\tilde{\theta}$"),
+            drawstyle=steps,
+            **_stroke(line),
+        )
 
 
-def _stack(title: str, t: Array, values: Array, desired: Array | None, labels: Sequence[str]) -> Figure:
-    """A panel per component, with a shared time axis; the desired value, where there is one, is dotted."""
-    figure, panels = _figure(title, len(labels), 1.4)
-    for i, panel in enumerate(panels):
-        panel.plot(t, values[:, i], color="#1f5fa8", linewidth=0.9, label="measured")
-        if desired is not None:
-            panel.plot(t, desired[:, i], color="#c8401e", linewidth=1.1, linestyle=":", label="desired")
-        panel.set_ylabel(labels[i])
-        panel.set_axisbelow(True)
-    if desired is not None:
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower right", fontsize=9, ncols=2)
-    return figure
+def _stroke(line: Line) -> dict[str, Any]:
+    if line.desired:
+        return DESIRED
+    return MEASURED if line.held else TRUE
 
 
-def _figure(title: str, panels: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with panels of this height [in] over one time axis."""
-    figure = Figure(figsize=(8, 1.5 + height * panels), layout="constrained")
-    figure.suptitle(title, fontsize=12)
-    axes: list[Axes] = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
-    for axis in axes:
-        axis.grid(visible=True, color="0.9")
-        axis.margins(x=0)
-    axes[-1].set_xlabel("time [s]")
-    return figure, axes
+def _label(panel: Panel, *, quantized: bool) -> str:
+    """An axis label: the panel's letter in mathematics, and the unit if it has one."""
+    axis = _AXES.get(panel.label[-1], "")
+    letter, text = panel.label[:-1] if axis else panel.label, panel.label
+    if letter in _LETTERS:
+        above = "^Q" if quantized else ""
+        text = f"${_LETTERS[letter].format(axis)}{above}$"
+    elif letter in _NORMS:
+        text = _NORMS[letter]
+    return text if panel.unit == "1" else f"{text} [{panel.unit}]"
 
 
-def _save(figure: Figure, path: Path) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        raise ReviewError(f"cannot write figures into {path.parent}: {error.strerror}") from None
-    return path
+def _shade(axes: Sequence[Axes], report: Report) -> None:
+    """Shade the report's bands on every panel, and label them on the first."""
+    for band in report.bands:
+        end_s = float(report.time[-1]) if band.end_s is None else band.end_s
+        for axis in axes:
+            axis.axvspan(band.start_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
+        axes[0].annotate(
+            band.label, (band.start_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
+            textcoords="offset points", va="top", fontsize=6,
+        )  # fmt: skip

@@ -12,6 +12,8 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from aeroloop.service.review.downsample import MAX_POINTS
+from aeroloop.service.review.observe import DrawnPart
 from aeroloop.service.review.report import Findings, Report, differences
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import report
@@ -57,7 +59,8 @@ def read_runs(
     def share(done: int) -> Callable[[float], None] | None:
         return None if progress is None else lambda part: progress((done + part) / len(logs))
 
-    return named_apart([report([log], limits, share(i)) for i, log in enumerate(logs)])
+    part = DrawnPart(points=MAX_POINTS // len(logs))  # one page holds them all
+    return named_apart([report([log], limits, share(i), part) for i, log in enumerate(logs)])
 
 
 def named_apart(reports: Sequence[Report]) -> list[Report]:

@@ -1,4 +1,4 @@
-"""Downsampling of lines in bounded memory, so that a page can hold hours of them.
+"""Downsampling of lines in bounded memory, so that a page holds every tick of minutes, and an outline of hours.
 
 Rows go into buckets, each with the least and the largest value of every column and the order of the two. When there are
 too many buckets, neighbours are merged in pairs; so the number of points is bounded whatever the length, and no extreme
@@ -7,6 +7,7 @@ is lost. While there are few enough rows, each is a bucket of its own and the li
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -15,8 +16,8 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-MAX_POINTS: Final = 4096
-"""Points of a line: two for each pixel of a wide screen."""
+MAX_POINTS: Final = 180_000
+"""Points of a line. While a session has no more ticks (six minutes at 500 Hz), every tick is drawn."""
 
 
 class Buckets(NamedTuple):
@@ -39,9 +40,20 @@ class Buckets(NamedTuple):
         """Every row in a bucket of its own. Shape (rows, columns)."""
         return cls(rows, rows, np.ones(rows.shape, dtype=bool), np.ones(len(rows), dtype=np.int64))
 
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Several, at least one, one after the other; no copy where one suffices."""
+        filled = [part for part in parts if len(part.rows)] or parts[:1]
+        if len(filled) == 1:
+            return filled[0]
+        low = np.concatenate([part.low for part in filled])
+        exact = all(part.low is part.high for part in filled)
+        high = low if exact else np.concatenate([part.high for part in filled])
+        return cls(low, high, *map(np.concatenate, zip(*(part[2:] for part in filled), strict=True)))
+
     def followed_by(self, other: Self) -> Self:
         """These buckets, followed by others."""
-        return type(self)(*map(np.concatenate, zip(self, other, strict=True)))  # type: ignore[arg-type]  # as they were
+        return self.joined([self, other])
 
     def part(self, cut: slice) -> Self:
         """A slice of the buckets."""
@@ -70,21 +82,30 @@ class DownsampledLines:
     """
 
     def __init__(self, columns: int, max_points: int = MAX_POINTS) -> None:
-        self._buckets = Buckets.of(np.empty((0, columns)))
+        self._parts = [Buckets.of(np.empty((0, columns)))]
+        self._count = 0
         self._max_points = max_points
         self.per_bucket = 1
 
     def add(self, rows: Array) -> None:
         """Add rows. Shape (rows, columns)."""
-        buckets, size = Buckets.of(rows), 1
-        while size < self.per_bucket and len(buckets.rows) > 1:
-            buckets, size = buckets.paired(), 2 * size
-        self._buckets = self._buckets.followed_by(buckets)
-        # If a bucket holds more rows than one call adds, the last one is filled up.
-        while len(self._buckets.rows) > 1 and int(self._buckets.rows[-2:].sum()) <= self.per_bucket:
-            self._buckets = self._buckets.paired(len(self._buckets.rows) - 2)
-        while len(self._buckets.rows) * (1 if self.per_bucket == 1 else 2) > self._max_points:
-            self._buckets = self._buckets.paired()
+        part, size = Buckets.of(rows), 1
+        while size < self.per_bucket and len(part.rows) > 1:
+            part, size = part.paired(), 2 * size
+        last = self._parts[-1]
+        if len(part.rows) == len(last.rows) == 1 and part.rows[0] + last.rows[0] <= self.per_bucket:
+            # A bucket may hold more rows than one call adds: the last one is filled up.
+            part = self._parts.pop().followed_by(part).paired()
+            self._count -= 1
+        self._parts.append(part)
+        self._count += len(part.rows)
+        while self._count * (1 if self.per_bucket == 1 else 2) > self._max_points:
+            parts, self._parts = self._parts, []
+            whole = Buckets.joined(parts)
+            del parts  # a third of the memory
+            whole = whole.paired()
+            self._parts = [whole.part(slice(-1)), whole.part(slice(-1, None))]  # the last may not be full
+            self._count = len(whole.rows)
             self.per_bucket *= 2
 
     def points(self) -> Array:
@@ -92,7 +113,7 @@ class DownsampledLines:
 
         The two stand in the middle of the bucket's first and second half, each line's extremes in order of time.
         """
-        low, high, rising, rows = self._buckets
+        low, high, rising, rows = Buckets.joined(self._parts)
         if self.per_bucket == 1:
             return low
         points = np.empty((2 * len(rows), low.shape[1]))

@@ -84,13 +84,10 @@ def findings_of(
 
 
 def latency_of(session: Session) -> tuple[Percentiles | None, str]:
-    """Loop latency of a session, or the reason why there is none."""
+    """Loop latency of a session, and the reason if there is none."""
     if session.settings.loop.lockstep:
         return None, LOCKSTEP
-    spread = session.observer.timing.get("latency")
-    if spread is None:
-        return None, "no measurement was answered"
-    return Percentiles(**spread.model_dump(include=set(Percentiles.model_fields))), ""
+    return session.observer.latency, "no measurement was answered"
 
 
 def _repeats(mark: Mark, verdict: str) -> bool:

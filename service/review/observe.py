@@ -7,21 +7,40 @@ session is. Durations go into histograms, lines into buckets (downsample.py), an
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from math import nan
-from typing import Final
+from math import inf, nan
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.config import Settings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
 from aeroloop.service.review.accumulators import Durations, SaturationCount
-from aeroloop.service.review.downsample import DownsampledLines
+from aeroloop.service.review.angles import beside, of_nearer_sign, roll_pitch_yaw, without_jumps
+from aeroloop.service.review.downsample import MAX_POINTS, DownsampledLines
 from aeroloop.service.review.panels import columns_of, panels_of, with_level
 from aeroloop.service.review.report import Gap, Panel, Spread
 from aeroloop.service.review.theorem_check import TheoremCheck
 
 LONGEST_GAPS: Final = 100
+
+
+class DrawnPart(NamedTuple):
+    """What of a session is drawn; its figures are of all of it.
+
+    Attributes:
+        since_s: From this time on, on the law's clock [s].
+        until_s: To this time [s].
+        points: The most points of a line: so many ticks are drawn each by itself, more in buckets.
+    """
+
+    since_s: float = -inf
+    until_s: float = inf
+    points: int = MAX_POINTS
+
+
+WHOLE: Final = DrawnPart()
 
 
 class Observer:
@@ -30,17 +49,20 @@ class Observer:
     Args:
         settings: The configuration of its controller.
         check: Checks it against the theorem.
+        part: What of it is drawn.
 
     Attributes:
         trial: The same check.
     """
 
-    def __init__(self, settings: Settings, check: TheoremCheck) -> None:
+    def __init__(self, settings: Settings, check: TheoremCheck, part: DrawnPart = WHOLE) -> None:
         wire = settings.wire
         self._period = settings.loop.period
         self.trial = check
         self._columns = columns_of(settings, theta=check.damping_known)
-        self._lines = DownsampledLines(1 + len(self._columns))  # k, then what is drawn
+        self._part = part
+        self._lines = DownsampledLines(1 + len(self._columns), part.points)  # k, then what is drawn
+        self._last_angles: Array = np.zeros(3)
         self._outermost = {name: SaturationCount(getattr(wire, name)) for name in ("attitude", "rate", "voltage")}
         self._timing = {name: Durations() for name in ("period", "latency", "measurement_delay", "command_delay")}
         self._longest: list[tuple[int, int]] = []
@@ -83,27 +105,29 @@ class Observer:
         durations = periods, ticks.latency_ns, ticks.measurement_delay_ns, ticks.command_delay_ns
         for histogram, values in zip(self._timing.values(), durations, strict=True):
             histogram.add(values[~np.isnan(values)])
-        desired, error = ticks.desired, ticks.attitude_error
-        turned_away = np.sum(ticks.attitude * desired, axis=1, keepdims=True) < 0
-        attitude = np.where(turned_away, -ticks.attitude, ticks.attitude)  # of ±q, the nearer to q_d
-        true_angle, theorem = self.trial.ticks(ticks)
+        desired, error, drawn = ticks.desired, ticks.attitude_error, self.trial.ticks(ticks)
+        angles = without_jumps(roll_pitch_yaw(desired), self._last_angles)
+        self._last_angles = angles[-1]
+        seen, true = (beside(roll_pitch_yaw(q), angles) for q in (ticks.attitude, drawn.true_attitude))
+        t = ticks.k * self._period
         self._lines.add(
             np.column_stack(
                 [
                     ticks.k.astype(np.float64),
-                    _alternating(attitude, desired),
+                    _alternating(seen, angles, true),
+                    _alternating(of_nearer_sign(ticks.attitude, desired), desired),
                     _alternating(ticks.rate, ticks.desired_rate),
                     error,
                     ticks.rate_error,
                     ticks.voltages,
                     np.degrees(2 * np.arcsin(np.minimum(1.0, np.linalg.norm(error, axis=1)))),
-                    true_angle,
+                    drawn.true_error,
                     ticks.latency_ns * 1e-3,
                     periods * 1e-3,
                     ticks.damping_estimate,
-                    theorem,
+                    drawn.norms,
                 ]
-            )
+            )[(t >= self._part.since_s) & (t <= self._part.until_s)]
         )
 
     # ── results ──
@@ -119,6 +143,12 @@ class Observer:
     def timing(self) -> dict[str, Spread]:
         """Spreads by name, without empty ones."""
         return {name: spread for name, one in self._timing.items() if (spread := one.spread()) is not None}
+
+    @property
+    def latency(self) -> Percentiles | None:
+        """Loop latency of this session [µs]; None if it is not known."""
+        spread = self._timing["latency"].spread()
+        return None if spread is None else Percentiles(**spread.model_dump(include=set(Percentiles.model_fields)))
 
     @property
     def gaps(self) -> list[Gap]:
@@ -139,10 +169,12 @@ class Observer:
     def lines(self) -> tuple[Array, list[Panel]]:
         """Times on the law's clock [s] and panels."""
         points = self._lines.points()
-        panels = panels_of(self._columns, points[:, 1:])
-        return points[:, 0] * self._period, with_level(panels, "z_norm", "guaranteed in the end", self.trial.radius)
+        panels, time = panels_of(self._columns, points[:, 1:]), points[:, 0] * self._period
+        since_s, until_s = self.trial.judged_s
+        judged = (time >= since_s) & (time < until_s)
+        return time, with_level(panels, "z_norm", "guaranteed in the end", self.trial.radius, judged)
 
 
-def _alternating(one: Array, other: Array) -> Array:
-    """The columns of both, interleaved. Shape (n, 2·columns)."""
-    return np.stack([one, other], axis=2).reshape(len(one), -1)
+def _alternating(*tables: Array) -> Array:
+    """The first column of each, then the second of each, and so on. Shape (n, tables·columns)."""
+    return np.stack(tables, axis=2).reshape(len(tables[0]), -1)

@@ -2,7 +2,7 @@
 
 A log is one run, and a run is one of the paper's three cases: without quantization (C.4–C.6), with it (C.7–C.11), with
 it and wind (C.12–C.14). Every quantity is drawn in every case; a title has the paper's number where the paper has
-that figure. Quantities without a figure in the paper follow: timing, estimates, and the theorem's norms.
+that figure. Roll, pitch and yaw come before them; timing, estimates, and the theorem's norms follow.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from itertools import groupby
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from aeroloop.service.config import Settings
 from aeroloop.service.logs.traces import Array
@@ -77,12 +78,13 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
     true_V = "true, with θ̃" if theta else "true, without θ̃"
     rate_errors, inputs = ("ω_e1", "ω_e2", "ω_e3"), ("u₁", "u₂", "u₃")[3 - settings.wire.actuators :]
     panels: list[tuple[str, str, Sequence[str], str, Sequence[str]]] = [
+        ("angles", "Roll, pitch and yaw", ("roll", "pitch", "yaw"), "°", (*beside, "true")),
         ("attitude", title_of("attitude", "Attitude", case), ("η", "ε₁", "ε₂", "ε₃"), "1", beside),
         ("rate", title_of("rate", "Angular velocity", case), ("ω₁", "ω₂", "ω₃"), "rad/s", beside),
         ("attitude_error", title_of("error", "Attitude error", case), ("ε̃₁", "ε̃₂", "ε̃₃"), "1", ["measured"]),
         ("rate_error", title_of("rate_error", "Angular velocity error", case), rate_errors, "rad/s", ["measured"]),
         ("input", title_of("input", "Input", case), inputs, "V", ["commanded"]),
-        ("error_angle", "Attitude error, as an angle", ["angle"], "deg", ("measured", "true")),
+        ("error_angle", "Attitude error, as an angle", ["angle"], "°", ("measured", "true")),
         ("latency", "Loop latency", ["latency"], "µs", ["latency"]),
         ("period", "Period between measurements", ["period"], "µs", ["period"]),
         ("damping_estimate", "Damping estimate", ("θ̂₁", "θ̂₂", "θ̂₃"), "N·m·s/rad", ["estimated"]),
@@ -111,13 +113,19 @@ def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
     ]
 
 
-def with_level(panels: list[Panel], group: str, label: str, level: float | None) -> list[Panel]:
-    """Panels, with a horizontal line at a level in those of a group; unchanged if the level is None."""
-    if level is None:
+def with_level(
+    panels: list[Panel], group: str, label: str, level: float | None, where: npt.NDArray[np.bool_]
+) -> list[Panel]:
+    """Panels, with a horizontal line at a level in those of a group; unchanged if there is none, or nowhere to draw it.
+
+    Args:
+        panels: The panels.
+        group: That of the panels that get the line.
+        label: The line's.
+        level: Its value.
+        where: The times at which it holds. Shape (n,).
+    """
+    if level is None or not where.any():
         return panels
-    return [
-        replace(panel, lines=[*panel.lines, Line(label, np.full(len(panel.lines[0].values), level), desired=True)])
-        if panel.group == group
-        else panel
-        for panel in panels
-    ]
+    line = Line(label, np.where(where, level, np.nan), desired=True)
+    return [replace(panel, lines=[*panel.lines, line]) if panel.group == group else panel for panel in panels]

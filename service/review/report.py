@@ -1,6 +1,6 @@
 """Report of a run as data: what `log review --json` prints and what its page draws.
 
-A `Report` has figures, events, and lines thinned out so that a page can hold hours of them. review.py fills it; it does
+A `Report` has figures, events, and lines: of minutes every tick, of hours an outline. review.py fills it; it does
 not depend on how it is shown.
 """
 
@@ -185,6 +185,11 @@ class Line:
     desired: bool = False
     """Whether it is the desired value."""
 
+    @property
+    def held(self) -> bool:
+        """Whether it holds its value from one tick to the next; desired and true values do not."""
+        return not self.desired and not self.label.startswith("true")
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -230,6 +235,7 @@ class Report:
         panels: What is drawn over time, in the order of the paper's figures.
         thinned: Ticks per two points of a line: 1 or 2 if nothing was thinned out. Of more, the points are the least
             and the largest value.
+        part: The span of the law's clock that is drawn, if it is not the whole session [s].
         bands: Shaded spans of time.
         settings: The effective configuration, as nested tables; each section is of the role that owns it.
         facts: Facts about software and host, by role: versions, git revision, kernel, notes.
@@ -242,6 +248,7 @@ class Report:
     thinned: int
     settings: dict[str, Any]
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    part: tuple[float, float] | None = None
     bands: Sequence[Band] = ()
 
 

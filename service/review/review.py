@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from aeroloop.service.review.certified_bounds import certified_bounds, damping_o
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.faults import bands
 from aeroloop.service.review.findings import facts_of, findings_of, latency_of, name_of
+from aeroloop.service.review.observe import WHOLE, DrawnPart
 from aeroloop.service.review.report import Findings, Report
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.session import Session
@@ -50,11 +52,14 @@ class Review(NamedTuple):
     facts: dict[str, dict[str, Any]]
 
     def report(self, limits: Sequence[Limit] = ()) -> Report:
-        """The review as data, checked against limits."""
-        observer = self.session.observer
+        """The review as data, checked against limits. Raises ReviewError if the part to draw has no tick."""
+        observer, part = self.session.observer, self.session.part
         time, panels = observer.lines()
         if self.session.settings.loop.lockstep:
             panels = [panel for panel in panels if panel.group not in ("latency", "period")]
+        if not len(time) and part[:2] != WHOLE[:2]:
+            until, lasts = "" if part.until_s == inf else f" and before {part.until_s:g} s", self.findings.duration_s
+            raise ReviewError(f"nothing to draw after {max(0.0, part.since_s):g} s{until}: the session has {lasts:g} s")
         return Report(
             name=self.name,
             findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),
@@ -63,6 +68,7 @@ class Review(NamedTuple):
             thinned=observer.thinned,
             settings=self.session.settings.description(),
             facts=self.facts,
+            part=None if part[:2] == WHOLE[:2] else part[:2],
             bands=bands(self.findings.faults),
         )
 
@@ -72,15 +78,21 @@ def review(*paths: Path) -> Figures:
     return read(*paths).figures
 
 
-def report(paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> Report:
+def report(
+    paths: Sequence[Path],
+    limits: Sequence[Limit] = (),
+    progress: Progress | None = None,
+    part: DrawnPart = WHOLE,
+) -> Report:
     """Report of a run's longest session. Raises as `read` does.
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
         limits: Limits that its figures must keep.
         progress: Called repeatedly with the share done, 0…1.
+        part: What of it is drawn.
     """
-    return read(*paths, progress=progress).report(limits)
+    return read(*paths, progress=progress, part=part).report(limits)
 
 
 def read(
@@ -89,6 +101,7 @@ def read(
     vehicle: str | None = None,
     watch: Callable[[Ticks], None] | None = None,
     progress: Progress | None = None,
+    part: DrawnPart = WHOLE,
 ) -> Review:
     """Read a run and judge a session. The figures list what cannot be read of a broken file.
 
@@ -98,6 +111,7 @@ def read(
         vehicle: Its vehicle; that of the longest session if None.
         watch: Called with every block of the session's ticks.
         progress: Called repeatedly with the share done, 0…1.
+        part: What of it is drawn.
 
     Raises:
         ReviewError: Not a log, several unrelated runs, or no such session.
@@ -112,7 +126,7 @@ def read(
             return TheoremCheck(certified, settings.loop.period, damping_of(settings.plant))
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
-        judged = Session(settings, check, missing, watch)
+        judged = Session(settings, check, missing, watch, part)
         frames = WireCheck(which, settings.wire, run.reached)
         events = EventLog(which, settings.loop.period, run.reached, run.open_sessions, alone=session is not None)
 

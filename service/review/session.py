@@ -19,7 +19,7 @@ from aeroloop.service.logs.runs import Block
 from aeroloop.service.logs.tick_reader import TickReader
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Missing
-from aeroloop.service.review.observe import Observer
+from aeroloop.service.review.observe import WHOLE, DrawnPart, Observer
 from aeroloop.service.review.theorem_check import WAITING, TheoremCheck
 
 _TRUTHS: Final = TypeAdapter(list[Truth])
@@ -41,8 +41,10 @@ class Session:
         check: Creates its check against the theorem, from the changes that it began with.
         missing: Its rows that the log lacks.
         watch: Called with every block of ticks, in order.
+        part: What of it is drawn.
 
     Attributes:
+        part: What of it is drawn.
         score: Its figures of merit.
         lapses: How many ticks were late, missed and so on; see `Findings`.
         reader: Reads its ticks.
@@ -55,8 +57,10 @@ class Session:
         check: Callable[[Sequence[Change]], TheoremCheck],
         missing: Sequence[Missing] = (),
         watch: Callable[[Ticks], None] | None = None,
+        part: DrawnPart = WHOLE,
     ) -> None:
         self.settings = settings
+        self.part = part
         self.score = Score(settings.wire, settings.loop.period, settings.plant.watchdog_s)
         self.lapses: Counter[str] = Counter()
         self.reader = TickReader(settings)
@@ -72,7 +76,7 @@ class Session:
     def observer(self) -> Observer:
         """The observations beside the figures."""
         if self._observer is None:
-            self._observer = Observer(self.settings, self._check(()))
+            self._observer = Observer(self.settings, self._check(()), self.part)
         return self._observer
 
     def truth(self, payload: bytes, _at_ns: int) -> None:
@@ -81,7 +85,7 @@ class Session:
 
     def take(self, block: Block) -> None:
         """Review the next block."""
-        observer = self._observer = self._observer or Observer(self.settings, self._check(block.changes))
+        observer = self._observer = self._observer or Observer(self.settings, self._check(block.changes), self.part)
         observer.trial.changed(block.changes)
         self._session = block.which[1]
         self._add_truths(observer.trial)

@@ -22,6 +22,7 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
+from aeroloop.service.review.angles import of_nearer_sign
 from aeroloop.service.review.certified_bounds import CertifiedBounds
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem.lemma import (
@@ -50,6 +51,20 @@ class Truths(NamedTuple):
     k: Integers
     attitude: Array
     rate: Array
+
+
+class Drawn(NamedTuple):
+    """Values of the ticks of a block to draw, NaN where there is none.
+
+    Attributes:
+        true_error: The true attitude error [deg]. Shape (n,).
+        true_attitude: The true attitude, of ±q the nearer to the desired one, up to its length. Shape (n, 4).
+        norms: Measured and true ‖z‖, measured and true V. Shape (n, 4).
+    """
+
+    true_error: Array
+    true_attitude: Array
+    norms: Array
 
 
 class InequalityCount:
@@ -111,7 +126,7 @@ class TheoremCheck:
         self._since, self._until = 0, inf
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
         self._before: Ticks | None = None  # the last block, for late truths
-        self._drawn = np.empty((0, 4))  # the last true state: its tick, ‖z‖, V and the angle of its error [deg]
+        self._drawn = np.empty((0, 8))  # the last true state, as of `_judge_truths`
         self._counts: dict[str, InequalityCount] = {}
         self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
@@ -135,18 +150,18 @@ class TheoremCheck:
         if tick is not None and (not self._truths or tick > self._truths[-1][0]):
             self._truths.append((tick, attitude, rate))
 
-    def ticks(self, ticks: Ticks) -> tuple[Array, Array]:
-        """Check a block of ticks.
+    @property
+    def judged_s(self) -> tuple[float, float]:
+        """The span of the law's clock within which the guarantee holds, its transient left out [s]."""
+        return self._settled * self._period, self._until * self._period
 
-        Returns:
-            Values to draw, NaN where there is none: the true attitude error [deg], shape (n,); measured and true
-            ‖z‖, measured and true V, shape (n, 4).
-        """
+    def ticks(self, ticks: Ticks) -> Drawn:
+        """Check a block of ticks, and return what is drawn of it."""
         z, V = measured_norm(ticks, self._certified.law)
         if (after := (ticks.k >= self._settled) & (ticks.k < self._until)).any():
             square = (ticks.attitude_error[after] ** 2).sum(axis=1)
             self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
-        true = np.full((3, len(z)), nan)
+        true = np.full((7, len(z)), nan)
         before, self._before = self._before, ticks
         if self._truths and self._truths[0][0] <= ticks.k[-1]:
             late = [] if before is None or before.k[-1] < self._truths[0][0] else [before]
@@ -155,7 +170,7 @@ class TheoremCheck:
                 self._drawn = known[-1:]
                 # Interpolated for drawing only.
                 true = np.array([np.interp(ticks.k, known[:, 0], values, left=nan) for values in known.T[1:]])
-        return true[2], np.column_stack([z, true[0], V, true[1]])
+        return Drawn(true[2], true[3:].T, np.column_stack([z, true[0], V, true[1]]))
 
     def finish(self) -> None:
         """Judge true states of the last block that were received after it."""
@@ -163,14 +178,14 @@ class TheoremCheck:
             self._judge_truths(self._before)
 
     def _judge_truths(self, ticks: Ticks) -> Array | None:
-        """Judge the true states of these ticks: tick, ‖z‖, V, error [deg] of each, shape (n, 4); None without one."""
+        """Judge the true states of these ticks: tick, ‖z‖, V, error [deg] and q of each, (n, 8); None without one."""
         truths = self._take_truths(int(ticks.k[0]), int(ticks.k[-1]))
         place = np.searchsorted(ticks.k, truths.k)
         there = ticks.k[place] == truths.k
         if not there.any():
             return None
-        at = ticks.where(place[there])
-        return np.column_stack([at.k, *self._judge_lemma(at, Truths(*(column[there] for column in truths)))])
+        at, truths = ticks.where(place[there]), Truths(*(column[there] for column in truths))
+        return np.column_stack([at.k, *self._judge_lemma(at, truths), of_nearer_sign(truths.attitude, at.desired)])
 
     def _take_truths(self, first: int, last: int) -> Truths:
         """Truths of these ticks; earlier ones are dropped, later ones wait."""

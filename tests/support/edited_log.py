@@ -21,7 +21,7 @@ from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
 from aeroloop.service.config import load
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.certified_bounds import certified_bounds
-from aeroloop.service.review.observe import Observer
+from aeroloop.service.review.observe import WHOLE, DrawnPart, Observer
 from aeroloop.service.review.theorem_check import TheoremCheck
 from tests.support.made_log import ONE_WAY_NS, SESSION, START_NS, VEHICLE
 
@@ -109,10 +109,10 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
     return change
 
 
-def observer_of(*overrides: str) -> Observer:
+def observer_of(*overrides: str, part: DrawnPart = WHOLE) -> Observer:
     """An observer of the default configuration."""
     settings = load(overrides=overrides)
-    return Observer(settings, TheoremCheck(certified_bounds(settings, ()), settings.loop.period, None))
+    return Observer(settings, TheoremCheck(certified_bounds(settings, ()), settings.loop.period, None), part)
 
 
 def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:

@@ -4,7 +4,7 @@ const figures = [...document.querySelectorAll(".drawing")];
 const inSight = new Set();
 const upToDate = new Set();
 
-const draw = (figure) => (figure.classList.contains("group") ? drawGroup(figure) : drawSpread(figure));
+const draw = (figure) => unpacked.then(() => (figure.classList.contains("group") ? drawGroup(figure) : drawSpread(figure)));
 
 /** Draw what is in sight and not up to date, once before the next frame. */
 function refresh() {
@@ -41,6 +41,17 @@ document.addEventListener("click", ({ target }) => {
   showAround(Number(jump.dataset.time));
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   document.getElementById("tracking").scrollIntoView({ behavior: calm ? "auto" : "smooth" });
+});
+
+// runs hidden and shown
+
+document.addEventListener("click", ({ target }) => {
+  const entry = target.closest(".key [data-run]");
+  if (!entry) return;
+  const run = Number(entry.dataset.run);
+  hiddenRuns[hiddenRuns.has(run) ? "delete" : "add"](run);
+  for (const each of document.querySelectorAll(`.key [data-run="${run}"]`)) each.setAttribute("aria-pressed", !hiddenRuns.has(run));
+  redrawAll();
 });
 
 // light and dark: the system's, or the other until the button is pressed again

@@ -1,27 +1,40 @@
-// Data of the page: arrays from base64, colours from the style sheet, numbers as text.
+// Data of the page: lines unpacked, colours from the style sheet, numbers as text.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const several = data.runs.length > 1;
 const pointed = matchMedia("(pointer: fine)").matches || !matchMedia("(any-pointer: coarse)").matches;
 
-/** Little-endian floats out of base64. */
-function floats(text, Type) {
-  return new Type(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
+/** Numbers as `packed` of data.py wrote them. */
+async function unpack({ least, step, deltas }, Type) {
+  const bytes = Uint8Array.from(atob(deltas), (letter) => letter.charCodeAt(0));
+  const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const planes = new Uint8Array(await new Response(inflated).arrayBuffer());
+  const n = planes.length / 4;
+  const values = new Type(n);
+  for (let i = 0, code = 0; i < n; i++) {
+    const zigzag = planes[i] | (planes[n + i] << 8) | (planes[2 * n + i] << 16) | (planes[3 * n + i] << 24);
+    code += (zigzag >>> 1) ^ -(zigzag & 1);
+    values[i] = code < 0 ? NaN : least + step * code;
+  }
+  return values;
 }
 
-for (const run of data.runs) run.time = floats(run.time, Float64Array);
-for (const group of data.groups)
-  for (const panel of group.panels)
-    for (const line of panel.lines) {
-      line.y = floats(line.values, Float32Array);
-      line.x = data.runs[line.run].time;
-      if (line.sparse) {
-        // Published less often than every tick: missing values are not gaps.
-        line.x = line.x.filter((_, i) => !Number.isNaN(line.y[i]));
-        line.y = line.y.filter((value) => !Number.isNaN(value));
-      }
-      delete line.values;
-    }
+async function unpackLine(line) {
+  line.y = await unpack(line.values, Float32Array);
+  line.x = data.runs[line.run].time;
+  if (line.sparse) {
+    // Published less often than every tick: missing values are not gaps.
+    line.x = line.x.filter((_, i) => !Number.isNaN(line.y[i]));
+    line.y = line.y.filter((value) => !Number.isNaN(value));
+  }
+  delete line.values;
+}
+
+/** Fulfilled when every line can be drawn. */
+const unpacked = (async () => {
+  for (const run of data.runs) run.time = await unpack(run.time, Float64Array);
+  await Promise.all(data.groups.flatMap(({ panels }) => panels.flatMap(({ lines }) => lines.map(unpackLine))));
+})();
 
 /** A number with a true minus sign. */
 const signed = (text) => text.replace("-", "−");
@@ -56,14 +69,30 @@ function durationTicks(from, to) {
   return { tickvals, ticktext: tickvals.map(duration) };
 }
 
-/** A key beside a drawing's title: what each colour means. */
+const RUN_DASHES = ["solid", "7px,2px", "2px,2px", "9px,2px,2px,2px", "14px,3px", "4px,4px", "12px,2px,2px,2px,2px,2px"];
+
+/** How the lines of a run are drawn among several: the first is widest and lies below, so that none hides another. */
+function runStroke(run) {
+  const width = 1.1 + (1.9 * (data.runs.length - 1 - run)) / Math.max(1, data.runs.length - 1);
+  return { color: colour(`--run-${run % 8}`), width, dash: RUN_DASHES[run % RUN_DASHES.length] };
+}
+
+const hiddenRuns = new Set();
+
+/** A key beside a drawing's title: what each colour means. The entry of a run hides and shows it in every drawing. */
 function showKey(figure, entries) {
-  const items = entries.map(([name, line, dash]) => {
-    const item = document.createElement("span");
+  const items = entries.map(([name, line, dash, run]) => {
+    const item = document.createElement(run === undefined ? "span" : "button");
     const swatch = document.createElement("i");
     swatch.className = `swatch ${dash ?? ""}`;
     swatch.style.setProperty("--line", `var(${line})`);
     item.append(swatch, name);
+    if (run !== undefined) {
+      item.type = "button";
+      item.dataset.run = run;
+      item.setAttribute("aria-pressed", !hiddenRuns.has(run));
+      item.title = "Hide or show this run in every drawing";
+    }
     return item;
   });
   figure.querySelector(".key").replaceChildren(...items);

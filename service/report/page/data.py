@@ -1,7 +1,9 @@
-"""Data of the page's drawings, as JSON: lines as base64 of little-endian floats, so that an hour of them opens at once.
+"""Data of the page's drawings, as JSON: every tick of every line, packed small enough that minutes open at once.
 
-Times are float64, because a float32 of a day's run is 4 ms coarse; values are float32, which is finer than any
-quantizer here. The panels of several runs are overlaid by group and label.
+A line is whole numbers of a step that is 2⁻²² of the line's extent, far finer than a pixel at any zoom; of them the
+differences are kept, zigzag-coded (0, −1, 1, −2… as 0, 1, 2, 3…), the least significant bytes of all first, deflated,
+in base64. Values of a quantizer repeat, so they take next to nothing. data.js reads it back. The panels of several runs
+are overlaid by group and label.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from json import dumps
 from math import floor, isfinite, log10
 from typing import Any, Final
+from zlib import compress
 
 import numpy as np
 
@@ -25,6 +28,12 @@ SPREADS: Final = {
 }
 """Distributions in the order of drawing, with their titles."""
 
+LEVELS: Final = 1 << 22
+"""Steps of a line."""
+
+TIME_LEVELS: Final = 1 << 30
+"""Steps of the time axis: of a day, 80 µs."""
+
 GRAVE: Final = frozenset({"tripped", "fault", "lost", "refused"})
 """Kinds of events that are highlighted."""
 
@@ -35,7 +44,7 @@ def page_data(reports: Sequence[Report]) -> str:
     """Everything that is drawn, as JSON that may stand in a script element."""
     spreads = [{"id": name, "runs": [_spread(report, name) for report in reports]} for name in spread_names(reports)]
     runs, groups = [_run(report) for report in reports], list(_groups(reports))
-    data = {"span": _span(reports), "runs": runs, "groups": groups, "spreads": spreads}
+    data = {"span": _span(reports), "runs": runs, "groups": groups, "spreads": spreads, "bands": _bands(reports)}
     # These occur inside JSON strings only; without them, no text can end the script or start a comment.
     return dumps(data, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -69,17 +78,30 @@ def period_s(report: Report) -> float | None:
 def _span(reports: Sequence[Report]) -> tuple[float, float]:
     """Time span of the page, with a margin, so that events at its ends are visible."""
     times = [float(time) for report in reports for time in (*report.time[:1], *report.time[-1:])]
-    times += [mark.time_s for report in reports for mark in report.findings.marks if mark.time_s is not None]
+    if not any(report.part for report in reports):
+        times += [mark.time_s for report in reports for mark in report.findings.marks if mark.time_s is not None]
     start, end = (min(times), max(times)) if times else (0.0, 1.0)
     room = 0.01 * (end - start) or 0.5
     return start - room, end + room
+
+
+def _bands(reports: Sequence[Report]) -> list[Json]:
+    """Shaded spans of time, of all runs; one that did not end lasts to the end of its run's lines."""
+    return [
+        {"run": run, "from": band.start_s, "to": float(report.time[-1]) if band.end_s is None else band.end_s,
+         "label": band.label}
+        for run, report in enumerate(reports)
+        for band in report.bands
+        if band.end_s is not None or len(report.time)
+    ]  # fmt: skip
 
 
 def _run(report: Report) -> Json:
     period = period_s(report) or 0.0
     return {
         "name": report.name,
-        "time": _packed(report.time, "<f8"),
+        "time": packed(report.time, TIME_LEVELS),
+        "exact": report.thinned <= 2,
         "marks": sorted([m.time_s, grave(m)] for m in report.findings.marks if m.time_s is not None),
         "gaps": [[gap.time_s, gap.time_s + gap.ticks * period] for gap in report.findings.gaps],
     }
@@ -106,7 +128,7 @@ def _panel(label: str, alike: Sequence[tuple[int, Panel]], reports: Sequence[Rep
         "log": unit in {"µs", "ms", "s"} and least > 0 and most > 30 * least,
         "lines": [
             {"run": run, "label": line.label, "desired": line.desired, "shared": shared and line.desired, "nth": nth,
-             "sparse": _sparse(line.values), "values": _packed(line.values, "<f4")}
+             "held": line.held, "sparse": _sparse(line.values), "values": packed(line.values)}
             for run, nth, line in _lines(alike, reports, shared)
         ],
     }  # fmt: skip
@@ -129,11 +151,13 @@ def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]
     """Whether the desired values of all runs agree, so that one line can stand for all."""
     desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
     one_each = len(desired) in (0, len(alike)) and len(alike) == len(reports)
-    return one_each and all(_agree(*desired[0], *other) for other in desired[1:])
+    least, most = _extent([line.values for _, panel in alike for line in panel.lines])
+    visible = 0.02 * max(abs(least), abs(most))
+    return one_each and all(_agree(visible, *desired[0], *other) for other in desired[1:])
 
 
-def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
-    """Whether two lines are the same, as far as can be seen, for as long as both last.
+def _agree(visible: float, time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
+    """Whether two lines are nowhere further apart than what is visible, for as long as both last.
 
     They need not be the same to the last bit: each was sampled, and perhaps thinned out, in its own way.
     """
@@ -142,7 +166,7 @@ def _agree(time: Array, values: Array, other_time: Array, other_values: Array) -
     both = (time >= other_time[0]) & (time <= other_time[-1]) & np.isfinite(values)
     apart = np.abs(np.interp(time[both], other_time, other_values) - values[both])
     apart = apart[np.isfinite(apart)]
-    return bool(len(apart) and apart.max() <= 0.02 * np.abs(values[both]).max())
+    return bool(len(apart) and apart.max() <= visible)
 
 
 def _sparse(values: Array) -> bool:
@@ -165,6 +189,19 @@ def _spread(report: Report, name: str) -> Json | None:
     return None if spread is None else spread.model_dump(include={"p50", "p99", "p999", "max", "bins"})
 
 
-def _packed(values: Array, dtype: str) -> str:
-    with np.errstate(over="ignore"):
-        return b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode()
+def packed(values: Array, levels: int = LEVELS) -> Json:
+    """Values as data.js unpacks them: `least` + `step` · the sum of all `deltas` so far, NaN where the sum is negative.
+
+    Args:
+        values: What to pack; what is not finite becomes NaN. Shape (n,).
+        levels: How many steps their extent has.
+    """
+    known = np.isfinite(values)
+    least, most = _extent([values])
+    step = (most - least) / levels or 1.0
+    codes = np.full(len(values), -1, dtype=np.int64)
+    codes[known] = np.rint((values[known] - least) / step)
+    deltas = np.diff(codes, prepend=0)
+    zigzag = np.where(deltas < 0, -2 * deltas - 1, 2 * deltas).astype("<u4")
+    planes = zigzag.view(np.uint8).reshape(-1, 4).T
+    return {"least": least, "step": step, "deltas": b64encode(compress(planes.tobytes())).decode()}

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from aeroloop.service.report.page.data import grave, period_s, spread_names
-from aeroloop.service.report.page.markup import Html, joined, tag
+from aeroloop.service.report.page.markup import Html, joined, jump, tag
 from aeroloop.service.report.page.verdict import run_name
-from aeroloop.service.report.rows import micros, percent, seconds
+from aeroloop.service.report.rows import micros, percent
 from aeroloop.service.review.report import Report
 
 Column = tuple[str, bool]
@@ -37,6 +37,7 @@ def table(reports: Sequence[Report], columns: Sequence[Column], rows: Rows, *, t
         "div",
         tag("table", tag("thead", tag("tr", head)), tag("tbody", body)),
         class_="scroll tall" if tall else "scroll",
+        tabindex=0 if tall else None,
     )
 
 
@@ -50,7 +51,10 @@ def events(reports: Sequence[Report]) -> Html:
             rows.append((index, [where, kind, mark.role, mark.text]))
     if not rows:
         return tag("p", "None: no event, no change, no loss.", class_="quiet")
-    return table(reports, [("Time [s]", True), ("What", False), ("Role", False), (TEXT, False)], rows, tall=True)
+    columns = [("Time [s]", True), ("What", False), ("Role", False), (TEXT, False)]
+    return joined(
+        [tag("p", f"{len(rows):,} in order of time.", class_="quiet"), table(reports, columns, rows, tall=True)]
+    )
 
 
 def faults(reports: Sequence[Report]) -> Html:
@@ -93,7 +97,7 @@ def timing(reports: Sequence[Report]) -> Html:
     for index, report in enumerate(reports):
         if age := report.findings.age_us:
             found = [micros(age[point]) if point in age else "–" for point in points]
-            rows.append((index, ["age when used", *found, "–"]))
+            rows.append((index, ["age at the controller", *found, "–"]))
     if not rows:
         reasons = {report.findings.reasons.get("latency_us", "not measured") for report in reports}
         return tag("p", f"No durations: {'; '.join(sorted(reasons))}.", class_="quiet")
@@ -118,7 +122,7 @@ def wire(reports: Sequence[Report]) -> Html:
     rates_of = [("Frames", False), ("Direction", False), ("Frames/s", True), ("Bit/s", True)]
     quantizers = [("Value", False), ("Quantizer", False), ("Bits", True), ("Limit", True)]
     first = table(reports, [*rates_of, ("Without a valid value", True)], streams)
-    return joined([first, table(reports, [*quantizers, ("At the outermost level [%]", True)], values)])
+    return joined([first, table(reports, [*quantizers, ("At the limit [%]", True)], values)])
 
 
 def _quantizer(signal: dict[str, Any]) -> tuple[str, str, str]:
@@ -128,10 +132,3 @@ def _quantizer(signal: dict[str, Any]) -> tuple[str, str, str]:
     bits, limit = signal.get("bits"), signal.get("limit")
     kind, bits = ("–", "cont") if bits is None else (signal.get("kind", "uniform"), str(bits))
     return kind, bits, f"±{limit:g}" if isinstance(limit, int | float) else "–"
-
-
-def jump(time_s: float, run: int, what: str) -> Html:
-    """A button that moves every time axis to a time of a run."""
-    shown = seconds(time_s)
-    return tag("button", shown, type="button", class_="jump", data_time=time_s, data_run=run,
-               aria_label=f"Show {shown} s: {what}")  # fmt: skip

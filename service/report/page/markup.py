@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from html import escape
 from typing import Final
 
+from aeroloop.service.report.rows import seconds
+
 VOID: Final = frozenset({"br", "col", "hr", "img", "input", "link", "meta"})
 """Elements without an end tag."""
 
@@ -35,6 +37,13 @@ def tag(name: str, *children: Child, **attributes: str | float | bool | None) ->
 def joined(parts: Iterable[Html | str]) -> Html:
     """Several pieces of markup or text as one."""
     return Html("".join(_markup(part) for part in parts))
+
+
+def jump(time_s: float, run: int, what: str) -> Html:
+    """A button that moves every time axis to a time of a run."""
+    shown = seconds(time_s)
+    return tag("button", shown, type="button", class_="jump", data_time=time_s, data_run=run,
+               aria_label=f"Show {shown} s: {what}")  # fmt: skip
 
 
 def _markup(child: Child) -> str:

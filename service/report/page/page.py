@@ -16,8 +16,9 @@ from typing import Final
 
 from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.report.page import happenings, setup, theorem, verdict
-from aeroloop.service.report.page.data import SPREADS, group_titles, page_data, spread_names
+from aeroloop.service.report.page.data import SPREADS, group_titles, page_data, period_s, spread_names
 from aeroloop.service.report.page.markup import Html, joined, tag
+from aeroloop.service.review.downsample import MAX_POINTS
 from aeroloop.service.review.report import Report
 
 SCRIPTS: Final = ("data.js", "window.js", "panels.js", "spreads.js", "controls.js")
@@ -43,7 +44,7 @@ def page(reports: Sequence[Report]) -> str:
         title=tag("title", f"{title} · aeroloop"),
         style=tag("style", Html("\n" + _read("page.css"))),
         masthead=verdict.masthead(reports),
-        navigation=joined(tag("a", title, href=f"#{name}") for name, title, _ in sections),
+        navigation=joined(tag("a", name.capitalize(), href=f"#{name}") for name, _, _ in sections),
         runs="several" if len(reports) > 1 else "one",
         verdict=tag("div", verdict.verdict(reports), class_="verdicts"),
         sections=joined(_section(*section) for section in sections),
@@ -85,8 +86,8 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
     return [
         ("figures", "Figures of merit", verdict.figures(reports)),
         *([("differences", "What differs in the configurations", setup.differing(reports))] if several else []),
-        *([("broken", "What is missing from the log", broken)] if broken else []),
-        ("tracking", "Tracking", joined([_thinned(reports), drawn])),
+        *([("missing", "What is missing from the log", broken)] if broken else []),
+        ("tracking", "Tracking", joined([_drawn(reports), drawn])),
         *([("theorem", "What the theorem promises", joined([promised, _groups(reports, proved)]))] if promised else []),
         ("events", "Events", joined([happenings.faults(reports), happenings.events(reports)])),
         ("timing", "Timing", timing),
@@ -117,12 +118,24 @@ def _drawing(kind: str, name: str, title: str, panels: int = 1) -> Html:
                data_name=name)  # fmt: skip
 
 
-def _thinned(reports: Sequence[Report]) -> Html:
-    most = max(report.thinned for report in reports)
-    if most <= 2:
-        return Html("")
-    text = f"Lines are thinned out: two points, the least and the largest value, stand for up to {most:,} ticks."
-    return tag("p", text, class_="quiet", id="thinned")
+def _drawn(reports: Sequence[Report]) -> Html:
+    """What is drawn, if that is not every tick of the whole session."""
+    sentences = []
+    if part := next((report.part for report in reports if report.part), None):
+        since, until = part[0], min(part[1], float(reports[0].time[-1]))
+        sentences.append(
+            f"Drawn is the part from {max(0.0, since):g} s to {until:g} s; the figures are of the session."
+        )
+    thinned = max(reports, key=lambda report: report.thinned)
+    if thinned.thinned > 2:
+        period = period_s(thinned)
+        span = f", {thinned.thinned * period:.3g} s" if period else ""
+        sentences.append(
+            f"More than {MAX_POINTS // len(reports):,} ticks are thinned out: two points, the least and the largest "
+            f"value, stand for up to {thinned.thinned:,} ticks{span}. "
+            "`aeroloop log review --from S --to S --html` draws every tick of a part."
+        )
+    return tag("p", " ".join(sentences), class_="quiet", id="drawn") if sentences else Html("")
 
 
 def _script(code: str) -> Html:

@@ -1,8 +1,8 @@
-// Drawings over time: the panels of a group under each other on one time axis, with events and gaps across all of them.
+// Drawings over time: the panels of a group under each other on one time axis, with bands, events and gaps across them.
 
 const MARKS_ACROSS = 500; // marks closer than this share of a drawing are merged
 
-/** A line's colour by its meaning: measured, desired, or its run. */
+/** A line's colour by its meaning: measured, desired, true, or its run. */
 function lineColour(line) {
   if (several) return line.shared ? "--quiet" : `--run-${line.run % 8}`;
   if (line.desired) return "--desired";
@@ -12,10 +12,8 @@ function lineColour(line) {
 /** Whether it is a run's own desired line, beside others. */
 const isOwn = (line) => several && line.desired && !line.shared;
 
-function lineDash(line) {
-  if (isOwn(line)) return "dot";
-  return several && line.nth ? "dash" : "solid";
-}
+/** Whether it stands for its run: not what is desired, nor a second line beside it. */
+const isMain = (line) => several && !line.desired && !line.nth;
 
 function lineName(line) {
   const run = data.runs[line.run].name;
@@ -23,23 +21,54 @@ function lineName(line) {
   return line.desired || line.nth ? `${run}, ${line.label}` : run;
 }
 
+function stroke(line) {
+  if (isMain(line)) return runStroke(line.run);
+  const color = colour(lineColour(line));
+  if (several && !line.shared) return { color, width: 1, dash: line.desired ? "1px,3px" : "5px,5px" };
+  return { color, width: line.desired ? 2.5 : 1.1, dash: line.held || line.desired ? "solid" : "6px,4px" };
+}
+
+/** What a line needs to be drawn between two times, in a drawing so many pixels wide.
+
+    Where there are few ticks, each of them; else the least and the largest value of each column of pixels, where they
+    were. Half a drawing more on either side, for panning.
+*/
+function inView({ x, y }, [from, to], pixels) {
+  const room = (to - from) / 2;
+  const begin = Math.max(0, firstAt(x, from - room) - 1);
+  const end = Math.min(x.length, firstAt(x, to + room) + 1);
+  if (end - begin <= 6 * pixels) return { x: x.subarray(begin, end), y: y.subarray(begin, end), everyTick: true };
+  const [drawnX, drawnY] = [[], []];
+  const width = (to - from) / pixels;
+  for (let i = begin; i < end; ) {
+    const until = x[i] + width;
+    let [low, high] = [i, i];
+    for (; i < end && x[i] < until; i++) {
+      if (!(y[i] >= y[low])) low = Number.isNaN(y[i]) ? low : i;
+      if (!(y[i] <= y[high])) high = Number.isNaN(y[i]) ? high : i;
+    }
+    for (const at of low < high ? [low, high] : low > high ? [high, low] : [low]) drawnX.push(x[at]), drawnY.push(y[at]);
+  }
+  return { x: drawnX, y: drawnY };
+}
+
 /** The traces of a group. */
-function traces(group) {
+function traces(group, pixels) {
   return group.panels.flatMap((panel, row) =>
-    inOrder(panel.lines).map((line) => ({
-      type: "scatter",
-      mode: "lines",
-      x: line.x,
-      y: line.y,
-      yaxis: axisOf(row),
-      name: plain(group.panels.length > 1 ? `${panel.label} ${lineName(line)}` : lineName(line)),
-      line: {
-        color: colour(lineColour(line)),
-        width: line.desired && !isOwn(line) ? 2.5 : 1.1,
-        dash: lineDash(line),
-      },
-      hovertemplate: `%{y:.${panel.decimals}f}${panel.unit && ` ${panel.unit}`}`,
-    })),
+    inOrder(panel.lines).map((line) => {
+      const { x, y, everyTick } = inView(line, timeWindow.shown, pixels);
+      return {
+        type: "scatter",
+        mode: "lines",
+        x,
+        y,
+        yaxis: axisOf(row),
+        visible: line.shared || !hiddenRuns.has(line.run),
+        name: plain(group.panels.length > 1 ? `${panel.label} ${lineName(line)}` : lineName(line)),
+        line: { ...stroke(line), shape: line.held && everyTick && data.runs[line.run].exact ? "hv" : "linear" },
+        hovertemplate: `%{y:.${panel.decimals}f}${panel.unit && ` ${panel.unit}`}`,
+      };
+    }),
   );
 }
 
@@ -52,11 +81,13 @@ const axisOf = (row) => (row ? `y${row + 1}` : "y");
 function extent(panel) {
   const [from, to] = timeWindow.shown;
   let [least, most] = [Infinity, -Infinity];
-  for (const { x, y } of panel.lines)
+  for (const { x, y, run, shared } of panel.lines) {
+    if (hiddenRuns.has(run) && !shared) continue;
     for (let i = firstAt(x, from); i < x.length && x[i] <= to; i++) {
       if (y[i] < least) least = y[i];
       if (y[i] > most) most = y[i];
     }
+  }
   if (least > most) return panel.log ? [1, 3] : [-1, 1];
   if (panel.log) return [Math.log10(least) - 0.05, Math.log10(most) + 0.05];
   const room = (most - least) * 0.07 || Math.abs(most) * 0.1 || 1;
@@ -74,7 +105,25 @@ function firstAt(times, time) {
   return low;
 }
 
-/** Events as lines across all panels, gaps as bands: a shape for all of a kind, since there may be hundreds. */
+/** The bands that are in sight. */
+function bandsShown() {
+  const [from, to] = timeWindow.shown;
+  return data.bands.filter((band) => band.to >= from && band.from <= to && !hiddenRuns.has(band.run));
+}
+
+const BAND_ROWS = Math.min(3, data.bands.length); // of labels, so that neighbours do not overlap
+
+/** Labels of the bands, above the first panel. */
+function bandLabels() {
+  const [from, to] = timeWindow.shown;
+  return bandsShown().map((band, i) => ({
+    text: plain(several ? `${data.runs[band.run].name}: ${band.label}` : band.label), x: Math.max(band.from, from), y: 1,
+    yref: "y domain", xanchor: band.from > (from + to) / 2 ? "right" : "left", yanchor: "bottom", yshift: 15 + 14 * (i % BAND_ROWS),
+    showarrow: false, font: { size: 11, color: colour("--ink") }, borderpad: 0,
+  }));
+}
+
+/** Events as lines across all panels, gaps and bands as areas: a shape for all of a kind, since there may be hundreds. */
 function marks() {
   const [from, to] = timeWindow.shown;
   const apart = (to - from) / MARKS_ACROSS;
@@ -83,7 +132,11 @@ function marks() {
   if (timeWindow.marked !== null)
     shapes.push({ ...across, path: `M${timeWindow.marked},0 L${timeWindow.marked},1`, opacity: 0.35,
       line: { color: colour("--accent"), width: 9 } });
+  for (const { run, ...band } of bandsShown())
+    shapes.push({ ...across, path: `M${band.from},0 L${band.to},0 L${band.to},1 L${band.from},1 Z`, opacity: 0.15,
+      line: { width: 0 }, fillcolor: colour(several ? `--run-${run % 8}` : "--band") });
   data.runs.forEach((run, index) => {
+    if (hiddenRuns.has(index)) return;
     const own = several ? colour(`--run-${index % 8}`) : null;
     const gaps = run.gaps.filter(([start, end]) => end >= from && start <= to);
     const bands = gaps.map(([start, end]) => `M${start},0 L${end},0 L${end},1 L${start},1 Z`);
@@ -107,7 +160,7 @@ function timeLayout(group) {
   const rows = group.panels.length;
   const layout = {
     ...plainLayout(),
-    margin: { l: 54, r: 10, t: 22, b: 36 },
+    margin: { l: 54, r: 10, t: 22 + 14 * BAND_ROWS, b: 36 },
     hovermode: "x unified",
     hoversubplots: "axis",
     dragmode: pointed ? "zoom" : false,
@@ -132,6 +185,7 @@ function timeLayout(group) {
       bgcolor: colour("--paper"), borderpad: 0,
     });
   });
+  layout.annotations.push(...bandLabels());
   return layout;
 }
 
@@ -140,7 +194,7 @@ async function drawGroup(figure) {
   const group = data.groups.find((each) => each.id === figure.dataset.name);
   const plot = figure.querySelector(".plot");
   const first = !plot.classList.contains("js-plotly-plot");
-  await Plotly.react(plot, traces(group), timeLayout(group), plotOptions);
+  await Plotly.react(plot, traces(group, Math.max(300, plot.clientWidth - 64)), timeLayout(group), plotOptions);
   if (!first) return;
   plot.on("plotly_relayout", (change) => {
     if ("xaxis.range[0]" in change) showTime(change["xaxis.range[0]"], change["xaxis.range[1]"]);
@@ -148,7 +202,16 @@ async function drawGroup(figure) {
   plot.on("plotly_doubleclick", () => moveTime("whole"));
   plot.addEventListener("keydown", moveByKey);
   const lines = group.panels.flatMap((panel) => panel.lines).sort((one, other) => one.desired - other.desired);
-  const meanings = new Map(lines.map((line) => [lineName(line), line]));
-  if (meanings.size > 1 || several)
-    showKey(figure, [...meanings].map(([name, line]) => [name, lineColour(line), lineDash(line)]));
+  const meanings = new Map(lines.map((line) => [isMain(line) ? line.run : line.label, line]));
+  if (meanings.size > 1 || several) showKey(figure, [...meanings.values()].map(keyEntry));
 }
+
+/** A line's entry in the key: its name, colour, kind of dashes, and the run that it stands for. */
+function keyEntry(line) {
+  if (isMain(line)) return [data.runs[line.run].name, `--run-${line.run % 8}`, runDash(line.run), line.run];
+  if (several) return [line.label, "--quiet", line.shared ? "" : line.desired ? "dot" : "dash"];
+  return [line.label, lineColour(line), line.held || line.desired ? "" : "dash"];
+}
+
+/** The kind of border that is nearest to a run's dashes. */
+const runDash = (run) => (run ? (run % 2 ? "dash" : "dot") : "");

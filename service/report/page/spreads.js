@@ -24,13 +24,14 @@ function outline(bins) {
 const percentiles = { p50: "p50", p99: "p99", p999: "p99.9" };
 
 function spreadTrace(run, index) {
-  const line = several ? colour(`--run-${index % 8}`) : colour("--measured");
+  const line = colour("--measured");
   return {
     type: "scatter",
     mode: "lines",
     ...outline(run.bins),
     name: plain(data.runs[index].name),
-    line: { color: line, width: several ? 1.4 : 1 },
+    visible: !hiddenRuns.has(index),
+    line: several ? runStroke(index) : { color: line, width: 1 },
     ...(!several && { fill: "toself", fillcolor: line.replace("rgb(", "rgba(").replace(")", ", 0.28)") }),
     hoverinfo: "skip",
   };
@@ -67,7 +68,7 @@ async function drawSpread(figure) {
     yaxis: { ...grid, type: "log", range: [Math.log10(NONE), Math.log10(Math.max(1, ...counts)) + 0.15], dtick: 1,
       title: { text: "count", standoff: 6 }, exponentformat: "power" },
   };
-  for (const [run, index] of runs) markPercentiles(layout, run, index);
+  for (const [run, index] of runs) if (!hiddenRuns.has(index)) markPercentiles(layout, run, index);
   await Plotly.react(figure.querySelector(".plot"), runs.map(([run, index]) => spreadTrace(run, index)), layout, plotOptions);
-  if (several) showKey(figure, runs.map(([, index]) => [data.runs[index].name, `--run-${index % 8}`]));
+  if (several) showKey(figure, runs.map(([, index]) => [data.runs[index].name, `--run-${index % 8}`, runDash(index), index]));
 }

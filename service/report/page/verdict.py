@@ -1,4 +1,7 @@
-"""Top of the page: name of each run, verdict, figures, and what of the files could not be read."""
+"""Top of the page: name of each run, verdict, figures, and what of the files could not be read.
+
+What a verdict rests on has its time, as a button that shows the drawings there.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,15 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from aeroloop.service.report.page.markup import Html, joined, tag
-from aeroloop.service.report.rows import THEOREM, Row, Value, figure_rows, seconds
+import numpy as np
+
+from aeroloop.service.report.page.data import grave
+from aeroloop.service.report.page.markup import Html, joined, jump, tag
+from aeroloop.service.report.rows import THEOREM, Row, Value, figure_rows, micros, seconds
 from aeroloop.service.review.report import Check, Findings, Report
+
+MOMENTS = 5
+"""Trips, faults and losses that a verdict lists."""
 
 
 class Judgement(NamedTuple):
@@ -68,12 +77,12 @@ def verdict(reports: Sequence[Report]) -> Html:
 def _verdict(report: Report, index: int, of: int) -> Html:
     found = judgement(report.findings)
     mood, sign = {True: ("good", "✓"), False: ("bad", "✗"), None: ("neutral", "●")}[found.good]
-    checks, facts = report.findings.checks, [*report.findings.trips, *_facts(report.findings)]
+    checks, facts = report.findings.checks, [*_moments(report, index), *_facts(report)]
     return tag(
         "div",
         run_name(report, index, of) if of > 1 else None,
         tag("p", tag("span", sign, aria_hidden="true"), f" {found.word}", class_="word"),
-        tag("p", found.because),
+        tag("p", found.because, class_="because"),
         tag("ul", [_check(check) for check in checks], class_="checks") if checks else None,
         tag("ul", [tag("li", fact) for fact in facts], class_="facts") if facts else None,
         class_=f"verdict {mood}",
@@ -90,16 +99,40 @@ def _check(check: Check) -> Html:
     )
 
 
-def _facts(run: Findings) -> list[str]:
-    facts = []
+def _moments(report: Report, index: int) -> list[Html]:
+    """Trips, faults and losses with their times, and the time of the largest error that is drawn."""
+    grave_marks = [mark for mark in report.findings.marks if grave(mark)]
+    moments = []
+    for mark in grave_marks[:MOMENTS]:
+        what = f"{mark.kind}, {mark.role}: {mark.text}"
+        outside = " outside of the session that is judged"
+        at = joined([" at ", jump(mark.time_s, index, what), " s"]) if mark.time_s is not None else Html(outside)
+        moments.append(joined([tag("b", mark.kind), at, f" ({mark.role}): {mark.text}"]))
+    if len(grave_marks) > MOMENTS:
+        more = tag("a", "all events", href="#events")
+        moments.append(joined([f"{len(grave_marks) - MOMENTS:,} more trips, faults and losses: see ", more]))
+    for panel in report.panels:
+        if panel.group == "error_angle":
+            values = panel.lines[0].values
+            time_s = float(report.time[int(np.nanargmax(values))])
+            text = f"Largest attitude error{' of the part that is drawn' if report.part else ''}: "
+            most = f"{float(np.nanmax(values)):.2f}°"
+            moments.append(joined([text, most, " at ", jump(time_s, index, f"largest attitude error, {most}"), " s"]))
+    return moments
+
+
+def _facts(report: Report) -> list[str]:
+    run, facts = report.findings, []
     if run.sessions > 1:
-        facts.append(f"the longest of {run.sessions} sessions is judged")
+        facts.append(f"The longest of {run.sessions} sessions is judged.")
+    if report.settings.get("loop", {}).get("lockstep"):
+        facts.append("The loop ran in lockstep: its durations are not those of real time.")
     if run.losses:
-        facts.append(f"the recorder lost {_count(sum(run.losses.values()), 'message')}")
+        facts.append(f"The recorder lost {_count(sum(run.losses.values()), 'message')}.")
     if missing := sum(run.missing_ticks.values()):
-        facts.append(f"{_count(missing, 'tick')} were not recorded")
+        facts.append(f"{_count(missing, 'tick')} were not recorded.")
     if run.damages:
-        facts.append("not all of the log could be read")
+        facts.append("Not all of the log could be read.")
     return facts
 
 
@@ -108,17 +141,23 @@ def figures(reports: Sequence[Report]) -> Html:
     rows = [row for row in figure_rows([report.findings for report in reports]) if not row.key.startswith(THEOREM)]
     if len(reports) > 1:
         return figures_table(reports, rows)
-    rest = [row for row in rows if not row.main]
+    rest = [row for row in rows if not row.figure.main]
     more = tag("details", tag("summary", "Every other figure"), figures_table(reports, rest)) if rest else Html("")
-    return joined([tag("dl", [_card(row) for row in rows if row.main], class_="cards"), more])
+    cards = [_card(row, _beside(row, reports[0].findings)) for row in rows if row.figure.main]
+    return joined([tag("dl", cards, class_="cards"), more])
 
 
-def _card(row: Row) -> Html:
+def _beside(row: Row, run: Findings) -> str:
+    """What a figure is; beside the median latency, the 99th percentile."""
+    tail = run.latency_us if row.key == "latency_us" else None
+    return row.figure.what + (f"; p99 {micros(tail.p99)}" if tail else "")
+
+
+def _card(row: Row, what: str) -> Html:
     value = row.values[0]
     unit = None if value.text == "–" else row.unit if row.unit == "°" else f" {row.unit}"
-    return tag(
-        "div", tag("dt", row.name), tag("dd", tag("b", value.text), unit, _why(value)), class_="card", title=row.key
-    )
+    return tag("div", tag("dt", row.name), tag("dd", tag("b", value.text), unit), _why(value) or tag("small", what),
+               class_="card", title=row.key)  # fmt: skip
 
 
 def _why(value: Value) -> Html | None:
@@ -126,24 +165,34 @@ def _why(value: Value) -> Html | None:
 
 
 def figures_table(reports: Sequence[Report], rows: Sequence[Row]) -> Html:
-    """Figures of one run, or of several side by side."""
-    several = len(reports) > 1
-    head = [run_name(report, index, len(reports)) if several else "" for index, report in enumerate(reports)]
-    return tag(
-        "div",
-        tag(
-            "table",
-            tag("thead", tag("tr", tag("th", "Figure"), [tag("th", name, class_="number") for name in head],
-                tag("th", "Unit"))),
-            tag("tbody", [
-                tag("tr", tag("th", row.name, scope="row"),
-                    [tag("td", value.text, _why(value), class_="number") for value in row.values],
-                    tag("td", row.unit, class_="unit"))
-                for row in rows
-            ]),
-        ),
-        class_="scroll",
-    )  # fmt: skip
+    """Figures of one run, or of several side by side, each with its difference to the first."""
+    several, runs = len(reports) > 1, range(len(reports))
+    head = [tag("th", "Figure"), *_each(
+        [tag("th", run_name(reports[i], i, len(reports)) if several else "", class_="number") for i in runs],
+        [tag("th", f"Δ to {reports[0].name}", class_="number") for _ in runs],
+    ), tag("th", "Unit")]  # fmt: skip
+    body = [
+        tag("tr", tag("th", row.name, scope="row", title=row.figure.what or None), _each(
+            [tag("td", value.text, _why(value), class_="number") for value in row.values],
+            [_delta(row, run) for run in runs],
+        ), tag("td", row.unit, class_="unit"))
+        for row in rows
+    ]  # fmt: skip
+    return tag("div", tag("table", tag("thead", tag("tr", head)), tag("tbody", body)), class_="scroll")
+
+
+def _each(values: Sequence[Html], deltas: Sequence[Html]) -> list[Html]:
+    """Each run's value, and from the second run on its difference to the first."""
+    return [cell for i, value in enumerate(values) for cell in ((value, deltas[i]) if i else (value,))]
+
+
+def _delta(row: Row, run: int) -> Html:
+    delta = row.delta(run)
+    if delta is None:
+        return tag("td", "–", class_="number delta")
+    sign = {"better": "▼ ", "worse": "▲ "}.get(delta.word or "", "")
+    word = tag("span", f"{sign}{delta.word or ''}", class_=f"word {delta.word or ''}")
+    return tag("td", delta.text, " ", word, class_="number delta")
 
 
 def broken(reports: Sequence[Report]) -> Html:

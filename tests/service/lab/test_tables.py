@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from itertools import chain
-from pathlib import Path
 
 import pytest
 
@@ -88,24 +87,3 @@ def test_the_papers_numbers_are_those_of_its_tables() -> None:
     assert paper.Z_TRACK[-1][0] == 43  # input unquantized, 8 bits out
     assert paper.U_TOTAL[2][3] == 8017  # 8 bits in, output unquantized
     assert len(paper.Z_TRACK) == len(paper.U_TOTAL) == len(paper.INPUT_BITS)
-
-
-def test_figures_of_the_paper_are_drawn_from_a_log_under_their_numbers(tmp_path: Path) -> None:
-    from aeroloop.service.lab.demo import run_demo
-    from aeroloop.service.logs.ticks import Ticks
-    from aeroloop.service.report.plots import draw_figures
-    from aeroloop.service.review.review import read
-
-    for overrides, numbers in (
-        (["wire.attitude.bits=cont", "wire.rate.bits=cont", "wire.voltage.bits=cont"], {"C.4", "C.5", "C.6"}),
-        ([], {"C.7", "C.8", "C.9", "C.10", "C.11"}),
-        (["plant.wind.blowing=true"], {"C.12", "C.13", "C.14"}),
-    ):
-        log = tmp_path / f"{len(numbers)}-{len(overrides)}.mcap"
-        run_demo(load(overrides=["loop.lockstep=true", *overrides]), 0.5, log)
-        kept: list[Ticks] = []
-        judged = read(log, watch=kept.append)
-        paths = draw_figures(judged.session.settings, kept, tmp_path / log.stem)
-        assert len(paths) == 5
-        assert {path.stem.split("-")[0] for path in paths if path.stem.startswith("C.")} == numbers
-        assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)

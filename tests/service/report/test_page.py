@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import os
 import shutil
+from base64 import b64decode
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from html import escape
 from html.parser import HTMLParser
 from itertools import count
 from json import loads
+from math import inf
 from pathlib import Path
 from typing import Any, cast
+from zlib import decompress
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from aeroloop.service.logs.files import ReviewError
-from aeroloop.service.report.page.data import page_data
+from aeroloop.service.report.page.data import packed, page_data
 from aeroloop.service.report.page.markup import tag
 from aeroloop.service.report.page.page import page, write_page
 from aeroloop.service.report.rows import figure_rows, micros, percent
-from aeroloop.service.review.report import Check, Mark, Panel, Report
+from aeroloop.service.review.report import Band, Check, Line, Mark, Panel, Report
 from tests.support.made_report import MARKS, made_report, made_theorem
 
 HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""
@@ -124,9 +127,89 @@ def test_what_could_not_be_read_is_reported() -> None:
     assert "What is missing from the log" not in Texts(page([made_report()])).texts
 
 
-def test_the_page_states_whether_lines_are_thinned_out() -> None:
-    assert "up to 64 ticks" in page([made_report(thinned=64)])
-    assert "thinned out" not in page([made_report(thinned=2)])
+def test_the_page_states_whether_lines_are_thinned_out_and_which_part_is_drawn() -> None:
+    thinned = page([made_report(thinned=64)])
+    assert "up to 64 ticks, 0.128 s" in thinned
+    assert "--from S --to S" in thinned
+    assert 'id="drawn"' not in page([made_report(thinned=2)])
+    part = replace(made_report(), part=(2.0, inf))
+    assert "Drawn is the part from 2 s to 10 s" in page([part])
+
+
+@pytest.mark.parametrize("levels", [1 << 22, 1 << 30])
+def test_what_is_packed_comes_back_to_half_a_step(levels: int) -> None:
+    """As data.js unpacks it."""
+    rng = np.random.default_rng(1)
+    for values in (
+        np.sin(np.arange(5000) / 300) * 1e3 + rng.normal(size=5000),
+        np.where(rng.random(5000) < 0.3, np.nan, rng.integers(-31, 32, 5000) * 0.77),
+        np.full(10, 3.5),
+        np.full(10, np.nan),
+        np.empty(0),
+    ):
+        found = packed(values, levels)
+        planes = np.frombuffer(decompress(b64decode(found["deltas"])), np.uint8).reshape(4, -1)
+        zigzag = np.ascontiguousarray(planes.T).view("<u4")[:, 0].astype(np.int64)
+        codes = np.cumsum((zigzag >> 1) ^ -(zigzag & 1))
+        back = np.where(codes < 0, np.nan, found["least"] + found["step"] * codes)
+        np.testing.assert_allclose(back, values, atol=0.51 * found["step"], rtol=0)
+        assert found["step"] in (
+            1.0,
+            np.ptp(values[np.isfinite(values)]) / levels if np.isfinite(values).any() else 1.0,
+        )
+
+
+def test_thirty_seconds_of_a_run_take_two_megabytes_beside_the_library() -> None:
+    """Forty lines at 500 Hz, half of them a quantizer's; without packing they took eight."""
+    rng = np.random.default_rng(1)
+    time = np.arange(15_000, dtype=np.float64) * 0.002
+    smooth = [np.sin(time + i) for i in range(20)]
+    coded = [np.round(63 * line + rng.normal(size=15_000)) / 63 for line in smooth]
+    lines = [Line("measured", values) for values in [*smooth, *coded]]
+    size = len(page_data([replace(made_report(), time=time, panels=[Panel("rate", "Rate", "ω", "rad/s", lines)])]))
+    assert size < 2e6
+
+
+def test_the_tiles_are_words_before_symbols_each_defined_and_fill_their_rows() -> None:
+    text = page([made_report()])
+    cards = text.partition('<dl class="cards">')[2].partition("</dl>")[0].split('class="card"')[1:]
+    assert len(cards) % 4 == 0
+    for card in cards:
+        name, what = (card.partition(f"<{tag}>")[2].partition(f"</{tag}>")[0] for tag in ("dt", "small"))
+        assert name.split()[0] not in ("z_track", "u_total")
+        assert len(what) > 10
+    assert "tracking error z_track" in cards[0]
+    assert "p99 2.4 ms" in text
+
+
+def test_the_verdict_has_its_times() -> None:
+    error = Panel("error_angle", "Attitude error", "angle", "°", [Line("measured", np.linspace(4.84, 0, 501))])
+    run = made_report()
+    (card,) = page([replace(run, panels=[*run.panels, error])]).partition('class="verdict bad"')[2].split("</ul>")[:1]
+    assert "Show 7.250 s: tripped" in card
+    assert "Largest attitude error: 4.84°" in card
+    assert "Show 0.000 s: largest attitude error" in card
+
+
+def test_a_comparison_states_differences_to_the_first_run_in_words() -> None:
+    first = made_report("a")
+    update = {"z_track": 0.00916, "max_error_deg": 2.42, "trips": []}
+    findings = first.findings.model_copy(update=update)
+    texts = Texts(page([first, replace(first, name="b", findings=findings)])).texts
+
+    def row(name: str) -> list[str]:
+        at = texts.index(name)
+        return [text.strip() for text in texts[at + 1 : at + 5]]
+
+    assert row("tracking error z_track") == ["45.80", "91.60", "+45.80 (+100.0 %)", "▲ worse"]
+    assert row("largest attitude error") == ["4.84", "2.42", "−2.42 (−50.0 %)", "▼ better"]
+    assert row("final attitude error") == ["0.46", "0.46", "0", "same"]
+    assert row("trips")[2:] == ["−1 (−100.0 %)", "▼ better"]
+    assert "Δ to a" in texts
+    longer = first.findings.model_copy(update={**update, "duration_s": 20.0})
+    texts = Texts(page([first, replace(first, name="b", findings=longer)])).texts
+    assert row("tracking error z_track")[2:] == ["+45.80 (+100.0 %)", "×10⁻⁴ s"]  # a sum over twice the time
+    assert row("largest attitude error")[3] == "▼ better"
 
 
 def test_a_missing_figure_states_why() -> None:
@@ -181,7 +264,7 @@ def test_numbers_have_sensible_digits() -> None:
     ]
     assert [percent(share) for share in (0, 0.00012, 0.0345, 1)] == ["0", "0.012", "3.5", "100.0"]
     (z_track,) = [row for row in figure_rows([made_report().findings]) if row.key == "z_track"]
-    assert (z_track.values[0].text, z_track.unit) == ("45.80", "10⁻⁴ s")
+    assert (z_track.values[0].text, z_track.unit) == ("45.80", "×10⁻⁴ s")
 
 
 # in a browser
@@ -328,7 +411,7 @@ def test_zooming_one_panel_moves_every_other_and_a_double_click_shows_all_again(
 
 
 def test_a_click_on_an_event_or_a_gap_shows_what_was_around_it(one: Page) -> None:
-    one.get_by_role("button", name="tripped").click()
+    one.locator(".verdict").get_by_role("button", name="tripped").click()
     shows(one, "attitude_error", (6.7, 7.8))
     one.get_by_role("button", name="gap of 50 ticks").click()
     shows(one, "attitude_error", (6.6, 7.75))
@@ -440,6 +523,72 @@ def test_a_comparison_shows_what_differs_and_draws_every_run(two: Page) -> None:
     first, second = two.evaluate(colours, "input")
     assert first != second
     assert {first, second} < set(two.evaluate(colours, "attitude"))  # the same everywhere, and what is desired
+
+
+def test_runs_can_be_told_apart_without_colour_and_one_can_be_hidden(two: Page) -> None:
+    draw_all(two)
+    strokes = """() => document.querySelector(".group[data-name=input] .plot").data
+        .map(({ line, visible }) => [line.dash, line.width, visible])"""
+    (dash, width, seen), (other_dash, other_width, other_seen) = two.evaluate(strokes)
+    assert dash != other_dash
+    assert width > other_width  # the first lies below, and shows beside the second
+    assert seen is other_seen is True
+    entry = two.locator(".group[data-name=input] .key button").first
+    entry.click()
+    two.wait_for_function("""() => !document.querySelector(".group[data-name=input] .plot").data[0].visible""")
+    assert [visible for _, _, visible in two.evaluate(strokes)] == [False, True]
+    entry.click()
+    two.wait_for_function("""() => document.querySelector(".group[data-name=input] .plot").data[0].visible""")
+
+
+def test_zooming_in_shows_every_tick_as_a_step_and_all_of_it_every_extreme_where_it_was(open_page: Open) -> None:
+    """Thirty seconds of a quantizer that dithers between two levels, with one spike."""
+    time = np.arange(15_000, dtype=np.float64) * 0.002
+    values = np.where(np.arange(15_000) % 3 == 0, 0.5, 0.25)
+    values[7_777] = 9.0
+    panel = Panel("input", "Input", "u₁", "V", [Line("commanded", values)])
+    opened = open_page(replace(made_report(), time=time, panels=[panel]))
+    draw_all(opened)
+    drawn = """() => {
+        const [{ x, y, line }] = document.querySelector(".group[data-name=input] .plot").data;
+        return { x: [...x], y: [...y], shape: line.shape };
+    }"""
+    whole = opened.evaluate(drawn)
+    assert len(whole["x"]) < 8_000
+    assert whole["x"][int(np.argmax(whole["y"]))] == pytest.approx(7_777 * 0.002, abs=1e-6)
+    opened.evaluate("showTime(15.5, 15.6)")
+    opened.wait_for_function("() => document.querySelector('.group[data-name=input] .plot').layout.xaxis.range[0] > 15")
+    close = opened.evaluate(drawn)
+    ticks = list(range(7_750, 7_801))
+    assert close["shape"] == "hv"
+    at = int(np.argmin(np.abs(np.array(close["x"]) - 15.5)))
+    assert close["x"][at : at + 51] == pytest.approx(time[ticks], abs=1e-6)
+    assert close["y"][at : at + 51] == pytest.approx(values[ticks], abs=1e-5)
+
+
+def test_bands_are_shaded_with_their_label_on_every_drawing_over_time(open_page: Open) -> None:
+    opened = open_page(replace(made_report(), bands=[Band(2.0, 4.0, "gyro off"), Band(9.0, None, "wind")]))
+    draw_all(opened)
+    found = opened.evaluate("""() => [...document.querySelectorAll(".drawing.group .plot")].map(({ layout }) => [
+        layout.shapes.filter(({ path, yref }) => yref === "paper" && /^M(2,0 L4|9,0 L10),0/.test(path)).length,
+        layout.annotations.map(({ text }) => text).filter((text) => ["gyro off", "wind"].includes(text)).length,
+    ])""")
+    assert found == [[2, 2]] * 5
+
+
+@pytest.mark.parametrize("width", [390, 700, 1280, 1920])
+def test_no_link_of_the_navigation_is_cut_off(one: Page, width: int) -> None:
+    one.set_viewport_size({"width": width, "height": 900})
+    edges = one.evaluate("""() => [...document.querySelectorAll("nav a")].map((link) => {
+        const { left, right } = link.getBoundingClientRect();
+        return [left, right];
+    })""")
+    assert len(edges) >= 8
+    assert all(left >= 0 and right <= width for left, right in edges)
+    assert one.evaluate(
+        "(() => { const nav = document.querySelector('nav'); return nav.scrollWidth <= nav.clientWidth; })()"
+    )
+    one.set_viewport_size({"width": 1280, "height": 900})
 
 
 def test_nothing_scrolls_sideways_on_a_phone(two: Page) -> None:

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Truth
-from aeroloop.protocol.wire.attitude import Quaternion
+from aeroloop.protocol.wire.attitude import Quaternion, to_euler
 from aeroloop.service.config import load
+from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.angles import roll_pitch_yaw
 from aeroloop.service.review.downsample import DownsampledLines
+from aeroloop.service.review.observe import DrawnPart
 from aeroloop.service.review.review import read, report
 from tests.support.edited_log import LATENCY_NS, PERIOD_NS, message_of, observer_of, rewrite, ticks_of
 from tests.support.made_log import SESSION, START_NS, make_log
@@ -50,6 +53,7 @@ def test_a_short_session_is_drawn_exactly(whole: Path) -> None:
 def test_panels_stand_in_the_order_of_the_papers_figures_and_are_named_after_them(whole: Path) -> None:
     made = report([whole])
     assert list(dict.fromkeys((panel.group, panel.title.partition(":")[0]) for panel in made.panels)) == [
+        ("angles", "Roll, pitch and yaw"),
         ("attitude", "Figure C.7"),
         ("rate", "Figure C.8"),
         ("attitude_error", "Figure C.9"),
@@ -62,7 +66,7 @@ def test_panels_stand_in_the_order_of_the_papers_figures_and_are_named_after_the
         ("z_norm", "Error of Theorem 1"),
         ("lyapunov", "Lyapunov function"),
     ]
-    assert [panel.label for panel in made.panels][:4] == ["η", "ε₁", "ε₂", "ε₃"]
+    assert [panel.label for panel in made.panels][:7] == ["roll", "pitch", "yaw", "η", "ε₁", "ε₂", "ε₃"]
     assert all(line.values.shape == made.time.shape for panel in made.panels for line in panel.lines)
 
 
@@ -71,7 +75,40 @@ def test_of_both_signs_the_attitude_is_drawn_with_that_beside_the_desired_one() 
     observer.ticks(ticks_of(0, attitude=(-0.6, 0.0, -0.8, 0.0), desired=(0.6, 0.0, 0.8, 0.0)))
     observer.ticks(ticks_of(1, attitude=(0.6, 0.0, 0.8, 0.0), desired=(0.6, 0.0, 0.8, 0.0)))
     _, panels = observer.lines()
-    assert panels[0].lines[0].values.tolist() == panels[0].lines[1].values.tolist() == [0.6, 0.6]
+    (eta,) = (panel for panel in panels if panel.label == "η")
+    assert eta.lines[0].values.tolist() == eta.lines[1].values.tolist() == [0.6, 0.6]
+
+
+def test_roll_pitch_and_yaw_are_the_angles_of_each_quaternion() -> None:
+    q = np.random.default_rng(1).normal(size=(200, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    np.testing.assert_allclose(roll_pitch_yaw(q), np.degrees([to_euler(tuple(one)) for one in q.tolist()]), atol=1e-9)
+
+
+def test_yaw_runs_on_where_the_body_turns_past_half_a_turn_and_what_is_measured_and_true_stays_beside_it() -> None:
+    """The reference turns about z at 10° a tick; the body lags by 4°, as measured, and by 5° truly."""
+    observer = observer_of()
+    for k in range(60):
+        desired, measured, true = (
+            (cos(radians(10 * k - lag) / 2), 0.0, 0.0, sin(radians(10 * k - lag) / 2)) for lag in (0, 4, 5)
+        )
+        observer.trial.truth(k, true, (0.0, 0.0, 0.0))
+        observer.ticks(ticks_of(k, attitude=measured, desired=desired))
+    _, panels = observer.lines()
+    (yaw,) = (panel for panel in panels if panel.label == "yaw")
+    lines = {line.label: line.values for line in yaw.lines}
+    np.testing.assert_allclose(lines["desired"], 10.0 * np.arange(60), atol=1e-6)
+    np.testing.assert_allclose(lines["measured"], lines["desired"] - 4, atol=1e-6)
+    np.testing.assert_allclose(lines["true"], lines["desired"] - 5, atol=1e-6)
+
+
+def test_of_a_part_every_tick_is_drawn_however_long_the_session_is(whole: Path) -> None:
+    made = report([whole], part=DrawnPart(0.2, 0.3, points=60))
+    assert made.time.tolist() == pytest.approx([0.002 * k for k in range(100, 151)])
+    assert (made.thinned, made.part) == (1, (0.2, 0.3))
+    assert made.findings == report([whole]).findings  # of the whole session
+    with pytest.raises(ReviewError, match=r"nothing to draw after 2 s and before 3 s: the session has 1 s"):
+        report([whole], part=DrawnPart(2, 3))
 
 
 def test_the_true_error_is_drawn_where_the_log_has_the_truth(whole: Path, tmp_path: Path) -> None:
@@ -161,9 +198,10 @@ def test_buckets_are_alike_however_long_it_runs() -> None:
 
 
 def test_an_observer_holds_a_bounded_number_of_points_however_many_ticks_come() -> None:
-    observer = observer_of()
-    for k in range(20_000):
-        observer.ticks(ticks_of(k))
+    observer = observer_of(part=DrawnPart(points=4096))
+    ticks = Ticks.joined([ticks_of(k) for k in range(20_000)])
+    for k in range(0, 20_000, 50):
+        observer.ticks(ticks.where(slice(k, k + 50)))
     time, panels = observer.lines()
     assert 1024 < len(time) <= 4096
     assert observer.thinned == 16

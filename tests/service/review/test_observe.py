@@ -14,7 +14,7 @@ from aeroloop.service.config import load
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read
 from tests.support.edited_log import Said, edited, message_of, observer_of, rewrite, ticks_of
-from tests.support.made_log import START_NS, make_log
+from tests.support.made_log import SESSION, START_NS, make_log
 
 TICKS = 500
 
@@ -85,6 +85,26 @@ def test_latency_and_period_are_those_of_the_plants_own_clock(whole: Path, tmp_p
     assert [count for edge, count in period.bins if edge < 1900 or edge > 2100] == [1, 1]
     slow = [count for edge, count in latency.bins if edge > 1000]
     assert (sum(slow), sum(count for _, count in latency.bins)) == (10, TICKS - 1)
+
+
+def test_the_loop_latency_is_that_of_the_session_whatever_the_plant_counted_before(whole: Path, tmp_path: Path) -> None:
+    """The plant's own status counts since its start; its sessions before may have been slower."""
+    slow = Percentiles(count=90_000, p50=1919, p99=9000, p999=9000, max=9000)
+    status = Status(
+        role="plant", state="driven", session=SESSION, uptime_s=1, ticks=1, rate_hz=1, skipped=0, latency_us=slow
+    )
+    more = [message_of("status", status, START_NS + 100_000_000, role="plant")]
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
+    assert findings.latency_us is not None
+    assert findings.latency_us.count == TICKS - 1
+    assert findings.latency_us.p50 == findings.timing["latency"].p50 == pytest.approx(300, rel=0.044)
+
+
+def test_in_lockstep_there_is_no_latency_and_no_age_and_the_reason_is_stated(tmp_path: Path) -> None:
+    make_log(tmp_path / "a.mcap", 100, settings=load(overrides=["loop.lockstep=true"]))
+    findings = found(tmp_path / "a.mcap")
+    assert (findings.latency_us, findings.age_us) == (None, None)
+    assert findings.reasons["latency_us"] == findings.reasons["age_us"] == LOCKSTEP
 
 
 def test_the_age_of_measurements_is_what_the_controller_said_worst_first(whole: Path, tmp_path: Path) -> None:

@@ -1,0 +1,96 @@
+"""Style of figures for print: a journal's column widths, one colour scheme, PDF, SVG and PNG, no titles.
+
+Colours are those of Okabe and Ito, which differ for the colour-blind, too; in grey, line styles and markers differ.
+The same bytes come out for the same figure: files have no date, and SVG ids no salt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from aeroloop.service.logs.files import ReviewError
+
+Columns = Literal[1, 2]
+
+WIDTH_IN: Final[dict[Columns, float]] = {1: 3.5, 2: 7.16}
+"""Width of one column, and of two, in IEEE's journals [in]."""
+
+FORMATS: Final[dict[str, dict[str, Any]]] = {
+    "pdf": {"metadata": {"CreationDate": None}},
+    "svg": {"metadata": {"Date": None}},
+    "png": {"dpi": 600},
+}
+"""Suffixes of every figure, with the options of each."""
+
+BLUE, ORANGE, GREEN, PURPLE, BLACK = "#0072b2", "#d55e00", "#009e73", "#b0568c", "#222222"
+
+MEASURED: Final[dict[str, Any]] = {"color": BLUE, "linewidth": 0.7}
+DESIRED: Final[dict[str, Any]] = {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (3.5, 2.5))}
+TRUE: Final[dict[str, Any]] = {"color": GREEN, "linewidth": 0.9, "linestyle": (0, (1, 1))}
+
+_STYLE: Final[dict[str, Any]] = {
+    "font.family": "STIXGeneral",  # a Times that comes with matplotlib
+    "mathtext.fontset": "stix",
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "legend.columnspacing": 1.2,
+    "legend.borderpad": 0.2,
+    "axes.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.4,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "pdf.fonttype": 42,  # TrueType, which journals ask for
+    "svg.hashsalt": "aeroloop",
+    "path.simplify": True,
+}
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """Every figure that is drawn and saved within has the style."""
+    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]  # its keys are literals in the stubs
+        yield
+
+
+def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure, list[Axes]]:
+    """A figure with panels of this height [in] over one time axis [s]."""
+    figure = Figure(figsize=(WIDTH_IN[columns], 0.45 + height * panels), layout="constrained")
+    axes: list[Axes] = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
+    for axis in axes:
+        axis.margins(x=0)
+        axis.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    return figure, axes
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Save a figure in every format, and return the paths. Raises ReviewError if it cannot be written."""
+    paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once, not for each format
+        for path, options in zip(paths, FORMATS.values(), strict=True):
+            figure.savefig(path, **options)
+    except OSError as error:
+        raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
+    return paths
