@@ -11,6 +11,7 @@ import pytest
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.service.config import load
+from aeroloop.service.review.findings import LOCKSTEP
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read
 from tests.support.edited_log import Said, edited, message_of, observer_of, rewrite, ticks_of
