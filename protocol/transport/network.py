@@ -182,7 +182,8 @@ def accepting(places: list[str]) -> list[str]:
         for number, _ in waiting.poll(left * 1000):
             waiting.unregister(number)
             attempt, place = attempts.pop(number)
-            if attempt.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == 0:
+            with suppress(OSError):
+                attempt.getpeername()  # raises if it is not connected
                 found.append(place)
             attempt.close()
     for attempt, _ in attempts.values():

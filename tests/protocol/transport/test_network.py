@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import TOPICS, Topic
 from aeroloop.protocol.runtime.processes import listener
-from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, visit
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, accepting, visit
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 
@@ -153,6 +153,11 @@ def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
             assert "--set network.listen=" in text
             assert ".rs" not in text  # Zenoh's own source locations are of no use to the user
         assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
+
+
+def test_an_address_that_cannot_be_reached_is_no_process_that_accepts() -> None:
+    """Neither a name that is none, nor a closed port."""
+    assert accepting(["tcp/no-such-host.invalid:7447", f"tcp/127.0.0.1:{free_port()}"]) == []
 
 
 def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:
