@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import TOPICS, Topic
-from aeroloop.protocol.runtime.processes import listener
+from aeroloop.protocol.runtime.processes import listener, name_process
 from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, accepting, visit
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
@@ -101,6 +101,9 @@ def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() 
         with visit(gathering.settings) as here:
             linked([*members, here.session])
             assert here.silent() == [gathering.settings.places[0]]
+        name_process("plant")
+        assert listener(gathering.settings.places[0]) == (os.getpid(), "plant")
+        name_process("pytest")
         assert listener(gathering.settings.places[0]) == (os.getpid(), None)
 
 
