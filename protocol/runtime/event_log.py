@@ -9,7 +9,7 @@ from aeroloop.protocol.messages.models import Event
 
 log: Final = logging.getLogger("aeroloop")
 
-_GRAVE: Final = ("tripped", "lost", "fault")
+_GRAVE: Final = ("tripped", "lost", "fault", "refused")
 
 
 def log_event(event: Event, vehicle: str | None) -> None:

@@ -115,7 +115,7 @@ class ProcessGroup:
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
         self._changed = threading.Condition()
-        self.zenoh = join(settings.network, listen=False)
+        self.zenoh = join(settings.network)  # listens, so that a process links to it as it starts
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
 
     def __enter__(self) -> Self:

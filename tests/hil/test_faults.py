@@ -173,6 +173,7 @@ def far_apart() -> Iterator[tuple[Cable, list[Event], list[Truth], list[subproce
 
             session.declare_subscriber(topics.key(name, "aero"), receive)
         near = ["controller", "--auto-arm", "--set", f"network.rendezvous={cable.endpoint}"]
+        near += ["--set", "controller.after_restart=configured"]  # it drives
         started.append(subprocess.Popen([*AEROLOOP, *near, *common]))
         yield cable, events, truths, started
     for process in started:
