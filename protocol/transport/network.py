@@ -49,6 +49,15 @@ POLL_S: Final = 0.005
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
+# A thread of Zenoh's that sends to a peer behind a narrow link may block. With its default, one or two threads a pool, it
+# then carries no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14, with these threads 0 of 6.
+# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
+os.environ.setdefault(
+    "ZENOH_RUNTIME",
+    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
+    "app: (worker_threads: 4))",
+)
+
 _PLACE = re.compile(r"(?P<protocol>[a-z]+)/(?P<host>[^/]+):(?P<port>\d+)(?P<rest>[?#].*)?")
 
 

@@ -20,7 +20,7 @@ from subprocess import Popen
 from tests.support.namespaces import Hosts
 
 AWAY_S = 2.0
-SETTLE_S = 3.0
+SETTLE_S = 2.0
 TRIALS = 10
 
 Parties = dict[str, Popen[bytes]]
