@@ -49,7 +49,7 @@ POLL_S: Final = 0.005
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
-# A thread of Zenoh's that sends to a peer behind a narrow link may block. By default a pool has one or two threads, which
+# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which
 # then carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14, with these threads 0 of 6.
 # Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
 os.environ.setdefault(
