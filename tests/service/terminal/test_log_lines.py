@@ -26,7 +26,7 @@ def test_an_events_line_has_its_fields_as_keys(kind: EventKind, caplog: pytest.L
     assert list(line) == KEYS
     expected = {"event": kind, "role": "plant", "vehicle": "aero", "session": "s1", "tick": 7, "message": event.text}
     assert {key: line[key] for key in expected} == expected
-    assert line["level"] == ("warning" if kind in ("tripped", "lost", "fault") else "info")
+    assert line["level"] == ("warning" if kind in ("tripped", "lost", "fault", "refused") else "info")
 
 
 def test_another_librarys_line_has_the_same_keys() -> None:
