@@ -52,9 +52,10 @@ def listener(endpoint: str) -> Listener | None:
                 cells = line.split()
                 if cells[3] == _LISTENS and int(cells[1].rpartition(":")[2], 16) == int(port[1]):
                     inodes.add(f"socket:[{cells[9]}]")
-    for folder in Path("/proc").glob("[0-9]*") if inodes else []:
-        with suppress(OSError):
-            if any(os.readlink(file) in inodes for file in (folder / "fd").iterdir()):
-                name, _, _ = (folder / "comm").read_text().strip().partition("@")
-                return Listener(int(folder.name), name if name in _ROLES else None)
+    for file in Path("/proc").glob("[0-9]*/fd/*") if inodes else []:
+        with suppress(OSError):  # closed, or ended, in the meantime
+            if os.readlink(file) in inodes:
+                process = file.parent.parent
+                name, _, _ = (process / "comm").read_text().strip().partition("@")
+                return Listener(int(process.name), name if name in _ROLES else None)
     return None
