@@ -53,7 +53,7 @@ def listener(endpoint: str) -> Listener | None:
                 cells = line.split()
                 if cells[3] == _LISTENS and int(cells[1].rpartition(":")[2], 16) == int(port[1]):
                     inodes.add(f"socket:[{cells[9]}]")
-    for file in map(Path, iglob("/proc/[0-9]*/fd/*") if inodes else ()):  # noqa: PTH207 - Path.glob raises if one ends
+    for file in map(Path, iglob("/proc/[0-9]*/fd/*") if inodes else ()):
         with suppress(OSError):  # closed, or ended, in the meantime
             if os.readlink(file) in inodes:
                 process = file.parent.parent
