@@ -22,7 +22,7 @@ from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, FaultStatus, Grant, Refusal, Release, SessionRecord, Status
-from aeroloop.protocol.messages.operator import Answer, Ask
+from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s
 from aeroloop.protocol.runtime.role import Role
@@ -79,9 +79,9 @@ class ZenohFront(Front):
         role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
         role.serve("release", Release, lambda release: lambda: self._release(release))
         role.serve("record", SessionRecord, lambda record: lambda: self._keep(record))
-        role.serve("show", Ask, lambda _: self._show)
-        role.serve("arm", Ask, lambda _: self._arm)
-        role.serve("stop", Ask, lambda _: self._stop)
+        role.serve("show", Request, lambda _: self._show)
+        role.serve("arm", Request, lambda _: self._arm)
+        role.serve("stop", Request, lambda _: self._stop)
         role.watch_tokens(self._token)
         role.zenoh.declare_subscriber(
             topics.key("status", role.vehicle, role=role.role), self._other_plant, allowed_origin=zenoh.Locality.REMOTE
@@ -157,13 +157,13 @@ class ZenohFront(Front):
 
     def _token(self, name: str, appeared: bool) -> None:
         if not appeared:
-            self._role.later(lambda: self._endpoint.lost(name))
+            self._role.enqueue(lambda: self._endpoint.lost(name))
 
     def _other_plant(self, sample: zenoh.Sample) -> None:
         """Another plant end publishes under this one's name, as after a network was cut and healed."""
         with suppress(ValidationError):
             other = Status.model_validate_json(sample.payload.to_bytes())
-            self._role.later(lambda: self._contest(other.process))
+            self._role.enqueue(lambda: self._contest(other.process))
 
     def _contest(self, other: str) -> None:
         if self._endpoint.trip is not TripCause.DUPLICATE:

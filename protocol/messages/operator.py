@@ -138,7 +138,7 @@ class Gains(Message):
     Gamma: Gain | None = Field(default=None, description="of the adaptation [N·m·s²/rad² per s]")
 
 
-class Ask(Message):
+class Request(Message):
     """A request without arguments: arm, stop, stand down, recall."""
 
 

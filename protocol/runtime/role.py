@@ -101,7 +101,7 @@ class Role:
         self._inbox: deque[Action] = deque()
         self._throttle = Throttle()
         self._started = time.monotonic()
-        self.configured(config)
+        self.publish_description(config)
         key = topics.key("description", vehicle, role=role)
         self.answer(key, lambda query: query.reply(key, self._description))
         self.answer(topics.key("status", vehicle, role=role), self._answer_status)
@@ -137,7 +137,7 @@ class Role:
 
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
 
-    def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
+    def publish_description(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
         """Publish the role's description: its effective configuration and, from a controller, its certificate."""
         freshness_s = None
         if "wire" in config and "loop" in config:
@@ -198,7 +198,7 @@ class Role:
 
         self.answer(key, received)
 
-    def later(self, action: Action) -> None:
+    def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
         self._inbox.append(action)
 

@@ -16,10 +16,10 @@ group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loo
 def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Check whether this machine holds the configured rate, and print what to change if not."""
     settings = settings_of(config, overrides)
-    from aeroloop.service.host.doctor import TRIAL_S, diagnose
+    from aeroloop.service.host.doctor import CHECK_S, diagnose
     from aeroloop.service.terminal.display import diagnosis_table, progress_bar
 
-    with guarded(), progress_bar("check", TRIAL_S, hidden=json) as update:
+    with guarded(), progress_bar("check", CHECK_S, hidden=json) as update:
         diagnosis = diagnose(settings.loop, update)
     show(diagnosis, json, diagnosis_table)
     if not diagnosis.holds:

@@ -275,8 +275,8 @@ def track(
 
 
 def _send(settings: Settings, topic: str, message: Message | None = None) -> None:
-    from aeroloop.protocol.messages.operator import Ask
+    from aeroloop.protocol.messages.operator import Request
     from aeroloop.service.host.operator import send
 
     with guarded():
-        typer.echo(send(settings.network, settings.vehicle, topic, message or Ask()))
+        typer.echo(send(settings.network, settings.vehicle, topic, message or Request()))

@@ -109,16 +109,16 @@ def controller(
 
         daemon = Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller)
 
-        def promise(now: Settings) -> dict[str, Any] | None:
-            return daemon.promise(now.law, now.reference, now.controller)
+        def certificate_of(now: Settings) -> dict[str, Any] | None:
+            return daemon.certificate_of(now.law, now.reference, now.controller)
 
-        role.configured(settings.description(), promise(settings))
+        role.publish_description(settings.description(), certificate_of(settings))
         reload_on_hangup(
             role,
             settings,
             load,
             lambda new: daemon.reconfigure(new.law, new.reference, new.controller),
-            lambda effective: promise(from_description(effective)),
+            lambda effective: certificate_of(from_description(effective)),
         )
         daemon.run()
 

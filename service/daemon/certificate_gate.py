@@ -81,12 +81,12 @@ class CertificateGate:
         self.required = settings.require_certificate
         self._cache: deque[tuple[Gains, Reference, Verdict]] = deque(maxlen=KEPT)
         self._now = gains_of(law), reference
-        self._verdict: Verdict | None = self.weigh(*self._now)
+        self._verdict: Verdict | None = self.verdict_of(*self._now)
         self._published = ""
 
     # ── in any thread ──
 
-    def weigh(self, gains: Gains, reference: Reference) -> Verdict:
+    def verdict_of(self, gains: Gains, reference: Reference) -> Verdict:
         """The verdict on gains and a reference, from the cache if there."""
         if (cached := self._cached(gains, reference)) is not None:
             return cached
@@ -107,13 +107,13 @@ class CertificateGate:
         """
         if not (self.required if required is None else required):
             return
-        verdict = self.weigh(gains, reference)
+        verdict = self.verdict_of(gains, reference)
         if not verdict.holds:
             raise UncertifiedError(f"controller.require_certificate is set, and then {verdict.text}{verdict.helps}")
 
-    def promise(self, gains: Gains, reference: Reference) -> dict[str, Any] | None:
+    def certificate_of(self, gains: Gains, reference: Reference) -> dict[str, Any] | None:
         """The certificate as a description carries it; None of a stream."""
-        certificate = self.weigh(gains, reference).certificate
+        certificate = self.verdict_of(gains, reference).certificate
         return None if certificate is None else certificate.model_dump(mode="json")
 
     # ── in the loop ──
@@ -134,16 +134,16 @@ class CertificateGate:
             self.publish()
             return
 
-        def weigh() -> None:
-            verdict = self.weigh(gains, reference)
-            self._role.later(lambda: take_verdict(verdict))
+        def verdict_of() -> None:
+            verdict = self.verdict_of(gains, reference)
+            self._role.enqueue(lambda: take_verdict(verdict))
 
         def take_verdict(verdict: Verdict) -> None:
             if self._now == (gains, reference):
                 self._verdict = verdict
                 self.publish()
 
-        threading.Thread(target=weigh, name="weigh", daemon=True).start()
+        threading.Thread(target=verdict_of, name="verdict_of", daemon=True).start()
 
     def publish(self) -> None:
         """Publish the verdict, if it differs from the last one published."""

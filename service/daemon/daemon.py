@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
-from aeroloop.protocol.messages.operator import Answer, Ask, Hold, Reference, in_words
+from aeroloop.protocol.messages.operator import Answer, Hold, Reference, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
 from aeroloop.protocol.runtime.realtime import prepare_process
@@ -103,9 +103,9 @@ class Daemon:
         role.declare("telemetry", self._settings.telemetry_rate_hz)
         role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
         self._changes.serve()
-        role.serve("stand_down", Ask, lambda _: self._stand_down)
-        role.serve("recall", Ask, lambda _: self._recall)
-        role.serve("show", Ask, lambda _: lambda: self._changes.record)
+        role.serve("stand_down", Request, lambda _: self._stand_down)
+        role.serve("recall", Request, lambda _: self._recall)
+        role.serve("show", Request, lambda _: lambda: self._changes.record)
         role.watch_tokens(self._token)
         role.zenoh.declare_subscriber(topics.key("status", role.vehicle, role="plant"), self._receive_plant)
         role.announce()
@@ -319,16 +319,18 @@ class Daemon:
         self._machine.fire(Trigger.RECALL)
         return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
 
-    def promise(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> dict[str, Any] | None:
+    def certificate_of(
+        self, law: LawSettings, reference: Reference, settings: ControllerSettings
+    ) -> dict[str, Any] | None:
         """The certificate of a configuration, for the description; in any thread, before `reconfigure`.
 
         Raises:
             UncertifiedError: The theorem must hold and would not, and a session runs: a reload never ends a session.
         """
         prospect = self._changes.prospect(law, reference)
-        self._gate.weigh(*prospect)
+        self._gate.verdict_of(*prospect)
         self._gate.admit(*prospect, required=settings.require_certificate and bool(self._claims.session))
-        return self._gate.promise(gains_of(law), reference)
+        return self._gate.certificate_of(gains_of(law), reference)
 
     def reconfigure(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> None:
         """Take over gains, reference and settings between two ticks."""

@@ -48,7 +48,7 @@ def reload_on_hangup(
     settings: Settings,
     load: Callable[[], Settings],
     take_over: Callable[[Settings], None],
-    promise: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda _: None,
+    certificate_of: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda _: None,
 ) -> None:
     """Reload the configuration on SIGHUP.
 
@@ -57,8 +57,8 @@ def reload_on_hangup(
         settings: Its present configuration.
         load: Reads it again; raises ConfigError.
         take_over: Called with the new configuration between two ticks; applies what is in `LIVE`.
-        promise: Returns the certificate of an effective configuration, for the description. Raises an AeroloopError
-            where the theorem must hold and does not; then nothing changes.
+        certificate_of: Returns the certificate of an effective configuration, for the description. Raises an
+            AeroloopError where the theorem must hold and does not; then nothing changes.
     """
     current, effective = settings, settings.description()
 
@@ -67,13 +67,13 @@ def reload_on_hangup(
         now = load()
         lines = differences(current, now, role.role)
         description = _with_live_keys(effective, now.description(), role.role)
-        certificate = promise(description)
+        certificate = certificate_of(description)
         current, effective = now, description
 
         def apply() -> None:
             take_over(now)
             # The description holds effective values only: a log must not contain those that need a restart.
-            role.configured(description, certificate)
+            role.publish_description(description, certificate)
             role.event("changed", f"configuration read again: {'; '.join(lines) or 'nothing has changed'}")
 
         return apply

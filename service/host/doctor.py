@@ -20,7 +20,7 @@ from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming, summary
 from aeroloop.protocol.wire.loop import LoopSettings
 
-TRIAL_S: Final = 5.0
+CHECK_S: Final = 5.0
 GOOD_CLOCKS: Final = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page")
 SHARE_OF_PERIOD: Final = 0.25
 """Latest wake-up, as a share of the period; after it too little time is left for two crossings of the network."""
@@ -55,7 +55,7 @@ def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     findings += [Finding(what="set-up", good=False, found=line, advice="run it as a service") for line in refusals]
     timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
-    ticks, report_every = loop.ticks(TRIAL_S), max(1, loop.ticks(0.2))
+    ticks, report_every = loop.ticks(CHECK_S), max(1, loop.ticks(0.2))
     while grid.tick < ticks:
         k = grid.wait()
         timing.woke(grid.due_ns)
@@ -67,7 +67,7 @@ def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None
     limit_us = SHARE_OF_PERIOD * loop.period_ns / 1000
     late = wake is None or wake.p999 > limit_us
     trial = Finding(
-        what=f"{TRIAL_S:g} s at {loop.rate_hz:g} Hz",
+        what=f"{CHECK_S:g} s at {loop.rate_hz:g} Hz",
         good=not late and grid.skipped == 0,
         found=f"{grid.skipped} ticks skipped, 99.9 % of wake-ups within {wake.p999 if wake else float('nan'):.0f} µs",
         advice=f"want none skipped and {limit_us:.0f} µs: lower loop.rate_hz, free or isolate a CPU (loop.cpus), or "

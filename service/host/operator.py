@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
-from aeroloop.protocol.messages.operator import Answer, Ask, Message
+from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
 from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, visit
 
@@ -96,7 +96,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
         if not done:
             raise OperatorError("; ".join(answer.text for answer in answers))
         if topic == "arm":
-            done += [answer.text for answer in _answers(here.session, "recall", vehicle, Ask()) if answer.done]
+            done += [answer.text for answer in _answers(here.session, "recall", vehicle, Request()) if answer.done]
         return "; ".join(done)
 
 
@@ -140,7 +140,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
                     here.session.get(
                         topics.key("stop", address.vehicle),
                         received,
-                        payload=Ask().encode(),
+                        payload=Request().encode(),
                         timeout=wait_s,
                         target=zenoh.QueryTarget.ALL,
                         consolidation=zenoh.ConsolidationMode.NONE,
@@ -168,7 +168,7 @@ def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> Sessi
     found: list[SessionRecord] = []
     with visit(network) as here:
         here.settle()
-        for reply in _get(here.session, topics.key("show", vehicle), Ask().encode(), ANSWER_S):
+        for reply in _get(here.session, topics.key("show", vehicle), Request().encode(), ANSWER_S):
             with suppress(ValidationError):  # a plant without a record answers so
                 record = SessionRecord.model_validate_json(reply.ok.payload.to_bytes() if reply.ok else b"")
                 found += [record] if (record.ended is not None) == last else []

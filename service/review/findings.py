@@ -51,7 +51,7 @@ def findings_of(
     if not known:
         few = "too few ticks have all four times of sending and receiving"
         reasons["clock_offset_us"] = LOCKSTEP if lockstep else few
-    theorem, unknown = observer.trial.findings()
+    theorem, unknown = observer.check.findings()
     gaps = [gap for gap in run.missing if gap.vehicle == which[0]]
     return Findings(
         **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},

@@ -52,13 +52,13 @@ class Observer:
         part: What of it is drawn.
 
     Attributes:
-        trial: The same check.
+        check: The same check.
     """
 
     def __init__(self, settings: Settings, check: TheoremCheck, part: DrawnPart = WHOLE) -> None:
         wire = settings.wire
         self._period = settings.loop.period
-        self.trial = check
+        self.check = check
         self._columns = columns_of(settings, theta=check.damping_known)
         self._part = part
         self._lines = DownsampledLines(1 + len(self._columns), part.points)  # k, then what is drawn
@@ -105,7 +105,7 @@ class Observer:
         durations = periods, ticks.latency_ns, ticks.measurement_delay_ns, ticks.command_delay_ns
         for histogram, values in zip(self._timing.values(), durations, strict=True):
             histogram.add(values[~np.isnan(values)])
-        desired, error, drawn = ticks.desired, ticks.attitude_error, self.trial.ticks(ticks)
+        desired, error, drawn = ticks.desired, ticks.attitude_error, self.check.ticks(ticks)
         angles = without_jumps(roll_pitch_yaw(desired), self._last_angles)
         self._last_angles = angles[-1]
         seen, true = (beside(roll_pitch_yaw(q), angles) for q in (ticks.attitude, drawn.true_attitude))
@@ -170,9 +170,9 @@ class Observer:
         """Times on the law's clock [s] and panels."""
         points = self._lines.points()
         panels, time = panels_of(self._columns, points[:, 1:]), points[:, 0] * self._period
-        since_s, until_s = self.trial.judged_s
+        since_s, until_s = self.check.judged_s
         judged = (time >= since_s) & (time < until_s)
-        return time, with_level(panels, "z_norm", "guaranteed in the end", self.trial.radius, judged)
+        return time, with_level(panels, "z_norm", "guaranteed in the end", self.check.radius, judged)
 
 
 def _alternating(*tables: Array) -> Array:

@@ -86,9 +86,9 @@ class Session:
     def take(self, block: Block) -> None:
         """Review the next block."""
         observer = self._observer = self._observer or Observer(self.settings, self._check(block.changes), self.part)
-        observer.trial.changed(block.changes)
+        observer.check.changed(block.changes)
         self._session = block.which[1]
-        self._add_truths(observer.trial)
+        self._add_truths(observer.check)
         self._count(block)
         found = self.reader.take(block)
         for tick in found.missed.tolist():
@@ -105,8 +105,8 @@ class Session:
     def finish(self) -> None:
         """Check the truths after the last block."""
         if self._observer is not None:
-            self._add_truths(self._observer.trial)
-            self._observer.trial.finish()
+            self._add_truths(self._observer.check)
+            self._observer.check.finish()
 
     def _add_truths(self, check: TheoremCheck) -> None:
         try:

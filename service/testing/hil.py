@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
-from aeroloop.protocol.messages.operator import Advance, Answer, Ask, Gains, Hold, Inject, Message, Reference, Track
+from aeroloop.protocol.messages.operator import Advance, Answer, Gains, Hold, Inject, Message, Reference, Request, Track
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, as_overrides, load
@@ -161,7 +161,7 @@ class Hil:
 
     def arm(self) -> str:
         """Arm the plant and recall controllers, as `aeroloop op arm`. Returns what was done; HilError if refused."""
-        return self._operate("arm", Ask())
+        return self._operate("arm", Request())
 
     def stop(self) -> str:
         """Stop the plant, as `aeroloop op stop`. Returns what was done; HilError if refused."""
@@ -173,7 +173,7 @@ class Hil:
 
     def release(self) -> str:
         """Make the controller release the vehicle, as `aeroloop op release`. Returns and raises as `arm`."""
-        return self._operate("stand_down", Ask())
+        return self._operate("stand_down", Request())
 
     def goto(self, roll: float, pitch: float, yaw: float, within_s: float) -> str:
         """Turn to an attitude [deg] within a time [s], as `aeroloop op goto`. Returns and raises as `arm`."""

@@ -17,7 +17,7 @@ from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release
-from aeroloop.protocol.messages.operator import Answer, Ask
+from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import Role
@@ -110,7 +110,7 @@ class Ends:
 
     def stop(self) -> Answer:
         """As `aeroloop op stop`."""
-        return Answer.model_validate_json(self._ask("stop", Ask().encode()))
+        return Answer.model_validate_json(self._ask("stop", Request().encode()))
 
     def received_state(self) -> PlantState | None:
         """The state that the node last received from the bridge."""

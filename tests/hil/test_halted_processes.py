@@ -12,7 +12,7 @@ from typing import Final
 import pytest
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.operator import Ask
+from aeroloop.protocol.messages.operator import Request
 from aeroloop.protocol.transport.network import join
 from aeroloop.service.config import Settings, load
 from aeroloop.service.host.operator import OperatorError, gather, send, stop
@@ -41,9 +41,9 @@ def assert_operable(settings: Settings, missing: RoleName, *, halted: bool) -> N
             assert (answers, failures) == ([AT_REST], [])
     if missing == "plant":
         with pytest.raises(OperatorError, match=names[0] if names else "no plant of aero answers"):
-            send(network, "aero", "arm", Ask())
+            send(network, "aero", "arm", Request())
     else:
-        assert "aero is armed" in send(network, "aero", "arm", Ask())
+        assert "aero is armed" in send(network, "aero", "arm", Request())
     with join(network) as newcomer:
         found: set[str] = set()
         subscriber = newcomer.declare_subscriber(topics.key("status", "aero"), lambda s: found.add(str(s.key_expr)))
@@ -87,7 +87,7 @@ def send_until_armed(settings: Settings) -> None:
 
     def armed() -> bool:
         try:
-            send(settings.network, "aero", "arm", Ask())
+            send(settings.network, "aero", "arm", Request())
         except OperatorError as error:
             return "held by" in str(error)
         return True

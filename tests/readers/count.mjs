@@ -64,8 +64,8 @@ async function byIndex(path) {
     }
     for await (const _ of reader.readMetadata()); // each must be where the index says
     for await (const _ of reader.readAttachments({ validateCrcs: true }));
-    const told = reader.statistics?.messageCount;
-    if (told !== messages) throw new Error(`the file's statistics tell of ${told} messages, its index of ${messages}`);
+    const counted = reader.statistics?.messageCount;
+    if (counted !== messages) throw new Error(`the file's statistics count ${counted} messages, its index of ${messages}`);
     return counts.topics;
   } finally {
     await file.close();
@@ -81,5 +81,5 @@ for (const path of process.argv.slice(2)) {
     process.exit(1);
   }
 }
-// Times in ns are beyond what a JSON number holds exactly, so they are told as text.
+// Times in ns are beyond what a JSON number holds exactly, so they are written as text.
 console.log(JSON.stringify(found, (_, value) => (typeof value === "bigint" ? value.toString() : value), 2));

@@ -15,7 +15,7 @@ from string import Template
 from typing import Final
 
 from aeroloop.service.logs.files import ReviewError
-from aeroloop.service.report.page import happenings, setup, theorem, verdict
+from aeroloop.service.report.page import setup, tables, theorem, verdict
 from aeroloop.service.report.page.data import SPREADS, group_titles, page_data, period_s, spread_names
 from aeroloop.service.report.page.markup import Html, joined, tag
 from aeroloop.service.review.downsample import MAX_POINTS
@@ -77,7 +77,7 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
     timing = joined([
         tag("div", [_drawing("spread", name, SPREADS.get(name, name)) for name in spread_names(reports)],
             class_="drawings"),
-        happenings.timing(reports),
+        tables.timing(reports),
         _groups(reports, {group: title for group, title in titles.items() if group in in_time}),
     ])  # fmt: skip
     configurations = [report.settings for report in reports]
@@ -89,10 +89,10 @@ def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:
         *([("missing", "What is missing from the log", broken)] if broken else []),
         ("tracking", "Tracking", joined([_drawn(reports), drawn])),
         *([("theorem", "What the theorem promises", joined([promised, _groups(reports, proved)]))] if promised else []),
-        ("events", "Events", joined([happenings.faults(reports), happenings.events(reports)])),
+        ("events", "Events", joined([tables.faults(reports), tables.events(reports)])),
         ("timing", "Timing", timing),
-        ("gaps", "Gaps", happenings.gaps(reports)),
-        ("wire", "On the wire", happenings.wire(reports)),
+        ("gaps", "Gaps", tables.gaps(reports)),
+        ("wire", "On the wire", tables.wire(reports)),
         ("configuration", "Configuration", joined([search, setup.sections(reports, configurations)])),
         ("facts", "Software and host", setup.sections(reports, [report.facts for report in reports])),
     ]

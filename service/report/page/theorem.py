@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from aeroloop.service.report.page.happenings import Column, table
 from aeroloop.service.report.page.markup import Html, joined, jump, tag
+from aeroloop.service.report.page.tables import Column, table
 from aeroloop.service.report.page.verdict import figures_table, run_name
 from aeroloop.service.report.rows import THEOREM, figure_rows, percent
 from aeroloop.service.review.report import Report, TheoremFindings

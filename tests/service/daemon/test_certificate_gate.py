@@ -50,7 +50,7 @@ def certified() -> Certified:
 def wait_for_threads() -> None:
     """Until what is computed beside the loop is done."""
     for thread in threading.enumerate():
-        if thread.daemon and thread is not threading.current_thread() and "weigh" in thread.name:
+        if thread.daemon and thread is not threading.current_thread() and "verdict_of" in thread.name:
             thread.join(30)
 
 
@@ -97,7 +97,7 @@ def test_a_stream_is_refused_and_what_can_be_certified_is_followed(certified: Ce
 def test_two_changes_that_hold_by_themselves_are_not_both_taken_if_together_they_do_not(certified: Certified) -> None:
     less, more = Gains(C1=(1.2, 1.2, 1.2)), Gains(C2=(0.06, 0.06, 0.06))
     for alone in (less, more):
-        assert certified.assurance.weigh(gains_of(of(alone)), Sinusoid()).holds
+        assert certified.assurance.verdict_of(gains_of(of(alone)), Sinusoid()).holds
     asked = [certified.ask("set_gains", gains) for gains in (less, more)]
     certified.tick()
     assert [one.answers[0].done for one in asked] == [True, False]
@@ -131,7 +131,7 @@ def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
     loop = Certified(required=True)
     loop.assurance.publish()
     for gains in (FAILING, BETTER):
-        loop.assurance.weigh(*loop.live.prospect(of(gains), Sinusoid()))
+        loop.assurance.verdict_of(*loop.live.prospect(of(gains), Sinusoid()))
         loop.live.adopt(of(gains), Sinusoid())
         blocks = loop.assurance.blocks
         if gains is FAILING:

@@ -703,14 +703,14 @@ def test_a_configuration_read_again_takes_over_what_differs_and_leaves_an_operat
     loop.ask("track", Track(reference=SWING, within_s=0.5))
     loop.run(0.1)
     gains = {"C1": (0.5, 0.5, 0.5)}
-    loop.role.later(lambda: loop.live.adopt(LawSettings.model_validate(gains), LEVEL))  # LEVEL is as it was configured
+    loop.role.enqueue(lambda: loop.live.adopt(LawSettings.model_validate(gains), LEVEL))  # LEVEL is configured
     loop.run(0.1)
     assert loop.controller.gains == Gains(C1=(0.5, 0.5, 0.5), C2=LAW.C2, Gamma=LAW.Gamma)
     assert [(change.tick, change.reference) for change in loop.changes()[1:]] == [(0, SWING), (50, None)]
     loop.ask("set_gains", Gains(C1=(0.6, 0.6, 0.6)))
     loop.tick()
     turned = Hold(attitude=(0.0, 0.0, 5.0))
-    loop.role.later(lambda: loop.live.adopt(LawSettings.model_validate(gains), turned))
+    loop.role.enqueue(lambda: loop.live.adopt(LawSettings.model_validate(gains), turned))
     loop.run(2.5)
     assert loop.controller.gains == Gains(C1=(0.6, 0.6, 0.6), C2=LAW.C2, Gamma=LAW.Gamma)
     assert loop.changes()[-1].reference == turned
@@ -726,14 +726,14 @@ def test_limits_that_are_read_again_hold_for_what_is_asked_next(loop: Loop) -> N
 
 
 def test_a_configured_reference_that_is_far_away_is_reached_as_soon_as_the_limits_allow(loop: Loop) -> None:
-    loop.role.later(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 0.0, 170.0))))
+    loop.role.enqueue(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 0.0, 170.0))))
     loop.tick()
     assert loop.events("fault") == []
     assert loop.changes()[-1].within_s == pytest.approx(radians(170) * 15 / 8, rel=1e-9)
 
 
 def test_a_configured_reference_beyond_the_limits_is_reported_and_ends_nothing(loop: Loop) -> None:
-    loop.role.later(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 70.0, 0.0))))  # as reload.py's SIGHUP does
+    loop.role.enqueue(lambda: loop.live.adopt(LAW, Hold(attitude=(0.0, 70.0, 0.0))))  # as reload.py's SIGHUP does
     loop.tick()
 
 
@@ -836,5 +836,5 @@ def test_from_the_logged_changes_a_fresh_controller_gives_the_same_commands_byte
                     loop.end()
                     loop.begin()
                 case "read again":
-                    loop.role.later(lambda: loop.live.adopt(LawSettings(C1=(0.7, 0.7, 0.7)), SWING))
+                    loop.role.enqueue(lambda: loop.live.adopt(LawSettings(C1=(0.7, 0.7, 0.7)), SWING))
         loop.assert_it_runs_again()

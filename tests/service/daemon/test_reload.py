@@ -154,7 +154,7 @@ class Hangup:
         """Keep it."""
         self.reload = reload
 
-    def configured(self, config: dict[str, Any], certificate: dict[str, Any] | None) -> None:
+    def publish_description(self, config: dict[str, Any], certificate: dict[str, Any] | None) -> None:
         """Keep it."""
         self.description, self.certificate = config, certificate
 
@@ -196,12 +196,12 @@ def test_the_certificate_is_of_the_new_gains_and_computed_before_the_tick() -> N
     role = Hangup()
     promised: list[float] = []
 
-    def promise(config: dict[str, Any]) -> dict[str, Any]:
+    def certificate_of(config: dict[str, Any]) -> dict[str, Any]:
         promised.append(config["law"]["C1"][0])
         return {"holds": False}
 
     reload_on_hangup(
-        cast(Role, role), load(), lambda: load(overrides=["law.C1=[1.0, 1.0, 1.0]"]), lambda _: None, promise
+        cast(Role, role), load(), lambda: load(overrides=["law.C1=[1.0, 1.0, 1.0]"]), lambda _: None, certificate_of
     )
     assert role.reload is not None
     act = role.reload()
@@ -210,15 +210,17 @@ def test_the_certificate_is_of_the_new_gains_and_computed_before_the_tick() -> N
     assert (promised, role.certificate) == ([1.0], {"holds": False})
 
 
-def test_what_the_promise_refuses_changes_nothing_and_may_be_read_again() -> None:
+def test_what_the_certificate_refuses_changes_nothing_and_may_be_read_again() -> None:
     role, taken = Hangup(), list[Settings]()
 
-    def promise(config: dict[str, Any]) -> None:
+    def certificate_of(config: dict[str, Any]) -> None:
         if config["law"]["C1"][0] > 2:
             raise AeroloopError("no")
 
     configurations = iter((["law.C1=[3.0, 3.0, 3.0]"], ["law.C1=[1.0, 1.0, 1.0]"]))
-    reload_on_hangup(cast(Role, role), load(), lambda: load(overrides=next(configurations)), taken.append, promise)
+    reload_on_hangup(
+        cast(Role, role), load(), lambda: load(overrides=next(configurations)), taken.append, certificate_of
+    )
     with pytest.raises(AeroloopError):
         role.hang_up()
     role.hang_up()

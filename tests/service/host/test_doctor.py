@@ -40,7 +40,7 @@ def test_the_trial_runs_at_the_configured_rate_and_every_finding_is_reported() -
 
 def test_a_machine_that_stalls_does_not_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "prepare_process", lambda _settings: [])
-    monkeypatch.setattr(doctor, "TRIAL_S", 1.0)
+    monkeypatch.setattr(doctor, "CHECK_S", 1.0)
     wait = tick_grid.TickGrid.wait
 
     def stalling(grid: tick_grid.TickGrid) -> int:

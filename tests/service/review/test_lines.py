@@ -92,7 +92,7 @@ def test_yaw_runs_on_where_the_body_turns_past_half_a_turn_and_what_is_measured_
         desired, measured, true = (
             (cos(radians(10 * k - lag) / 2), 0.0, 0.0, sin(radians(10 * k - lag) / 2)) for lag in (0, 4, 5)
         )
-        observer.trial.truth(k, true, (0.0, 0.0, 0.0))
+        observer.check.truth(k, true, (0.0, 0.0, 0.0))
         observer.ticks(ticks_of(k, attitude=measured, desired=desired))
     _, panels = observer.lines()
     (yaw,) = (panel for panel in panels if panel.label == "yaw")
@@ -137,7 +137,7 @@ def test_the_true_error_is_that_of_the_law_however_far_the_body_is_turned() -> N
     observer = observer_of()
     for k in range(3):
         turned = product(desired, (cos(radians(15)), sin(radians(15)), 0.0, 0.0))
-        observer.trial.truth(k, turned, (0.0, 0.0, 0.0))
+        observer.check.truth(k, turned, (0.0, 0.0, 0.0))
         observer.ticks(ticks_of(k, desired=desired))
     _, panels = observer.lines()
     (true,) = (

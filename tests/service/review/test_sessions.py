@@ -216,7 +216,7 @@ def test_events_that_matter_come_first_and_the_certificate_once(
 ) -> None:
     settings = load()
     path = write(tmp_path / "a.mcap", settings, made(settings, 300, {20: (Gains(C2=(0.2, 0.2, 0.2)), None)}))
-    verdict = read(path).session.observer.trial.findings()[0].verdict
+    verdict = read(path).session.observer.check.findings()[0].verdict
     happened = [("controller", "started", verdict.rstrip(".")), ("controller", "changed", verdict.rstrip("."))]
     happened += [("plant", "armed", f"armed {i}") for i in range(30)]
     happened += [("controller", "fault", f"{i} ticks missed") for i in range(5)]
