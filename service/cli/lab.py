@@ -78,7 +78,15 @@ def calibrate(json: Json = False, config: Config = None, overrides: Overrides = 
 
 @group.command()
 def certify(
-    disturbance: Annotated[float, typer.Option(min=0, help="Largest disturbance torque, in N·m.")] = 0.0,
+    disturbance: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Largest torque beyond what the plant's settings say, in N·m; a machine needs it.",
+            show_default=False,
+        ),
+    ] = None,
+    late: Annotated[float, typer.Option(min=0, help="Further delay of commands, in s.")] = 0.0,
     attitude_error: Annotated[
         float | None,
         typer.Option(
@@ -103,14 +111,7 @@ def certify(
     from aeroloop.service.theorem.certificate import certify
 
     with guarded():
-        result = certify(
-            settings.wire,
-            settings.law,
-            settings.reference,
-            settings.controller,
-            disturbance=disturbance,
-            attitude_error_deg=attitude_error,
-        )
+        result = certify(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
     show(result, json, lambda found: certificate_table(found, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
 

@@ -107,7 +107,7 @@ def controller(
         from aeroloop.service.daemon.daemon import Daemon
         from aeroloop.service.daemon.reload import reload_on_hangup
 
-        daemon = Daemon(role, settings.loop, settings.wire, settings.law, settings.reference, settings.controller)
+        daemon = Daemon(role, settings)
 
         def certificate_of(now: Settings) -> dict[str, Any] | None:
             return daemon.certificate_of(now.law, now.reference, now.controller)

@@ -162,6 +162,14 @@ class Plan:
             return every
         return Angles(*(np.concatenate(both) for both in zip(every, self._swing(), strict=True)))
 
+    def third(self) -> Floats:
+        """The largest third derivative of roll, pitch and yaw [rad/s³]. Shape (3,)."""
+        ends = np.append(np.diff(self.starts), 0.0)[:, None, None] * np.linspace(0, 1, SAMPLES)[:, None]
+        c = self.quintic[:, None]
+        jerk = np.abs(6 * c[:, :, 3] + 24 * c[:, :, 4] * ends + 60 * c[:, :, 5] * ends**2)
+        largest: Floats = (jerk.max(axis=1) + np.abs(self.amplitude * self.frequency**3)).max(axis=0)
+        return largest
+
     def _swing(self) -> Angles:
         """The last piece's sinusoid over `_TURNS` periods of its slowest axis; its bounds if too many samples."""
         moving = self.frequency[-1][self.frequency[-1] > 0]

@@ -19,9 +19,8 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import EventKind
 from aeroloop.protocol.messages.operator import Gains, Reference
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
-from aeroloop.service.settings import ControllerSettings
 from aeroloop.service.theorem.certificate import Certificate, certify
 from aeroloop.service.theorem.extremes import BoundlessError
 
@@ -71,16 +70,12 @@ class CertificateGate:
         required: Whether the theorem must hold.
     """
 
-    def __init__(
-        self, role: Role, wire: WireSpec, law: LawSettings, reference: Reference, settings: ControllerSettings
-    ) -> None:
+    def __init__(self, role: Role, settings: Settings, reference: Reference) -> None:
         self._role = role
-        self._wire = wire
-        self._law = law
         self._settings = settings
-        self.required = settings.require_certificate
+        self.required = settings.controller.require_certificate
         self._cache: deque[tuple[Gains, Reference, Verdict]] = deque(maxlen=KEPT)
-        self._now = gains_of(law), reference
+        self._now = gains_of(settings.law), reference
         self._verdict: Verdict | None = self.verdict_of(*self._now)
         self._published = ""
 
@@ -90,10 +85,11 @@ class CertificateGate:
         """The verdict on gains and a reference, from the cache if there."""
         if (cached := self._cached(gains, reference)) is not None:
             return cached
-        law = self._law.model_copy(update={name: value for name, value in gains if value is not None})
+        law = self._settings.law.model_copy(update={name: value for name, value in gains if value is not None})
         try:
             with _giving_way():
-                verdict = Verdict.of(certify(self._wire, law, reference, self._settings))
+                changed = self._settings.model_copy(update={"law": law, "reference": reference})
+                verdict = Verdict.of(certify(changed))
         except BoundlessError as error:
             verdict = Verdict(None, f"nothing is certified: {error}")
         self._cache.append((gains, reference, verdict))

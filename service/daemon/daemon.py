@@ -25,9 +25,8 @@ from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import ZenohLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
@@ -59,12 +58,10 @@ class Daemon:
     def __init__(
         self,
         role: Role,
-        loop: LoopSettings,
-        wire: WireSpec,
-        law: LawSettings,
-        reference: Reference,
-        settings: ControllerSettings,
+        configured: Settings,
     ) -> None:
+        loop, wire, law, reference = configured.loop, configured.wire, configured.law, configured.reference
+        settings = configured.controller
         self._role = role
         self._loop = loop
         self._wire = wire
@@ -73,7 +70,7 @@ class Daemon:
         self._controller = self._new_controller()
         self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
         begins = reference if settings.after_restart == "configured" else Hold()
-        self._gate = CertificateGate(role, wire, law, begins, settings)
+        self._gate = CertificateGate(role, configured, begins)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
             role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators == 3

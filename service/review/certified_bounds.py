@@ -18,7 +18,7 @@ from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
-from aeroloop.service.theorem.certificate import Certificate, Evaluated, bounds_of, certify
+from aeroloop.service.theorem.certificate import Certificate, Evaluated, certify, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError
 
 
@@ -39,8 +39,8 @@ class CertifiedBounds(NamedTuple):
 
     @property
     def radius(self) -> float | None:
-        """Where ‖z‖ is guaranteed to end; None without a guarantee."""
-        return None if self.certificate is None or not self.certificate.holds else self.certificate.radius
+        """Within which ‖z‖ stays in the end; None where no such bound is proven of the plant."""
+        return None if self.certificate is None or not self.certificate.holds else self.certificate.plant_radius
 
 
 def certified_bounds(
@@ -57,14 +57,15 @@ def certified_bounds(
     gains = {name: value for name, value in (first and first.gains) or () if value is not None}
     law, reference = settings.law.model_copy(update=gains), (first and first.reference) or settings.reference
     try:
-        bounds = bounds_of(settings.wire, law, reference, settings.controller)
+        begun = settings.model_copy(update={"law": law, "reference": reference})
+        bounds = evaluate(begun)
     except BoundlessError as error:
         return CertifiedBounds(law, None, None, f"Nothing is promised: {error}.")
     certificate = None
     if (law, reference) == (settings.law, settings.reference) and promised is not None:
         with suppress(ValidationError):
             certificate = Certificate.model_validate(promised)
-    certificate = certificate or certify(settings.wire, law, reference, settings.controller)
+    certificate = certificate or certify(begun)
     return CertifiedBounds(law, certificate, bounds, certificate.verdict)
 
 

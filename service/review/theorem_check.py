@@ -240,7 +240,7 @@ class TheoremCheck:
             verdict=certified.verdict,
             holds=None if certificate is None else certificate.holds,
             radius=radius,
-            radius_deg=None if radius is None or certificate is None else certificate.radius_deg,
+            radius_deg=None if radius is None or certificate is None else certificate.plant_deg,
             transient_s=transient(certified.law),
             since_s=round(self._since * self._period, 9),
             until_s=None if self._until == inf else round(self._until * self._period, 9),

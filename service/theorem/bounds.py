@@ -18,14 +18,19 @@ Where the paper's text cannot be evaluated as printed, it is read as follows:
 - c₀ of (C.66): GᵀC₁G has rank 3 and the least eigenvalue 0. The proof needs z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃, which is at least
   λ_min(C₁) (1 + |η̃|)/2 ‖z₁‖².
 - (C.71) has δ_R λ_max(J) k_ωd where the proof has k_ω̇d; the proof is right.
-- Remark 5 says ‖θ̃‖ ≤ k_θ. The projection keeps θ̂, and Assumption 2 θ, within k_θ: that gives 2 k_θ.
+- Remark 5 says ‖θ̃‖ ≤ k_θ. Assumption 2 keeps θ within k_θ and the projection θ̂ within k_θ/0.95: their sum bounds θ̃.
 - k of (C.66) is the largest allowed: the margin itself.
+- (C.26) has k_ω_e = 1 + λ_max(C₁); ω_e = z₂ − C₁ε̃ gives √(1 + λ_max(C₁)²). (C.56) has λ_max(C₁) k_ω_e; since e ↦ η̃ I
+  + S(ε̃) is linear and of norm ‖e‖, the difference is ½ λ_max(C₁) δ_q k_ω_e, which vanishes without quantization.
+- (C.68) does not follow: V contains θ̃, so the ball is no level set of V. What (C.77) proves is the mean square,
+  (1/T) ∫‖z‖² dt ≤ V(0)/(kT) + δ_Q/k, so √(δ_Q/k) is the root of the mean square in the long run. `invariant`
+  has a bound at every instant.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import asin, cos, pi, sin, sqrt
+from math import cos, pi, sin, sqrt
 from typing import Annotated, NamedTuple
 
 
@@ -62,18 +67,23 @@ class Known:
             "Assumption 3",
             "rad",
             "assumed: the attitude error stays below twice this; from --attitude-error, else "
-            "controller.start_within_deg, within which sessions begin; at least the guaranteed final error",
+            "controller.start_within_deg, within which sessions begin",
         ),
     ]
     k_theta: Annotated[
         float, Term("k_θ", "Assumption 2", "N·m·s/rad", "assumed: ‖θ‖ ≤ law.damping_bound, as in the law")
     ]
-    k_tau_d: Annotated[float, Term("k_τ_d", "C.78", "N·m", "assumed: ‖τ_d‖ ≤ this, from --disturbance; 0 is Theorem 1")]
+    k_theta_hat: Annotated[float, Term("max ‖θ̂‖", "Remark 5", "N·m·s/rad", "k_θ/0.95, by the projection")]
+    k_tau_d: Annotated[
+        float,
+        Term("k_τ_d", "C.78", "N·m", "largest ‖τ_d‖: --disturbance, and what the plant's settings say; 0 is Theorem 1"),
+    ]
+    hold: Annotated[
+        float, Term("τ_h", "sampling", "N·m", "torque by which a command is out of date, within the invariant set")
+    ]
     omega_limit: Annotated[
         float,
-        Term(
-            "max |ω_k|", "C.29", "rad/s", "assumed: within wire.rate.limit; max ‖ω‖ below is the guaranteed final bound"
-        ),
+        Term("max |ω_k|", "C.29", "rad/s", "assumed of Lemma 1: within wire.rate.limit"),
     ]
     u_limit: Annotated[
         float, Term("max |u_k|", "C.30", "V", "assumed: within wire.voltage.limit; a log counts the commands beyond it")
@@ -96,22 +106,22 @@ class Lemma:
     delta_S1: Annotated[float, Term("δ_S1", "C.55, C.63", "rad/s", "‖S(ω)R_i^b − S(ω^Q)R_i^Q‖ at z = 0")]
     delta_S2: Annotated[float, Term("δ_S2", "C.55, C.63", "1", "its growth with ‖z‖")]
     delta_alpha1: Annotated[float, Term("δ_ᾱ1", "C.56, C.64", "rad/s²", "‖ᾱ^Q − α̇‖ at z = 0")]
-    delta_alpha2: Annotated[
-        float, Term("δ_ᾱ2", "C.56, C.64", "1/s", "its growth with ‖z‖; does not vanish without quantization")
-    ]
+    delta_alpha2: Annotated[float, Term("δ_ᾱ2", "C.56, C.64", "1/s", "its growth with ‖z‖")]
     delta_Phi: Annotated[float, Term("δ_ω", "C.57, C.65", "rad/s", "‖Φ − Φ^Q‖")]
     delta_Bu: Annotated[float, Term("δ_Bu", "C.75", "N·m", "torque of u's quantization error")]
 
 
 @dataclass(frozen=True)
 class Theorem:
-    """Quantities of Theorem 1 and Corollary 1. The last four are None where condition (C.66) fails."""
+    """Quantities of Theorem 1 and Corollary 1. The last two are None where condition (C.66) fails."""
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
     coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
     alpha: Annotated[float, Term("δ_ᾱ2 λ_max(J)", "C.67", "N·m·s/rad", "δ_V1's part of ᾱ^Q")]
     delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
-    k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "2 k_θ: θ and θ̂ are both within k_θ")]
+    k_theta_err: Annotated[
+        float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "k_θ + k_θ/0.95: θ by Assumption 2, θ̂ by the projection")
+    ]
     delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q due to θ̃")]
     delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 due to θ and θ̃")]
     delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "quantization's effect as a torque")]
@@ -120,16 +130,20 @@ class Theorem:
     margin: Annotated[float, Term("c₀/2 − δ_V1", "C.66", "N·m·s/rad", "positive where the theorem holds")]
     k: Annotated[float | None, Term("k", "C.66", "N·m·s/rad", "rate at which V decreases, per ‖z‖²")]
     radius: Annotated[
-        float | None, Term("√(δ_Q/k)", "C.68, C.79", "1, rad/s", "final bound of ‖z‖, disturbance included")
+        float | None,
+        Term(
+            "√(δ_Q/k)",
+            "C.68, C.79",
+            "1, rad/s",
+            "root of the mean of ‖z‖² in the long run, disturbance included",
+        ),
     ]
-    end_angle: Annotated[float | None, Term("4 asin(√(δ_Q/k)/2)", "C.19", "rad", "attitude error at that ‖z₁‖")]
-    end_rate: Annotated[float | None, Term("max ‖ω‖", "C.27", "rad/s", "k_ω_e √(δ_Q/k) + k_ω_d")]
 
 
 def lemma_1(p: Known) -> Lemma:
     """The δ of Lemma 1."""
     delta_q = attitude_error(p.delta_eps, min(pi / 2, p.half_angle_d + p.half_angle_e))  # (C.31), (C.33)
-    k_omega_e = 1 + p.C1_max  # (C.26)
+    k_omega_e = sqrt(1 + p.C1_max**2)  # (C.26)
     delta_R = 2 * (delta_q + delta_q**2)  # (C.61)
     delta_omega_e = delta_R * p.k_omega_d + p.delta_omega  # (C.58)
     return Lemma(
@@ -145,7 +159,7 @@ def lemma_1(p: Known) -> Lemma:
         delta_S1=p.k_omega_d * delta_R + p.delta_omega,  # (C.63)
         delta_S2=k_omega_e * delta_R,  # (C.63)
         delta_alpha1=p.C1_max * delta_omega_e / 2,  # (C.64)
-        delta_alpha2=p.C1_max * k_omega_e,  # (C.64)
+        delta_alpha2=p.C1_max * delta_q * k_omega_e / 2,  # (C.64)
         delta_Phi=p.delta_omega,  # (C.65)
         delta_Bu=p.delta_u * p.norm_B,  # (C.75)
     )
@@ -172,7 +186,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     c0 = min(p.C1_min * least_share, p.C2_min)  # (C.66)
     coriolis, alpha = d.delta_S2 * p.lambda_J * p.k_omega_d, d.delta_alpha2 * p.lambda_J
     delta_V1 = d.delta_Psi2 + coriolis + alpha  # (C.67)
-    k_theta_err = 2 * p.k_theta
+    k_theta_err = p.k_theta + p.k_theta_hat
     delta_theta1 = k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
     delta_theta2 = p.k_theta * p.delta_omega + k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
     delta_V2 = (
@@ -186,7 +200,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
         + d.delta_Bu
     )  # (C.71)
     delta_Q = delta_theta1 + delta_V2**2 / (2 * c0)  # (C.69)
-    delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d) ** 2 / (2 * c0)  # (C.80)
+    delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d + p.hold) ** 2 / (2 * c0)  # (C.80)
     margin = c0 / 2 - delta_V1  # (C.66)
     holds = margin > 0
     radius = sqrt(delta_Qdist / margin) if holds else None  # (C.68), (C.79)
@@ -204,11 +218,4 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
         margin=margin,
         k=margin if holds else None,
         radius=radius,
-        end_angle=None if radius is None else error_angle(radius),
-        end_rate=None if radius is None else d.k_omega_e * radius + p.k_omega_d,  # (C.27)
     )
-
-
-def error_angle(z1: float) -> float:
-    """The attitude error [rad] at ‖z₁‖: by (C.19), ‖z₁‖ = √(2 − 2|η̃|) = 2 sin(angle / 4); at most π."""
-    return min(pi, 4 * asin(min(1.0, z1 / 2)))

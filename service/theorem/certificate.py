@@ -1,34 +1,32 @@
-"""Certificate: whether bits, gains and reference satisfy Theorem 1 and Corollary 1, and by how much.
+"""Certificate: what is proven of a configuration, with its assumptions, and what fails.
 
-All is computed from the effective configuration, by the equations of `bounds`. The theorem's other premises are
-assumed: the damping (law.damping_bound), the disturbance, that no command saturates, and the largest attitude error,
-because q's error grows without bound as η nears 0. That error is controller.start_within_deg by default, within which a
-session begins; where the guaranteed final error is larger, it is widened until the two agree, so that no certificate
-contradicts itself. The theorem assumes the law's J, B and g for the plant, and continuous time; friction, lag and
-sensor errors are disturbances to it.
+Two statements stand side by side. The mean square of (C.77) follows from condition (C.66), by the paper's own terms in
+`bounds`. A bound at every instant follows from `invariant`, for the paper's body and for the configured plant. The
+certificate holds if both are proven of the configured plant and the set lies within everything that the proof
+presumes: the wire's ranges, the voltages within reach, half a turn, the bound of the damping.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from math import ceil, degrees, inf, pi, radians, sin, sqrt
+from math import asin, ceil, degrees, hypot, inf, pi, radians, sin, sqrt
 from typing import Any, Final, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from aeroloop.protocol.messages.operator import Reference
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from aeroloop.service.control.law import LawSettings
-from aeroloop.service.settings import ControllerSettings
+from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
-from aeroloop.service.theorem.extremes import Extremes, extremes
+from aeroloop.service.theorem.configured import Configured
+from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
+from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
+from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
 from aeroloop.service.theorem.remedies import Remedy, remedies
 
-_ROUNDS: Final = 500
-_AGREED: Final = 1e-9
+PROJECTION: Final = 0.95
+"""The projection keeps ‖θ̂‖ within k_θ divided by this."""
 
 
 class CertificateTerm(BaseModel):
@@ -44,42 +42,51 @@ class CertificateTerm(BaseModel):
 
 
 class Certificate(BaseModel):
-    """The theorem evaluated for a configuration."""
+    """What is proven of a configuration."""
 
     model_config = ConfigDict(frozen=True)
 
-    holds: bool = Field(description="whether (C.66) is satisfied and the reference stays within the wire's ranges")
+    holds: bool = Field(description="whether everything below is proven of the configured plant")
     margin: float = Field(description="c₀/2 − δ_V1 [N·m·s/rad]")
     c0: float = Field(description="c₀, as corrected [N·m·s/rad]")
     delta_V1: float = Field(description="δ_V1 of (C.67) [N·m·s/rad]")
     delta_V2: float = Field(description="δ_V2 of (C.71) [N·m]")
     delta_Q: float = Field(description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance [W]")
     k: float | None = Field(description="the largest k of (C.66) [N·m·s/rad]; null where it fails")
-    radius: float | None = Field(description="√(δ_Q/k), the final bound of ‖z‖ [1, rad/s]; null where (C.66) fails")
-    radius_deg: float | None = Field(description="the attitude error at that bound [deg]; null where (C.66) fails")
+    radius: float | None = Field(description="the same as rms_radius, by its name in the paper")
+    rms_radius: float | None = Field(
+        description="√(δ_Q/k): bounds the root of the mean of ‖z‖² in the long run [1, rad/s]; null where (C.66) fails"
+    )
+    pointwise_radius: float | None = Field(
+        description="bound of ‖z‖ at every instant, in the end, for the paper's body under this wire, law and period "
+        "[1, rad/s]; null where none is proven"
+    )
+    pointwise_deg: float | None = Field(description="the attitude error within that bound [deg]")
+    plant_radius: float | None = Field(
+        description="the same for the configured plant: its mechanism, lag, friction, wind, sensors and transport"
+    )
+    plant_deg: float | None = Field(description="the attitude error within that bound [deg]")
+    assumptions: list[str] = Field(description="what is assumed, each with the key or the option that states it")
+    violated: list[str] = Field(description="what fails, each with the key that would mend it; empty where it holds")
     terms: list[CertificateTerm]
-    blame: str | None = Field(description="why it does not hold; null where it does")
     remedies: list[Remedy] = Field(description="changes with which it would hold, the least of each kind")
+
+    @property
+    def blame(self) -> str | None:
+        """Why it does not hold; None where it does."""
+        return "; and ".join(self.violated) or None
 
     @property
     def verdict(self) -> str:
         """The certificate in a sentence."""
-        disturbance = self.value("k_τ_d")
-        name = f"Corollary 1, with ‖τ_d‖ ≤ {disturbance:g} N·m," if disturbance else "Theorem 1"
-        if self.blame is not None:
-            return f"{name} does not hold: {self.blame}."
-        assert self.radius_deg is not None
-        holds = (
-            f"{name} holds: c₀/2 = {self.c0 / 2:.4g} exceeds δ_V1 = {self.delta_V1:.4g} by {self.margin:.4g} N·m·s/rad"
-        )
-        if self.radius == 0:
-            return f"{holds}; the error goes to 0."
-        if self.radius_deg >= 180:
-            return f"{holds}; but ‖z‖ ≤ {self.radius:.4g} bounds no attitude error."
-        assumed = 2 * degrees(self.value("max ∡e/2") or 0.0)
+        if self.violated:
+            more = len(self.violated) - 1
+            return f"Does not hold: {self.violated[0]}{f' (and {more} more)' if more else ''}."
+        assert self.plant_radius is not None
+        assert self.plant_deg is not None
         return (
-            f"{holds}; in the end ‖z‖ ≤ {self.radius:.4g}, an attitude error of {self.radius_deg:.2f}°, "
-            f"provided that it never exceeds {assumed:.2f}°."
+            f"Holds: once there, ‖z‖ stays within {self.plant_radius:.4g}, the attitude within {self.plant_deg:.2f}°; "
+            f"in the long run the root of the mean of ‖z‖² is at most {self.rms_radius:.4g}."
         )
 
     def value(self, symbol: str) -> float | None:
@@ -89,45 +96,56 @@ class Certificate(BaseModel):
 
 @dataclass(frozen=True)
 class Evaluated:
-    """The quantities of a certificate."""
+    """The quantities of a certificate.
+
+    Attributes:
+        known: Inputs.
+        lemma: The bounds of Lemma 1.
+        theorem: The bounds of Theorem 1.
+        body: Premises of the paper's body.
+        plant: Premises of the configured plant.
+        body_reach: What the paper's body reaches; None where nothing is proven.
+        plant_reach: What the configured plant reaches; likewise.
+        bounds: What the plant does beyond the paper's equations.
+    """
 
     known: Known
     lemma: Lemma
     theorem: Theorem
+    body: Premises
+    plant: Premises
+    body_reach: Reach | None
+    plant_reach: Reach | None
+    bounds: PlantBounds
 
 
 def certify(
-    wire: WireSpec,
-    law: LawSettings,
-    reference: Reference,
-    controller: ControllerSettings,
+    settings: Configured,
     *,
-    disturbance: float = 0.0,
+    disturbance: float | None = None,
     attitude_error_deg: float | None = None,
+    late_s: float = 0.0,
 ) -> Certificate:
     """The certificate of a configuration.
 
     Args:
-        wire: The quantizers.
-        law: The model and the gains.
-        reference: The reference.
-        controller: How a session begins.
-        disturbance: k_τ_d, the largest assumed ‖τ_d‖ [N·m].
-        attitude_error_deg: Assumed bound on the attitude error at all times; controller.start_within_deg if None.
+        settings: The configuration.
+        disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
+        attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; controller.start_within_deg if None.
+        late_s: Further age of a command, by delay or lost frames [s].
 
     Raises:
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
-    inputs_of = _inputs_of(reference, controller, disturbance, attitude_error_deg)
-    bounds = evaluate(inputs_of(wire, law))
-    t = bounds.theorem
-    reasons, ways = _beyond_range(wire, bounds.known)
-    if t.k is None:
-        reasons.append(_blame(bounds.lemma, t))
-        ways += remedies(wire, law, lambda wire, law: evaluate(inputs_of(wire, law)).theorem.k is not None)
+    evaluated = partial(evaluate, disturbance=disturbance, attitude_error_deg=attitude_error_deg, late_s=late_s)
+    e = evaluated(settings)
+    t = e.theorem
+    violated, ways = _violated(settings, e), list[Remedy]()
+    if violated:
+        ways = _range_remedies(settings, e) + remedies(settings, lambda tried: not _violated(tried, evaluated(tried)))
     return Certificate(
-        holds=not reasons,
+        holds=not violated,
         margin=t.margin,
         c0=t.c0,
         delta_V1=t.delta_V1,
@@ -135,88 +153,203 @@ def certify(
         delta_Q=t.delta_Qdist,
         k=t.k,
         radius=t.radius,
-        radius_deg=None if t.end_angle is None else degrees(t.end_angle),
-        terms=[term for part in (bounds.known, bounds.lemma, t) for term in _terms(part)],
-        blame="; and ".join(reasons) or None,
+        rms_radius=t.radius,
+        pointwise_radius=_radius(e.body_reach),
+        pointwise_deg=_degrees(e.body_reach),
+        plant_radius=_radius(e.plant_reach),
+        plant_deg=_degrees(e.plant_reach),
+        assumptions=_assumptions(settings, e, disturbance),
+        violated=violated,
+        terms=[*(term for part in (e.known, e.lemma, t) for term in _terms(part)), *_reach_terms(e.plant_reach)],
         remedies=ways,
     )
 
 
-def bounds_of(
-    wire: WireSpec,
-    law: LawSettings,
-    reference: Reference,
-    controller: ControllerSettings,
+def evaluate(
+    settings: Configured,
     *,
-    disturbance: float = 0.0,
+    disturbance: float | None = None,
     attitude_error_deg: float | None = None,
+    late_s: float = 0.0,
 ) -> Evaluated:
     """The quantities of a certificate, to check a run against; arguments and errors as of `certify`."""
-    return evaluate(_inputs_of(reference, controller, disturbance, attitude_error_deg)(wire, law))
+    stated = disturbance or 0.0
+    if not 0 <= stated < inf:
+        raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
+    desired = extremes(settings.reference)
+    bounds = plant_bounds(settings, disturbance is not None)
+    body = premises(settings, desired, paper_body(settings), stated, late_s)
+    plant = premises(settings, desired, bounds, stated, late_s)
+    body_reach = reach(body)
+    plant_reach = reach(plant)
+    start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
+    p = _known(settings, desired, body, body_reach, radians(min(180.0, start_deg)))
+    lemma = lemma_1(p)
+    return Evaluated(p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
 
 
-def _inputs_of(
-    reference: Reference, controller: ControllerSettings, disturbance: float, attitude_error_deg: float | None
-) -> Callable[[WireSpec, LawSettings], Known]:
-    if not 0 <= disturbance < inf:
-        raise ValueError(f"a disturbance is 0 or more, in N·m, not {disturbance}")
-    start_deg = controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
-    return partial(known, desired=extremes(reference), disturbance=disturbance, error=radians(min(180.0, start_deg)))
-
-
-def known(wire: WireSpec, law: LawSettings, *, desired: Extremes, disturbance: float, error: float) -> Known:
-    """Inputs of the theorem for a configuration.
+def premises(
+    settings: Configured, desired: Extremes, plant: PlantBounds, disturbance: float, late_s: float
+) -> Premises:
+    """Premises of the invariant set.
 
     Args:
-        wire: The quantizers; a signal without one has the error 0.
-        law: The model and the gains.
+        settings: The configuration.
         desired: The reference's extremes.
-        disturbance: k_τ_d [N·m].
-        error: Largest attitude error [rad].
+        plant: What the plant does beyond the paper's equations.
+        disturbance: Further torque [N·m].
+        late_s: Further age of a command [s].
     """
-    # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
-    B = np.array(law.allocation)[3 - wire.actuators :, 3 - wire.actuators :]
+    wire, law = settings.wire, settings.law
+    gravity = law.mass * law.gravity
+    return Premises(
+        C1=law.C1,
+        C2=law.C2,
+        Gamma=law.Gamma,
+        J=law.inertia,
+        k_theta=law.damping_bound,
+        k_theta_hat=law.damping_bound / PROJECTION,
+        weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
+        weight_roll=abs(law.centre_of_mass[1]) * gravity,
+        norm_B=_norm_B(settings),
+        delta_omega=_error(wire.rate, 3) + plant.delta_omega,
+        delta_u=_error(wire.voltage, wire.actuators),
+        k_omega_d=desired.rate,
+        k_omega_d_dot=desired.acceleration,
+        k_omega_d_ddot=desired.jerk,
+        axis_rate=desired.axis_rate,
+        half_angle_d=desired.half_angle,
+        delta_q=chords(settings.reference, wire.attitude.quantizer().bound + plant.delta_eps),
+        age=plant.age + late_s,
+        rate_lag=plant.rate_lag,
+        k_tau_d=plant.torque + disturbance,
+        tilt=desired.tilt if plant.held_roll else None,
+    )
+
+
+def _known(settings: Configured, desired: Extremes, body: Premises, within: Reach | None, error: float) -> Known:
+    wire, law = settings.wire, settings.law
     return Known(
         lambda_J=max(law.inertia),
-        weight=float(np.linalg.norm(law.centre_of_mass)) * law.mass * law.gravity,
-        norm_B=float(np.linalg.norm(B, 2)),
+        weight=body.weight,
+        norm_B=body.norm_B,
         C1_min=min(law.C1),
         C1_max=max(law.C1),
         C2_min=min(law.C2),
         C2_max=max(law.C2),
         delta_eps=_error(wire.attitude, 3),
         delta_omega=_error(wire.rate, 3),
-        delta_u=_error(wire.voltage, wire.actuators),
+        delta_u=body.delta_u,
         k_omega_d=desired.rate,
         k_omega_d_dot=desired.acceleration,
         half_angle_d=desired.half_angle,
         half_angle_e=error / 2,
-        k_theta=law.damping_bound,
-        k_tau_d=disturbance,
+        k_theta=body.k_theta,
+        k_theta_hat=body.k_theta_hat,
+        k_tau_d=body.k_tau_d,
+        hold=within.hold if within else 0.0,
         omega_limit=wire.rate.limit,
         u_limit=wire.voltage.limit,
     )
 
 
-def evaluate(p: Known) -> Evaluated:
-    """The bounds, with the assumed attitude error widened to the guaranteed one if that is larger; at most 180°.
-
-    Both grow together: from the assumed error the iteration ends at the least fixed point.
-    """
-    for _ in range(_ROUNDS):
-        lemma = lemma_1(p)
-        theorem = theorem_1(p, lemma)
-        if theorem.end_angle is None or theorem.end_angle <= 2 * p.half_angle_e * (1 + _AGREED):
-            return Evaluated(p, lemma, theorem)
-        p = replace(p, half_angle_e=theorem.end_angle / 2)
-    p = replace(p, half_angle_e=pi / 2)
-    lemma = lemma_1(p)
-    return Evaluated(p, lemma, theorem_1(p, lemma))
+def _norm_B(settings: Configured) -> float:  # noqa: N802  # the paper's letter
+    # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
+    first = 3 - settings.wire.actuators
+    return float(np.linalg.norm(np.array(settings.law.allocation)[first:, first:], 2))
 
 
 def _error(signal: SignalSpec, elements: int) -> float:
     """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
     return sqrt(elements) * signal.quantizer().bound
+
+
+def largest_voltage(settings: Configured, at: Reach) -> float:
+    """The largest |u_k| that the law commands within a set [V]."""
+    first = 3 - settings.wire.actuators
+    inverse = np.linalg.inv(np.array(settings.law.allocation)[first:, first:])
+    along = np.abs(feedforward(settings.reference, settings.law)[:, first:] @ inverse.T).max(axis=0)
+    return float((along + np.linalg.norm(inverse, axis=1) * at.deviation).max())
+
+
+def _violated(settings: Configured, e: Evaluated) -> list[str]:
+    """What fails, the gravest first."""
+    found = list(e.bounds.unproven)
+    law = settings.law
+    if e.theorem.k is None:
+        found.append(_condition(e.lemma, e.theorem))
+    if e.bounds.theta is not None and (norm := hypot(*e.bounds.theta)) > law.damping_bound:
+        found.append(f"the plant's damping, ‖θ‖ = {norm:.3g}, exceeds law.damping_bound = {law.damping_bound:g}")
+    found += _beyond(settings, e, e.plant_reach or without_error(e.plant))
+    if e.plant_reach is None:
+        found.append(_unproven(e))
+    return found
+
+
+def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
+    """Which ranges the set exceeds."""
+    wire = settings.wire
+    volts, limit = largest_voltage(settings, at), min(wire.voltage.limit, settings.plant.voltage_limit)
+    where = "the set" if e.plant_reach else "what the quantizers alone do along the reference"
+    ranges = (
+        (at.axis_rate + e.plant.delta_omega, wire.rate.limit, "|ω_k|", "rad/s", "range: wire.rate.limit"),
+        (sin(at.half_angle), wire.attitude.limit, "|ε_k|", "", "range: wire.attitude.limit"),
+        (volts, limit, "|u_k|", "V", "saturation: wire.voltage.limit"),
+    )
+    return [
+        f"{name} = {most:g} {unit}".rstrip() + f", and {symbol} may reach {value:.3g} {unit}".rstrip() + f" by {where}"
+        for value, most, symbol, unit, name in ranges
+        if value > most
+    ]
+
+
+def _unproven(e: Evaluated) -> str:
+    """Which properties of the plant, removed one after the other, leave a set that is proven."""
+    p, body = e.plant, e.body
+    without: tuple[tuple[str, dict[str, Any]], ...] = (
+        (f"its age of {p.age * 1e3:.3g} ms (rotor lag, period, transport)", {"age": 0.0}),
+        ("the held roll: u₁ is never applied", {"tilt": None}),
+        (f"the rate sensor's error of {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
+        (f"a torque of {p.k_tau_d:.2g} N·m", {"k_tau_d": body.k_tau_d}),
+        ("the attitude sensor's error", {"delta_q": body.delta_q}),
+        (
+            f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)",
+            {"k_theta": 0.0, "k_theta_hat": 0.0},
+        ),
+        ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}),
+    )
+    names = list[str]()
+    for name, change in without:
+        changed = replace(p, **change)
+        if changed != p:
+            p = changed
+            names.append(name)
+            if reach(p) is not None:
+                break
+    return f"pointwise: no invariant set is proven; without {', and '.join(names)} there is one"
+
+
+def _condition(d: Lemma, t: Theorem) -> str:
+    parts = {"δ_ᾱ2 λ_max(J)": t.alpha, "δ_Ψ2": d.delta_Psi2, "δ_S2 λ_max(J) k_ω_d": t.coriolis}
+    symbol, value = max(parts.items(), key=lambda part: part[1])
+    return (
+        f"condition (C.66): c₀/2 = {t.c0 / 2:.4g} does not exceed δ_V1 = {t.delta_V1:.4g} N·m·s/rad; its largest term "
+        f"is {symbol} = {value:.4g}, which comes from quantization"
+    )
+
+
+def _assumptions(settings: Configured, e: Evaluated, disturbance: float | None) -> list[str]:
+    law = settings.law
+    start = degrees(2 * e.known.half_angle_e)
+    torque = f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)"
+    return [
+        f"‖θ‖ ≤ {law.damping_bound:g} N·m·s/rad, and θ is constant (law.damping_bound)",
+        torque,
+        f"for the mean square: the attitude error stays below {start:g}° (--attitude-error)",
+        "for the bound at every instant: a state near enough to the set, once (`log review` finds it)",
+        "the law's J, B, m and r_g are the plant's ([law])",
+        *e.bounds.assumed,
+    ]
 
 
 def _terms(part: Known | Lemma | Theorem) -> Iterator[CertificateTerm]:
@@ -226,26 +359,41 @@ def _terms(part: Known | Lemma | Theorem) -> Iterator[CertificateTerm]:
         yield CertificateTerm(value=getattr(part, name), **term._asdict())
 
 
-def _blame(d: Lemma, t: Theorem) -> str:
-    parts = {"δ_ᾱ2 λ_max(J)": t.alpha, "δ_Ψ2": d.delta_Psi2, "δ_S2 λ_max(J) k_ω_d": t.coriolis}
-    symbol, value = max(parts.items(), key=lambda part: part[1])
-    origin = "the gain C₁, whatever the bits" if value == t.alpha else "quantization"
-    return (
-        f"c₀/2 = {t.c0 / 2:.4g} does not exceed δ_V1 = {t.delta_V1:.4g} N·m·s/rad; its largest term is "
-        f"{symbol} = {value:.4g}, which comes from {origin}"
-    )
+_REACH: Final = {
+    "eps_e": ("max ‖ε̃‖", "1", "attitude error within the configured plant's set"),
+    "omega_e": ("max ‖ω_e‖", "rad/s", "rate error within it"),
+    "axis_rate": ("max |ω_k| reached", "rad/s", "rate about an axis within it"),
+    "slow": ("‖w_s‖", "N·m", "slow disturbance: θ̃ along the reference"),
+    "fast": ("‖w_f‖", "N·m", "fast disturbance: quantization, age, sensors, friction, wind"),
+    "hold": ("τ_h of the plant", "N·m", "the part of it by which commands are out of date"),
+    "deviation": ("max ‖B u − B u_d‖", "N·m", "command beyond that of the reference"),
+}
 
 
-def _beyond_range(wire: WireSpec, p: Known) -> tuple[list[str], list[Remedy]]:
-    """Where the reference leaves a quantizer's range, so that (C.28) or (C.29) fails: reasons and remedies."""
-    reasons, ways = list[str](), list[Remedy]()
-    eps = sin(min(pi / 2, p.half_angle_d + p.half_angle_e))
-    for name, reached, limit, unit in (
-        ("wire.rate", p.k_omega_d, wire.rate.limit, " rad/s"),
-        ("wire.attitude", eps, wire.attitude.limit, ""),
+def _reach_terms(at: Reach | None) -> Iterator[CertificateTerm]:
+    for name, (symbol, unit, meaning) in _REACH.items():
+        value = None if at is None else getattr(at, name)
+        yield CertificateTerm(symbol=symbol, equation="invariant set", value=value, unit=unit, meaning=meaning)
+
+
+def _radius(at: Reach | None) -> float | None:
+    return None if at is None else at.radius
+
+
+def _degrees(at: Reach | None) -> float | None:
+    return None if at is None else degrees(2 * asin(at.eps_e))
+
+
+def _range_remedies(settings: Configured, e: Evaluated) -> list[Remedy]:
+    """Limits of the wire that hold the set, or the reference where no set is proven."""
+    at = e.plant_reach or without_error(e.plant)
+    wire = settings.wire
+    ways = list[Remedy]()
+    for name, reached, limit in (
+        ("wire.rate", at.axis_rate + e.plant.delta_omega, wire.rate.limit),
+        ("wire.attitude", sin(min(pi / 2, at.half_angle)), wire.attitude.limit),
     ):
         if reached > limit:
-            reasons.append(f"the reference reaches {reached:.4g}{unit}, beyond {name}.limit = {limit:g}{unit}")
             enough = f"{name}.limit={ceil(100 * reached) / 100:g}"
-            ways.append(Remedy(text=f"a range that holds the reference, {name}", overrides=[enough]))
-    return reasons, ways
+            ways.append(Remedy(text=f"a range that holds it, {name}", overrides=[enough]))
+    return ways

@@ -1,30 +1,30 @@
-"""Remedies: the fewest bits, or the least change of a gain, with which condition (C.66) holds, found by search.
+"""Remedies: the fewest bits, or the least change of gains or of the damping's bound, with which a certificate holds.
 
-Nothing is solved: each candidate is a whole configuration, which the certificate's own function checks.
+Nothing is solved: each candidate is a whole configuration, which the certificate's own function checks. Where no single
+change would do, bits and the damping's bound are changed together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import product
-from math import ceil, exp, floor, log, log10
+from math import ceil, exp, floor, hypot, log, log10
 from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.messages.operator import MAX_GAIN
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.law import LawSettings
+from aeroloop.service.theorem.configured import Configured
 
-Holds = Callable[[WireSpec, LawSettings], bool]
+Holds = Callable[[Configured], bool]
 
 SIGNALS: Final = ("attitude", "rate", "voltage")
 GAINS: Final = ("C1", "C2")
-_STEP: Final = 1.1
+_STEP: Final = 1.5
 """Gains are tried in steps of this factor; then the step that satisfies the condition is bisected."""
-_MOST_STEPS: Final = 80
-_HALVINGS: Final = 20
+_MOST_STEPS: Final = 10
+_HALVINGS: Final = 12
 
 
 class Remedy(BaseModel):
@@ -36,60 +36,91 @@ class Remedy(BaseModel):
     overrides: list[str] = Field(description="the change as `--set` takes it; empty where none does")
 
 
-def remedies(wire: WireSpec, law: LawSettings, holds: Holds) -> list[Remedy]:
-    """The least changes that would satisfy the condition: of one signal's bits, of all bits, of C₁, of C₂, of both.
+def remedies(settings: Configured, holds: Holds) -> list[Remedy]:
+    """The least changes with which it would hold: of a signal's bits, of all bits, of a gain, of the damping's bound.
 
-    The wire does not satisfy it with the law; `holds` returns whether a configuration does.
+    The settings do not satisfy it; `holds` returns whether a configuration does.
     """
-    return [*_by_bits(wire, law, holds), *_by_gains(wire, law, holds)]
+    found = list(_by_gains(settings, holds))
+    if holds(_most_generous(settings)):
+        found = [*_by_bits(settings, holds), *found, *_by_damping(settings, holds)]
+        found = found or list(_by_bits_and_damping(settings, holds))
+    return found or [Remedy(text="no bits, no gain and no damping bound would do", overrides=[])]
 
 
-def _by_bits(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]:
-    quantized = [name for name in SIGNALS if getattr(wire, name).bits is not None]
-    if not quantized:
-        yield Remedy(text="nothing is quantized: no bits are to blame", overrides=[])
-        return
+def _most_generous(settings: Configured) -> Configured:
+    """The most bits and the smallest bound of the damping: where this fails, fewer bits fail as well."""
+    names = [name for name in SIGNALS if getattr(settings.wire, name).bits is not None]
+    least = {"damping_bound": min(settings.law.damping_bound, *_bounds(settings.law), settings.law.damping_bound)}
+    smaller = _with_law(settings, settings.law.model_copy(update=least))
+    return list(_with_any_bits(smaller, names))[-1][1] if names else smaller
+
+
+def _by_bits(settings: Configured, holds: Holds) -> Iterator[Remedy]:
+    quantized = [name for name in SIGNALS if getattr(settings.wire, name).bits is not None]
     choices = [[name] for name in quantized] + ([quantized] if len(quantized) > 1 else [])
-    found = False
     for names in choices:
-        fewest = next((bits for bits, tried in _with_any_bits(wire, names) if holds(tried, law)), None)
+        fewest = next((bits for bits, tried in _with_any_bits(settings, names) if holds(tried)), None)
         if fewest is not None:
-            found = True
             which = f"wire.{names[0]}" if len(names) == 1 else "all of them"
             yield Remedy(text=f"{fewest} bits for {which}", overrides=[f"wire.{name}.bits={fewest}" for name in names])
-    if not found:
-        yield Remedy(text=f"no number of bits up to {MAX_BITS} would do", overrides=[])
 
 
-def _with_any_bits(wire: WireSpec, names: list[str]) -> Iterator[tuple[int, WireSpec]]:
-    """The wire with every number of bits allowed for the signals named."""
-    tree = wire.model_dump()
+def _with_any_bits(settings: Configured, names: list[str]) -> Iterator[tuple[int, Configured]]:
+    """The settings with every number of bits allowed for the signals named."""
+    tree = settings.wire.model_dump()
     for bits in range(MIN_BITS, MAX_BITS + 1):
         for name in names:
             tree[name]["bits"] = bits
         try:
-            tried = WireSpec.model_validate(tree)
+            wire = type(settings.wire).model_validate(tree)
         except ValueError:
             continue  # some kinds of quantizer need more bits
-        yield bits, tried
+        yield bits, settings.model_copy(update={"wire": wire})
 
 
-def _by_gains(wire: WireSpec, law: LawSettings, holds: Holds) -> Iterator[Remedy]:
-    found = False
+def _by_gains(settings: Configured, holds: Holds) -> Iterator[Remedy]:
+    law = settings.law
     for name in GAINS:
-        factor = _least_factor(lambda f, name=name: holds(wire, scaled(law, {name: f})))  # type: ignore[misc]
-        if factor is not None:
-            found = True
+        factor = _least_factor(lambda f, name=name: holds(_with_law(settings, scaled(law, {name: f}))))  # type: ignore[misc]
+        if factor is not None and max(getattr(law, name)) * factor <= MAX_GAIN:
             yield _gains_remedy(law, {name: factor})
-    if found:
-        return
-    steps = range(-_MOST_STEPS, _MOST_STEPS + 1, 4)  # one gain alone is tried finely, two together coarsely
-    for m, n in sorted(product(steps, steps), key=lambda pair: (abs(pair[0]) + abs(pair[1]), pair)):
-        factors = {"C1": _STEP**m, "C2": _STEP**n}
-        if _allowed(law, factors) and holds(wire, scaled(law, factors)):
-            yield _gains_remedy(law, factors)
+
+
+def _by_damping(settings: Configured, holds: Holds) -> Iterator[Remedy]:
+    for bound in _bounds(settings.law):
+        if holds(_with_law(settings, settings.law.model_copy(update={"damping_bound": bound}))):
+            yield _damping_remedy("", bound, [])
             return
-    yield Remedy(text="no gains C1 and C2 would do", overrides=[])
+
+
+def _by_bits_and_damping(settings: Configured, holds: Holds) -> Iterator[Remedy]:
+    quantized = [name for name in SIGNALS if getattr(settings.wire, name).bits is not None]
+    for bound in _bounds(settings.law):
+        smaller = _with_law(settings, settings.law.model_copy(update={"damping_bound": bound}))
+        for bits, tried in _with_any_bits(smaller, quantized):
+            if holds(tried):
+                names = [f"wire.{name}.bits={bits}" for name in quantized]
+                yield _damping_remedy(f"{bits} bits and ", bound, names)
+                return
+
+
+def _bounds(law: LawSettings) -> list[float]:
+    """Smaller bounds of the damping that still hold the first estimate, the largest first."""
+    least = hypot(*law.damping_estimate)
+    tried = [_rounded(law.damping_bound, law.damping_bound * 0.85**n) for n in range(1, 25)]
+    return [bound for bound in tried if bound >= least]
+
+
+def _damping_remedy(also: str, bound: float, overrides: list[str]) -> Remedy:
+    return Remedy(
+        text=f"{also}law.damping_bound = {bound:g}, if ‖θ‖ is known to be within it",
+        overrides=[*overrides, f"law.damping_bound={bound:g}"],
+    )
+
+
+def _with_law(settings: Configured, law: LawSettings) -> Configured:
+    return settings.model_copy(update={"law": law})
 
 
 def _least_factor(holds: Callable[[float], bool]) -> float | None:
@@ -104,10 +135,6 @@ def _least_factor(holds: Callable[[float], bool]) -> float | None:
                 good, bad = (middle, bad) if holds(exp(middle)) else (good, middle)
             return exp(good)
     return None
-
-
-def _allowed(law: LawSettings, factors: dict[str, float]) -> bool:
-    return all(max(getattr(law, name)) * factor <= MAX_GAIN for name, factor in factors.items())
 
 
 def scaled(law: LawSettings, factors: dict[str, float]) -> LawSettings:
