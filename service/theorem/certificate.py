@@ -189,7 +189,7 @@ def evaluate(
 
 
 def premises(
-    settings: Configured, desired: Extremes, plant: PlantBounds, disturbance: float, late_s: float
+    settings: Configured, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
 ) -> Premises:
     """Premises of the invariant set.
 

@@ -131,6 +131,8 @@ class Reach:
     Attributes:
         start: r [1, rad/s].
         radius: Largest ‖z‖ [1, rad/s].
+        eps_bar: Largest ‖ε̄‖ [1].
+        torque: Largest ‖ε̄ + C₂ z̄‖ [N·m].
         eps_e: Largest ‖ε̃‖ [1].
         z2: Largest ‖z₂‖ [rad/s].
         omega_e: Largest ‖ω_e‖ [rad/s].
@@ -146,6 +148,8 @@ class Reach:
 
     start: float
     radius: float
+    eps_bar: float
+    torque: float
     eps_e: float
     z2: float
     omega_e: float
@@ -163,7 +167,7 @@ def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
     c1, c2 = max(p.C1), max(p.C2)
     torque = p.delta_q(0.0) * (1 + c1 * c2) + c2 * p.delta_omega
-    return Reach(0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, torque)
+    return Reach(0, 0, 0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, torque)
 
 
 def reach(p: Premises, start: float = 0.0) -> Reach | None:
@@ -303,6 +307,8 @@ def _disturbances(
     return Reach(
         start=start,
         radius=sqrt(largest**2 + zeta**2 - eps_e**2),
+        eps_bar=eps_bar,
+        torque=torque,
         eps_e=eps_e,
         z2=z2,
         omega_e=omega_e,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from math import acos, asin, cos, degrees, hypot, pi, radians, sin, sqrt
+from math import acos, cos, degrees, hypot, pi, radians, sin, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid, Stream
-from aeroloop.protocol.wire.attitude import IDENTITY, received_quaternion, sent_vector
+from aeroloop.protocol.wire.attitude import IDENTITY, received_quaternion, sent_vector, to_euler
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.cli.main import execute as run
@@ -19,30 +19,42 @@ from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import Plan, reference_function
-from aeroloop.service.settings import ControllerSettings
 from aeroloop.service.theorem.bounds import attitude_error
-from aeroloop.service.theorem.certificate import Certificate, bounds_of, certify
+from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError, extremes
-from aeroloop.service.theorem.lemma import Samples, coordinates, lemma_inequalities
+from aeroloop.service.theorem.lemma import Samples, coordinates, lemma_inequalities, rotation
 from tests.support import numpy_twin as twin
 
 PAPER = Settings()
 EXAMPLES = Path(__file__).parents[3] / "service" / "examples"
 STILL = Hold(attitude=(0.0, 0.0, 0.0))
-KEYS = ["holds", "margin", "c0", "delta_V1", "delta_V2", "delta_Q", "k", "radius", "radius_deg", "terms"]
+KEYS = [
+    "holds", "margin", "c0", "delta_V1", "delta_V2", "delta_Q", "k", "radius", "rms_radius", "pointwise_radius",
+    "pointwise_deg", "plant_radius", "plant_deg", "assumptions", "violated", "terms", "remedies",
+]  # fmt: skip
+SMALL = ["law.damping_bound=0.0119"]
+FREE = [
+    "plant.kind=rigid_body", "plant.ideal=true", "wire.actuators=3", "plant.rigid_body.damping=[0, 0.006, 0.006]",
+    "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "law.centre_of_mass=[0, 0, 0]", *SMALL,
+]  # fmt: skip
+"""A free body with the paper's inertia, gains and reference, three motors and nothing beyond the equations."""
 
 
-def certificate(settings: Settings, **options: Any) -> Certificate:
-    return certify(settings.wire, settings.law, settings.reference, settings.controller, **options)
+def bits(out: int | None, inp: int | None) -> list[str]:
+    return [f"wire.{name}.bits={n or 'cont'}" for name, n in (("attitude", out), ("rate", out), ("voltage", inp))]
 
 
 def with_bits(out: int | None, inp: int | None) -> Settings:
-    return PAPER.model_copy(update={"wire": PAPER.wire.with_bits(out, inp)})
+    return load_over(PAPER, bits(out, inp))
+
+
+def free(out: int | None, inp: int | None, *changes: str) -> Settings:
+    return load_over(PAPER, [*FREE, *bits(out, inp), *changes])
 
 
 def test_the_paper_s_experiment_agrees_with_its_formulas_worked_by_hand() -> None:
     """8 and 6 bits, an attitude error of at most 90° assumed; plain arithmetic from (C.58) to (C.72), (C.80)."""
-    found = certificate(PAPER, attitude_error_deg=90.0, disturbance=0.01)
+    found = certify(PAPER, attitude_error_deg=90.0, disturbance=0.01)
 
     d_eps = d_omega = sqrt(3) / 255  # l = 2/(2⁸ − 1), half of it on each of three axes
     d_u = sqrt(2) * 24 / 63  # two motors
@@ -55,17 +67,17 @@ def test_the_paper_s_experiment_agrees_with_its_formulas_worked_by_hand() -> Non
     k_wd = 1.005 * sqrt((radians(40) * 0.1 * pi) ** 2 + (radians(100) * 0.05 * pi) ** 2)
     # q may turn by 50° + 45°, halved, from [1, 0]: past 90°, so ε^Q of length 1 may stand for an ε that is shorter.
     d_q = sqrt(d_eps**2 + (1 - (1 - d_eps) ** 2))
-    k_we = 1 + C1
+    k_we, theta_err = sqrt(1 + C1**2), k_theta + k_theta / 0.95
     d_R = 2 * (d_q + d_q**2)
     d_we = d_R * k_wd + d_omega
     d_z1 = d_q
     d_z2 = d_we + C1 * d_q
     d_psi1, d_psi2 = J * (2 * k_wd * d_omega + d_omega**2) + weight * d_R, 2 * J * d_omega * k_we
     d_S1, d_S2 = k_wd * d_R + d_omega, k_we * d_R
-    d_alpha1, d_alpha2 = C1 * d_we / 2, C1 * k_we
+    d_alpha1, d_alpha2 = C1 * d_we / 2, C1 * d_q * k_we / 2
     V1 = d_psi2 + d_S2 * J * k_wd + d_alpha2 * J
-    theta1 = 2 * k_theta * d_z2 * (d_omega + k_wd)
-    theta2 = k_theta * d_omega + 2 * k_theta * k_we * d_z2
+    theta1 = theta_err * d_z2 * (d_omega + k_wd)
+    theta2 = k_theta * d_omega + theta_err * k_we * d_z2
     k_wdd = found.value("k_ω̇_d")
     assert k_wdd is not None
     V2 = C2 * d_z2 + d_z1 + d_psi1 + d_S1 * J * k_wd + d_R * J * k_wdd + d_alpha1 * J + theta2 + d_u * B
@@ -81,10 +93,9 @@ def test_the_paper_s_experiment_agrees_with_its_formulas_worked_by_hand() -> Non
         "√(δ_Q/k)": sqrt(Q / k),
     }  # fmt: skip
     assert {symbol: found.value(symbol) for symbol in by_hand} == pytest.approx(by_hand)
-    assert found.holds
     assert (found.margin, found.k) == pytest.approx((k, k))
     assert (found.c0, found.delta_V1, found.delta_V2, found.delta_Q) == pytest.approx((c0, V1, V2, Q))
-    assert (found.radius, found.radius_deg) == pytest.approx((sqrt(Q / k), degrees(4 * asin(sqrt(Q / k) / 2))))
+    assert found.radius == found.rms_radius == pytest.approx(sqrt(Q / k))
 
 
 def test_a_body_at_rest_near_its_reference_agrees_with_the_formulas_worked_by_hand() -> None:
@@ -99,24 +110,27 @@ def test_a_body_at_rest_near_its_reference_agrees_with_the_formulas_worked_by_ha
         rate=SignalSpec(bits=10, limit=3, deadzone=0.004),
         voltage=SignalSpec(bits=10, limit=10),
     )
-    found = certify(wire, law, STILL, ControllerSettings(), attitude_error_deg=60)
+    found = certify(Settings(wire=wire, law=law, reference=STILL), attitude_error_deg=60)
     d_eps, d_omega, d_u = sqrt(3) / 4095, sqrt(3) * 0.004, sqrt(3) * 10 / 1023
     d_q = d_eps / cos(radians(30))
     d_z2 = d_omega + 0.2 * d_q
     c0 = min(0.1 * (1 + cos(radians(30))) / 2, 0.2)
-    V1 = 2 * 0.03 * d_omega * 1.2 + 0.2 * 1.2 * 0.03
+    k_we, theta_err, hold = sqrt(1.04), 0.01 + 0.01 / 0.95, found.value("τ_h") or 0.0
+    V1 = 2 * 0.03 * d_omega * k_we + 0.2 / 2 * d_q * k_we * 0.03
     V2 = 0.3 * d_z2 + d_q + 0.03 * d_omega**2 + 0.2 / 2 * d_omega * 0.03
-    V2 += 0.01 * d_omega + 0.02 * 1.2 * d_z2 + d_u * 0.02
-    Q = 0.02 * d_z2 * d_omega + V2**2 / (2 * c0)
+    V2 += 0.01 * d_omega + theta_err * k_we * d_z2 + d_u * 0.02
+    Q = theta_err * d_z2 * d_omega + (V2 + hold) ** 2 / (2 * c0)
+    assert 0 < hold < V2
     assert (found.c0, found.delta_V1) == pytest.approx((c0, V1), rel=1e-9)
     assert (found.delta_V2, found.delta_Q) == pytest.approx((V2, Q), rel=1e-4)  # k_ε's second order
     assert found.radius == pytest.approx(sqrt(Q / (c0 / 2 - V1)), rel=1e-4)
 
 
-def test_the_paper_s_experiment_holds_and_certifies_itself_as_json(capfd: pytest.CaptureFixture[str]) -> None:
-    assert run(("lab", "certify", "--json")) == 0
+def test_a_certificate_as_json_has_its_keys_and_every_equation(capfd: pytest.CaptureFixture[str]) -> None:
+    overrides = [word for change in [*FREE, *bits(12, 12)] for word in ("--set", change)]
+    assert run(("lab", "certify", "--json", *overrides)) == 0
     found = json.loads(capfd.readouterr().out)
-    assert list(found) == [*KEYS, "blame", "remedies"]
+    assert list(found) == KEYS
     assert all(set(term) == {"symbol", "equation", "value", "unit", "meaning"} for term in found["terms"])
     assert len({term["symbol"] for term in found["terms"]}) == len(found["terms"])
     equations = {number for term in found["terms"] for number in term["equation"].replace(",", " ").split()}
@@ -124,56 +138,94 @@ def test_the_paper_s_experiment_holds_and_certifies_itself_as_json(capfd: pytest
     assert numbers - equations == set()
     assert found["holds"]
     assert found["margin"] == found["k"] == pytest.approx(found["c0"] / 2 - found["delta_V1"])
-    assert found["radius"] == pytest.approx(sqrt(found["delta_Q"] / found["k"]))
-    assert found["blame"] is None
-    assert found["remedies"] == []
+    assert found["radius"] == found["rms_radius"] == pytest.approx(sqrt(found["delta_Q"] / found["k"]))
+    assert found["violated"] == found["remedies"] == []
 
 
 @pytest.mark.parametrize("signal", ["attitude", "rate", "voltage", "all"])
 @pytest.mark.parametrize("option", [None, 180.0], ids=["default", "nothing assumed"])
 def test_more_bits_are_never_worse(signal: str, option: float | None) -> None:
-    last: Certificate | None = None
-    for bits in (*range(4, 17), None):
-        wire = PAPER.wire.model_dump()
-        for name in ("attitude", "rate", "voltage") if signal == "all" else (signal,):
-            wire[name]["bits"] = bits
-        now = certificate(PAPER.model_copy(update={"wire": WireSpec.model_validate(wire)}), attitude_error_deg=option)
+    last: Evaluated | None = None
+    for n in (*range(4, 17), None):
+        names = ("attitude", "rate", "voltage") if signal == "all" else (signal,)
+        settings = load_over(PAPER, [*SMALL, *(f"wire.{name}.bits={n or 'cont'}" for name in names)])
+        now = evaluate(settings, attitude_error_deg=option)
+        assert now.theorem.radius is not None
         if last is not None:
-            assert now.margin >= last.margin
-            assert now.radius is not None
-            assert last.radius is not None
-            assert now.radius < last.radius
+            assert now.theorem.margin >= last.theorem.margin
+            assert now.theorem.radius < last.theorem.radius  # type: ignore[operator]  # margins only grow
+        if last is not None and last.body_reach is not None:
+            assert now.body_reach is not None
+            assert now.body_reach.radius < last.body_reach.radius
         last = now
+    assert last is not None
+    assert last.body_reach is not None
 
 
-def test_without_quantization_the_error_goes_to_0_and_only_the_gain_takes_from_the_damping() -> None:
-    found = certificate(with_bits(None, None))
-    assert found.holds
-    assert (found.radius, found.radius_deg, found.delta_V2, found.delta_Q) == (0, 0, 0, 0)  # Remark 7
-    assert found.delta_V1 == pytest.approx(0.3 * 1.3 * 0.0218)
-    assert "goes to 0" in found.verdict
-    windy = certificate(with_bits(None, None), disturbance=0.003)
+def test_without_quantization_the_mean_square_vanishes_but_for_the_disturbance() -> None:
+    found = certify(with_bits(None, None))
+    assert (found.radius, found.delta_V1, found.delta_V2, found.delta_Q) == (0, 0, 0, 0)  # Remark 7
+    windy = certify(with_bits(None, None), disturbance=0.003)
     assert windy.k is not None
     assert windy.radius == pytest.approx(0.003 / sqrt(2 * windy.c0 * windy.k))  # (C.79), (C.80)
 
 
-def test_the_assumed_error_is_widened_until_it_agrees_with_the_guaranteed_one() -> None:
-    found = certificate(PAPER, attitude_error_deg=5.0)
-    assumed = 2 * degrees(found.value("max ∡e/2") or 0)
-    assert found.radius_deg == pytest.approx(assumed, rel=1e-6)
-    assert assumed > 5
-    assert certificate(PAPER, attitude_error_deg=2 * assumed).radius > found.radius  # type: ignore[operator]
-    narrow = certificate(with_bits(12, 12))
-    assert narrow.value("max ∡e/2") == pytest.approx(radians(PAPER.controller.start_within_deg / 2))
+@pytest.mark.parametrize(("out", "inp", "most"), [(12, 12, 0.028), (8, 6, 0.20)])
+def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, most: float) -> None:
+    """At 500 Hz, with the paper's gains and reference, if ‖θ‖ is known to be within that of the paper's first estimate."""
+    found = certify(load_over(PAPER, [*SMALL, *bits(out, inp)]))
+    assert found.pointwise_radius is not None
+    assert found.pointwise_radius <= most
+    assert not found.holds  # the Aero's roll is held, its rotors lag
+    assert found.plant_radius is None
+
+
+def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
+    for settings in (with_bits(3, 3), load_over(PAPER, ["plant.ideal=true", *bits(3, 3)]), free(3, 3)):
+        found = certify(settings)
+        assert not found.holds
+        assert any("saturation" in reason or "range" in reason for reason in found.violated)
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        ("plant.ideal=false", "age"),
+        ("wire.rate.limit=0.3", "range: wire.rate.limit"),
+        ("wire.attitude.limit=0.7", "range: wire.attitude.limit"),
+        ("wire.voltage.limit=1", "saturation: wire.voltage.limit"),
+        ("plant.rigid_body.damping=[0.01, 0.01, 0.01]", "law.damping_bound"),
+        ("plant.rigid_body.inertia=[0.03, 0.02, 0.02]", "inertia"),
+        ('plant.faults=["attitude:drop=0.1"]', "plant.faults"),
+        ("loop.rate_hz=20", "age"),
+        ("plant.rigid_body.allocation=[[0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]]", "torque"),
+    ],
+)
+def test_everything_that_the_proof_presumes_is_required(change: str, names: str) -> None:
+    """Each of them alone keeps a certificate from holding that holds without."""
+    assert certify(free(12, 12)).holds
+    changes = [change]
+    if change == "plant.ideal=false":
+        changes += ["plant.sensors.attitude=perfect", "plant.sensors.rate=perfect", "plant.friction.viscous=[]",
+                    "plant.friction.coulomb=[]"]  # fmt: skip  # the rotors' lag remains
+    found = certify(free(12, 12, *changes))
+    assert not found.holds
+    assert any(names in reason for reason in found.violated), found.violated
+
+
+def test_a_machine_holds_only_with_a_stated_disturbance() -> None:
+    machine = load_over(PAPER, ["plant.via=quanser", "reference.kind=hold", "law.damping_bound=0.0232", *bits(12, 12)])
+    assert any("state --disturbance" in reason for reason in certify(machine).violated)
+    assert certify(machine, disturbance=1e-4).holds
+    assert any("--disturbance" in assumption for assumption in certify(machine, disturbance=1e-4).assumptions)
 
 
 def test_c0_is_the_least_share_of_z1_that_the_gain_reaches() -> None:
     """The correction of (C.66), against random errors: z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃ ≥ c₀ ‖z₁‖², and c₀ is all but attained."""
     law = LawSettings(C1=(0.3, 0.1, 0.2), C2=(9, 9, 9))
     most = radians(100)
-    c0 = certify(
-        PAPER.wire.with_bits(None, None), law, STILL, ControllerSettings(), attitude_error_deg=degrees(most)
-    ).c0
+    settings = Settings(wire=PAPER.wire.with_bits(None, None), law=law, reference=STILL)
+    c0 = evaluate(settings, attitude_error_deg=degrees(most)).theorem.c0
     rng = np.random.default_rng(0)
     half, axis = most / 2 * rng.random(20_000), rng.standard_normal((20_000, 3)) * [0.1, 1, 0.1]
     eps = axis / np.linalg.norm(axis, axis=1, keepdims=True) * np.sin(half)[:, None]
@@ -210,18 +262,33 @@ def test_no_attitude_errs_by_more_than_k_eps_says_and_some_by_nearly_as_much(bit
 )
 def test_the_extremes_of_a_reference_are_those_of_what_the_law_is_given(reference: Reference) -> None:
     bounds, plan, function = extremes(reference), Plan.of(reference), Compiled(reference_function())
-    most = [0.0, 0.0, 0.0]
-    for t in np.linspace(0, 6.5 if isinstance(reference, Points) else 140, 20_000).tolist():
+    most = np.zeros(6)
+    times, step = np.linspace(0, 6.5 if isinstance(reference, Points) else 140, 20_000, retstep=True)
+    last: np.ndarray[Any, Any] | None = None
+    for t in times.tolist():
         i = plan.piece(t)
         for name in ("quintic", "amplitude", "frequency"):
             function.inputs[name][:] = memoryview(getattr(plan, name)[i].ravel().copy())
         function.inputs["start"][0], function.inputs["t"][0] = plan.starts[i], t
         function()
         rate, acceleration = (hypot(*function.outputs[name]) for name in ("omega_d", "omega_d_dot"))
-        half_angle = acos(min(1.0, abs(function.outputs["q_d"][0])))
-        most = [*map(max, most, (rate, acceleration, half_angle))]
-    assert np.all(np.array(most) < bounds)
-    assert np.all(np.array(most) > 0.985 * np.array(bounds))
+        q_d, omega_d = function.outputs["q_d"], function.outputs["omega_d"]
+        half_angle = acos(min(1.0, abs(q_d[0])))
+        body = rotation(np.array([q_d]))[0].T @ np.array(omega_d)
+        jerk = 0.0 if last is None else hypot(*(np.array(function.outputs["omega_d_dot"]) - last)) / step
+        last = np.array(function.outputs["omega_d_dot"])
+        now = (
+            rate,
+            acceleration,
+            0.0 if jerk > 100 else jerk,
+            np.abs(body).max(),
+            half_angle,
+            abs(to_euler(tuple(q_d))[1]),
+        )
+        most = np.maximum(most, now)
+    assert np.all(most < bounds)
+    tight = np.array([True, True, False, True, True, True])  # the jerk's bound adds maxima of different times
+    assert np.all(most[tight] > 0.985 * np.array(bounds)[tight])
 
 
 def test_a_stream_is_not_certified_and_the_reason_is_reported(capfd: pytest.CaptureFixture[str]) -> None:
@@ -233,81 +300,54 @@ def test_a_stream_is_not_certified_and_the_reason_is_reported(capfd: pytest.Capt
     assert capfd.readouterr().err.startswith("aeroloop: a stream's set-points")
 
 
-COARSE = ["wire.rate.limit=20", "wire.rate.bits=4"]
-
-
 @pytest.mark.parametrize(
-    ("overrides", "to_blame"),
+    ("settings", "to_blame"),
     [
-        (COARSE, "δ_Ψ2"),
-        (["law.C1=[2, 2, 2]"], "δ_ᾱ2"),
-        (["law.C2=[0.01, 0.02, 0.01]"], "δ_ᾱ2"),
-        (["wire.rate.limit=0.3"], "wire.rate.limit"),
-        (["wire.attitude.limit=0.5"], "wire.attitude.limit"),
+        (free(6, 6), "saturation"),
+        (free(12, 12, "law.C1=[8, 8, 8]"), "saturation"),
+        (free(12, 12, "wire.rate.limit=0.3"), "wire.rate.limit"),
+        (free(12, 12, "law.damping_bound=0.05"), "pointwise"),
+        (free(8, 8, "law.damping_bound=0.05"), "pointwise"),
     ],
-    ids=["coarse rate", "large C1", "small C2", "narrow rate", "narrow attitude"],
+    ids=["coarse", "large C1", "narrow rate", "unknown damping", "both"],
 )
-def test_one_that_fails_names_what_is_to_blame_and_each_remedy_cures_it(overrides: list[str], to_blame: str) -> None:
-    settings = load_over(PAPER, overrides)
-    found = certificate(settings)
+def test_one_that_fails_names_what_is_to_blame_and_each_remedy_cures_it(settings: Settings, to_blame: str) -> None:
+    found = certify(settings)
     assert not found.holds
-    assert found.blame is not None
-    assert to_blame in found.blame
-    assert found.blame in found.verdict
+    assert to_blame in (found.blame or "")
+    assert found.violated[0] in found.verdict
     cures = [remedy.overrides for remedy in found.remedies if remedy.overrides]
     assert cures
     for cure in cures:
-        assert certificate(load_over(settings, cure)).holds, cure
+        assert certify(load_over(settings, cure)).holds, cure
 
 
-def test_a_remedy_by_bits_is_the_fewest_that_do_and_by_gain_the_least_change() -> None:
-    settings = load_over(PAPER, [*COARSE, "law.C1=[0.4, 0.4, 0.4]"])
-    remedies = {remedy.overrides[0].partition("=")[0]: remedy.overrides for remedy in certificate(settings).remedies}
-    rate = int(remedies["wire.rate.bits"][0].partition("=")[2])
-    assert certificate(load_over(settings, [f"wire.rate.bits={rate}"])).holds
-    assert not certificate(load_over(settings, [f"wire.rate.bits={rate - 1}"])).holds
-    everything = {change.partition("=")[0]: int(change.partition("=")[2]) for change in remedies["wire.attitude.bits"]}
-    assert list(everything) == ["wire.attitude.bits", "wire.rate.bits", "wire.voltage.bits"]
-    fewer = [f"{name}={bits - 1}" for name, bits in everything.items()]
-    assert not certificate(load_over(settings, fewer)).holds
-
-    slow = load_over(PAPER, ["law.C2=[0.01, 0.01, 0.01]"])
-    gains = [float(c.partition("[")[2].partition(",")[0]) for r in certificate(slow).remedies for c in r.overrides]
-    for name, before, gain in zip(("C1", "C2"), (0.3, 0.01), gains, strict=True):
-        almost = gain + 0.01 * (before - gain)
-        assert not certificate(load_over(slow, [f"law.{name}=[{almost}, {almost}, {almost}]"])).holds
+def test_a_remedy_by_bits_is_the_fewest_that_do() -> None:
+    settings = free(5, 5)
+    bits_alone = [r.overrides for r in certify(settings).remedies if r.overrides and r.overrides[0].startswith("wire.")]
+    assert bits_alone
+    for overrides in bits_alone:
+        fewer = [f"{name}={int(n) - 1}" for name, _, n in (change.partition("=") for change in overrides)]
+        assert not certify(load_over(settings, fewer)).holds
 
 
-@pytest.mark.parametrize("gain", [0.0077, 0.0091, 0.0123, 0.0151])
-def test_a_gain_that_is_printed_with_four_digits_still_cures(gain: float) -> None:
-    settings = load_over(PAPER, [f"law.C2=[{gain}, {2 * gain}, {3 * gain}]"])
-    cures = [remedy.overrides for remedy in certificate(settings).remedies if remedy.overrides]
-    assert len(cures) == 2
-    for cure in cures:
-        assert certificate(load_over(settings, cure)).holds, cure
-
-
-def test_where_no_bits_and_no_gains_suffice_it_is_reported() -> None:
-    found = certificate(load_over(PAPER, ["law.inertia=[1, 1, 1]"]))
-    assert [r.text for r in found.remedies] == ["no number of bits up to 16 would do", "no gains C1 and C2 would do"]
-    assert (found.k, found.radius, found.radius_deg) == (None, None, None)
+def test_where_nothing_suffices_it_is_reported() -> None:
+    assert [r.text for r in certify(PAPER).remedies] == ["no bits, no gain and no damping bound would do"]
 
 
 def test_the_verdict_comes_first_and_the_exit_code_follows_it(capfd: pytest.CaptureFixture[str]) -> None:
-    assert run(("lab", "certify", "--disturbance", "0.004")) == 0
+    overrides = [word for change in [*FREE, *bits(12, 12)] for word in ("--set", change)]
+    assert run(("lab", "certify", *overrides)) == 0
     shown = capfd.readouterr().out
-    assert shown.startswith("Corollary 1, with ‖τ_d‖ ≤ 0.004 N·m, holds: ")
+    assert shown.startswith("Holds: once there, ‖z‖ stays within ")
+    assert "law.damping_bound" in shown  # assumptions
     assert "Remark 5" not in shown  # of all terms, which --verbose prints
-    assert run(("lab", "certify", "--disturbance", "0.004", "--verbose")) == 0
+    assert run(("lab", "certify", "--verbose", *overrides)) == 0
     assert "Remark 5" in capfd.readouterr().out
-    assert run(("lab", "certify", "--bits-out", "cont", "--bits-in", "cont")) == 0
-    shown = " ".join(capfd.readouterr().out.split())
-    assert shown.startswith("Theorem 1 holds: ")
-    assert "the error goes to 0." in shown
-    assert run(("lab", "certify", "--set", "law.C1=[2, 2, 2]")) == 1
+    assert run(("lab", "certify", *overrides, "--set", "wire.rate.limit=0.3")) == 1
     shown = capfd.readouterr().out
-    assert shown.startswith("Theorem 1 does not hold: ")
-    assert "--set 'law.C1=" in shown
+    assert shown.startswith("Does not hold: range: wire.rate.limit")
+    assert "--set 'wire.rate.limit=" in shown
     assert run(("lab", "certify", "--disturbance", "-1")) == 2
     assert run(("lab", "certify", "--disturbance", "inf")) == 1
 
@@ -323,15 +363,15 @@ def test_an_ideal_body_ends_within_the_radius_and_breaks_no_inequality_on_its_wa
     for signal in () if kind == "uniform" else ("attitude", "rate", "voltage"):
         wire += [f"wire.{signal}.kind={kind}", f"wire.{signal}.bits={bits}"]
     settings = load_over(load(EXAMPLES / "rigid-body.toml"), [off, *wire])
-    bounds = bounds_of(settings.wire, settings.law, settings.reference, settings.controller)
+    bounds = evaluate(settings)
     samples = _run(settings, duration_s=16)
     inequalities = lemma_inequalities(samples, settings.law, bounds.known, bounds.lemma)
     assert {i.equation: int(i.broken.sum()) for i in inequalities if i.broken.any()} == {}
-    x, radius = samples, bounds.theorem.radius
+    x = samples
     z = coordinates(x.q, x.omega, x.q_d, x.omega_d, x.sign, np.array(settings.law.C1)).norm
-    assert radius is not None
-    assert z[0] > radius
-    assert z[len(z) // 2 :].max() < radius
+    assert bounds.plant_reach is not None
+    assert z[0] > bounds.plant_reach.radius
+    assert z[len(z) // 2 :].max() < bounds.plant_reach.radius
 
 
 def _run(settings: Settings, duration_s: float) -> Samples:
