@@ -157,7 +157,7 @@ def can_node(options: DaemonOptions, faults: Faults = None) -> None:
         from aeroloop.plant_emulator.hosts.emulator import Emulator
 
         emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
-        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint))
+        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint, emulator.fault_statuses))
 
     run_alone(run, options)
 
