@@ -166,9 +166,17 @@ class Tenancy:
         return True
 
     def stop(self, cause: TripCause = TripCause.OPERATOR, reason: str = "stopped by an operator") -> None:
-        """Trip in any state: 0 V, and no claim, not even one with `auto_arm`, is granted before `arm`."""
+        """Trip in any state: 0 V, and no claim, not even one with `auto_arm`, is granted before `arm`.
+
+        An operator's stop of a plant that has tripped keeps the cause of that trip, and is another event only if it
+        changes what clears the latch.
+        """
         self.operated("stop", cause=cause, reason=reason)
-        self._trip(cause, reason)
+        if cause is not TripCause.OPERATOR or self.state is not PlantState.TRIPPED:
+            self._trip(cause, reason)
+        elif not self._operator_only:
+            self.cause = f"{self.cause}; then {reason}"
+            self._notice("changed", f"{reason} after it tripped: a claim with auto_arm does not clear it any more")
         self._operator_only = True
         if self.last is not None:
             self.last = self.last.model_copy(update={"ended": cause})

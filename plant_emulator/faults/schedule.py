@@ -26,6 +26,16 @@ class Turn(NamedTuple):
     text: str
 
 
+def begins(fault: str, source: Source) -> str:
+    """Text of the event of a fault's begin."""
+    return f"fault begins ({source}): {fault}"
+
+
+def ends(fault: str, source: Source, changed: int, effect: str) -> str:
+    """Text of the event of a fault's end, with what it changed."""
+    return f"fault ends ({source}): {fault}, {changed} {effect}"
+
+
 class _Scheduled:
     """A fault as it was written; what applies it; its ticks, of which `end` is None if there is none."""
 
@@ -48,12 +58,12 @@ class _Scheduled:
         turns = []
         if not self.begun and self.due <= now:
             self.begun = True
-            turns.append(Turn(self.begin, f"fault begins ({self.source}): {self.fault}"))
+            turns.append(Turn(self.begin, begins(str(self.fault), self.source)))
         if self.begun and self.due <= now:
             self.over = True
             assert self.end is not None
-            changed = f"{self.applied.changed} {self.fault.effect}"
-            turns.append(Turn(self.end, f"fault ends ({self.source}): {self.fault}, {changed}"))
+            text = ends(str(self.fault), self.source, self.applied.changed, self.fault.effect)
+            turns.append(Turn(self.end, text))
         return turns
 
 

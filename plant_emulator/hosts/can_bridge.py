@@ -1,9 +1,9 @@
 """Bridge between Zenoh and a plant on a CAN bus.
 
-On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace. On
-the bus it is the controller's side. Frames pass unchanged, byte for byte. It runs its own watchdog besides the node's
-and trips when the bus fails or the node is silent, has another wire spec or trips. It reopens a failed bus by itself;
-the plant is driven again once it is armed.
+On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace; an
+emulated node's faults, too. On the bus it is the controller's side. Frames pass unchanged, byte for byte. It runs its
+own watchdog besides the node's and trips when the bus fails or the node is silent, has another wire spec or trips. It
+reopens a failed bus by itself; the plant is driven again once it is armed.
 
 A tick of the bridge is a forwarded measurement. Commands are judged fresh or stale by the node's rule.
 """
@@ -15,7 +15,8 @@ from math import isfinite
 from threading import Condition
 from typing import Final, Literal
 
-from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from aeroloop.plant_emulator.endpoint.tenancy import Notice, Tenancy
+from aeroloop.plant_emulator.faults.node_faults import NodeFaults
 from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCause
@@ -31,6 +32,8 @@ from aeroloop.protocol.wire.transmit import SILENCE
 
 WAIT_S: Final = 0.01
 SESSIONS: Final = 16
+_AHEAD: Final = 16
+"""Ticks by which a fault report may be ahead of the measurements that were forwarded."""
 _UNBEGUN_NS: Final = round(FIRST_COMMAND_S * 1e9)  # for the first command, before the session's first measurement
 
 
@@ -141,7 +144,7 @@ class Relay(Tenancy):
 
     def _count(self, ticks: int) -> None:
         """Count a tick, this many periods after the session's last one."""
-        self.ticked += 1
+        self.ticked += ticks
         self._session_tick += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
 
@@ -189,14 +192,14 @@ class Bridge:
         )
         self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
-        self._front = ZenohFront(role, loop, self._relay, self._changed)
+        self._faults = NodeFaults(settings.parsed_faults, bus.node)
+        self._front = ZenohFront(role, loop, self._relay, self._changed, self._faults.statuses)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._beat_due = 0.0
         self._sent_state = self._relay.state  # by heartbeat
         self._arrival: Arrival | None = None  # the last command since the last tick
         self._machine_notes: list[str] = []
         self._granted_ns = 0
-        self._faults = settings.faults
 
     def run(self) -> None:
         """Run until the role stops; then release the node and publish a last status."""
@@ -204,9 +207,6 @@ class Bridge:
         if not self._loop.lockstep:
             front.notes = self._machine_notes = prepare_process(self._loop)
         front.serve()
-        if self._faults:
-            text = f"an emulated node has faults whose begin and end are not published: {', '.join(self._faults)}"
-            self._role.event("fault", text)
         try:
             while not self._role.stop.is_set():
                 with self._changed:
@@ -215,6 +215,7 @@ class Bridge:
                 front.take_inbox()
                 self._follow()
                 self._pass_frames()
+                self._take_fault_reports()
                 if relay.watch(now_ns := time.monotonic_ns()):
                     self._account(None, now_ns)
                 self._watch_node()
@@ -252,6 +253,18 @@ class Bridge:
             frame = self._relay.command(arrival.frame, time.monotonic_ns())
             if frame is not None:
                 self._bus.send(frame)
+
+    def _take_fault_reports(self) -> None:
+        """Queue an event for each fault of the node that began or ended, at the session tick that the node reports."""
+        relay = self._relay
+        while self._bus.reports:
+            report = self._bus.reports.popleft()
+            now = relay.event_tick
+            ago = 0 if now is None else (now - report.tick + _AHEAD) % 256 - _AHEAD
+            text = self._faults.take(report, relay.ticked - ago)
+            if text is not None:
+                tick = None if now is None else max(0, now - ago)
+                relay.notices.append(Notice("fault", text, relay.session, tick))
 
     def _account(self, measurement: bytes | None, sent_ns: int) -> None:
         arrival, self._arrival = self._arrival, None

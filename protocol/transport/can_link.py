@@ -1,12 +1,13 @@
-"""CAN link: one end's frames and heartbeats on a CAN bus, by python-can. Any interface, classic CAN or FD.
+"""CAN link: one end's frames, heartbeats and fault reports on a CAN bus, by python-can. Any interface, classic or FD.
 
-A frame's bytes are the CAN payload; `can_format` has identifiers and heartbeats.
+A frame's bytes are the CAN payload; `can_format` has identifiers, heartbeats and reports.
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from contextlib import suppress
 from typing import Final, Literal
 
@@ -16,10 +17,12 @@ from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
+    FAULT_REPORT_ID,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     CanError,
     CanSettings,
+    FaultReport,
     Heartbeat,
     carried_bytes,
     check_widths,
@@ -34,6 +37,7 @@ _SEND_S: Final = 0.002
 _REOPEN_S: Final = 0.5
 _UNSENT: Final = 20
 """Failed sends in a row after which the bus counts as lost."""
+_REPORTS: Final = 256
 
 End = Literal["plant", "controller"]
 
@@ -45,6 +49,7 @@ class CanLink(Link):
 
     Attributes:
         peer: The other end's last heartbeat, or None.
+        reports: The plant's fault reports that the controller's side has not yet taken.
         fault: Why the bus cannot be used, or None; `reopen` may clear it.
         errors: Error frames, failed sends and receives so far.
         refused: Malformed frames and heartbeats so far.
@@ -69,6 +74,9 @@ class CanLink(Link):
         self._receive_id = (COMMAND_ID if plant else MEASUREMENT_ID) + settings.node
         self._beat_id = (PLANT_HEARTBEAT_ID if plant else CONTROLLER_HEARTBEAT_ID) + settings.node
         self._peer_beat_id = (CONTROLLER_HEARTBEAT_ID if plant else PLANT_HEARTBEAT_ID) + settings.node
+        self._report_id = FAULT_REPORT_ID + settings.node
+        self._takes_reports = not plant
+        self.reports: deque[FaultReport] = deque(maxlen=_REPORTS)
         self._receives = wire.command if plant else wire.measurement
         transmit = wire.transmit
         self._may_be_silent = lockstep and (transmit.command if plant else transmit.measurement) == "on_change"
@@ -89,6 +97,10 @@ class CanLink(Link):
     def beat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat."""
         self._put(self._beat_id, heartbeat.pack())
+
+    def report(self, report: FaultReport) -> None:
+        """Send a fault report."""
+        self._put(self._report_id, report.pack())
 
     def silent_s(self) -> float:
         """Time since the last reception from the other end [s]; infinite if there was none."""
@@ -202,3 +214,10 @@ class CanLink(Link):
                 return
             self.peer_ns = now
             self.peer = heartbeat
+        elif identifier == self._report_id and self._takes_reports:
+            report = FaultReport.unpack(data)
+            if report is None:
+                self.refused += 1
+                return
+            self.peer_ns = now
+            self.reports.append(report)

@@ -68,7 +68,8 @@ def demo(
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
     settings = with_bits_of(settings_of(config, overrides, *options), bits_out, bits_in)
     from aeroloop.service.lab.demo import run_demo
-    from aeroloop.service.terminal.display import figures_table, live_demo
+    from aeroloop.service.terminal.display import live_demo
+    from aeroloop.service.terminal.log_tables import demo_account
 
     with guarded():
         if json or not sys.stderr.isatty():
@@ -78,7 +79,7 @@ def demo(
         else:
             with live_demo(duration) as update:
                 figures, complete = run_demo(settings, duration, log, update)
-    show(figures, json, figures_table)
+    show(figures, json, demo_account)
     if not json:
         page = quote(str(Path(figures.log or "").with_suffix(".html")))
         typer.echo(f"aeroloop: next, draw it: `aeroloop log review {quote(figures.log or '')} --html {page}`", err=True)
@@ -157,7 +158,7 @@ def can_node(options: DaemonOptions, faults: Faults = None) -> None:
         from aeroloop.plant_emulator.hosts.emulator import Emulator
 
         emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
-        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint))
+        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint, emulator.fault_statuses))
 
     run_alone(run, options)
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from typing import Self
 
 import zenoh
+from pydantic import Field
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status, Telemetry
@@ -20,12 +22,25 @@ from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
 from aeroloop.service.host.bandwidth import PayloadRate
 from aeroloop.service.recording.rolling import parts
-from aeroloop.service.review.review import review
+from aeroloop.service.review.report import FaultInterval
+from aeroloop.service.review.review import read
 from aeroloop.service.testing.process_group import ProcessGroup, ProcessGroupError, standalone
 
 REFRESH_S = 0.1
 CLAIM_WAIT_S = 60.0
 """The controller claims the plant within a second here; a machine may stall."""
+
+
+class DemoFigures(Figures):
+    """Figures of merit, and the faults that acted."""
+
+    faults: list[FaultInterval] = Field(default_factory=list, description="faults of the emulated plant that acted")
+
+    @classmethod
+    def of(cls, log: Sequence[Path]) -> Self:
+        """Those of a log. Raises ReviewError if it cannot be reviewed."""
+        found = read(*log)
+        return cls(**dict(found.figures), faults=found.findings.faults)
 
 
 @dataclass
@@ -78,7 +93,7 @@ class Progress:
 
 def run_demo(
     settings: Settings, duration_s: float, log: Path | None, show: Callable[[Progress], None] | None = None
-) -> tuple[Figures, bool]:
+) -> tuple[DemoFigures, bool]:
     """Run the experiment over Zenoh in three processes and review its log.
 
     Args:
@@ -122,7 +137,7 @@ def run_demo(
         processes.check()
     progress.waiting_for = "the review of the log"
     show(progress)
-    return review(*parts(path)), not interrupted.is_set()
+    return DemoFigures.of(parts(path)), not interrupted.is_set()
 
 
 @contextmanager

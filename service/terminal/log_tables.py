@@ -16,6 +16,7 @@ from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 
 if TYPE_CHECKING:
+    from aeroloop.service.lab.demo import DemoFigures
     from aeroloop.service.logs.replay import Replay
 
 MARKS_SHOWN: Final = 12
@@ -64,6 +65,13 @@ def review_account(findings: Findings) -> None:
             style = "green" if check.holds else "bold red"
             checks.add_row(f"[{style}]{'✓' if check.holds else '✗'}[/]", check.text, check.found)
         console.print(checks)
+
+
+def demo_account(figures: DemoFigures) -> None:
+    """Print the faults that acted, and figures of merit."""
+    if figures.faults:
+        Console().print(_faults_table(figures.faults))
+    figures_table(figures)
 
 
 def _timing_table(findings: Findings, *, drawn: bool) -> Table:

@@ -16,12 +16,12 @@ import zenoh
 from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, Status
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
+from aeroloop.protocol.transport.can_format import FaultPhase, FaultReport, Heartbeat, fault_check, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -47,6 +47,8 @@ class Ends:
         self.events: list[Event] = []
         self._session = gathering.join()
         self._session.declare_subscriber(topics.key("event", "aero"), self._on_event)
+        self.statuses: list[Status] = []
+        self._session.declare_subscriber(topics.key("status", "aero", role="plant"), self._on_status)
         self.batches: list[Batch] = []
         self._session.declare_subscriber(topics.key("trace", "aero", role="plant"), self._trace)
         self.measured: list[bytes] = []
@@ -131,6 +133,9 @@ class Ends:
     def _on_event(self, sample: zenoh.Sample) -> None:
         self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
 
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        self.statuses.append(Status.model_validate_json(sample.payload.to_bytes()))
+
     def command(self, echo: int) -> None:
         """Answer a measurement."""
         key = topics.key("command", "aero", session=f"of-a-{self._sessions}")
@@ -157,10 +162,40 @@ def ends() -> Iterator[Ends]:
             ends.close()
 
 
-def test_faults_of_the_node_are_named_at_the_start_because_it_cannot_publish_them(ends: Ends) -> None:
-    eventually("the event", lambda: any(event.kind == "fault" for event in ends.events))
-    (event,) = (event for event in ends.events if event.kind == "fault")
-    assert event.text == "an emulated node has faults whose begin and end are not published: rate:off@9"
+def test_begin_end_and_count_of_a_nodes_fault_are_published_at_the_ticks_that_the_node_reports(ends: Ends) -> None:
+    ends.hold()
+    for counter in range(4):
+        ends.node.send(WIRE.measurement.pack(counter, (counter, 0, 0, 0, 0, 0)))
+        eventually("the measurement", lambda counter=counter: len(ends.measured) == counter + 1)  # type: ignore[misc]
+    check = fault_check("rate:off@9")
+    for phase, tick, changed in ((FaultPhase.TO_COME, 3, 0), (FaultPhase.ACTS, 2, 1), (FaultPhase.OVER, 4, 300)):
+        ends.node.report(FaultReport(0, phase, tick, check, changed))
+    ends.node.report(FaultReport(5, FaultPhase.ACTS, 3, check, 1))  # the bridge's configuration has no sixth one
+
+    def faults() -> list[Event]:
+        return [event for event in ends.events if event.kind == "fault"]
+
+    eventually("the events", lambda: len(faults()) == 3)
+    unknown = "fault 6 of node 1, not in the bridge's plant.faults"
+    assert [(event.text, event.tick) for event in faults()] == [
+        ("fault begins (configured): rate:off@9", 2),
+        ("fault ends (configured): rate:off@9, 300 samples dropped", 4),
+        (f"fault begins (configured): {unknown}", 3),
+    ]
+    assert len({event.session for event in faults()} - {None}) == 1
+    eventually("the status", lambda: any(len(status.faults) == 2 for status in ends.statuses))
+    (known, other) = next(status.faults for status in ends.statuses if len(status.faults) == 2)
+    assert (known.fault, known.begin_tick, known.end_tick, known.changed) == ("rate:off@9", 2, 4, 300)
+    assert (other.fault, other.begin_tick, other.end_tick, other.changed) == (unknown, 3, None, 1)
+
+
+def test_without_a_report_no_fault_is_published(ends: Ends) -> None:
+    """The plant behind the bus may be no emulator."""
+    ends.hold()
+    assert ends.release()
+    eventually("a status", lambda: bool(ends.statuses))
+    assert not any(status.faults for status in ends.statuses)
+    assert not any(event.kind == "fault" for event in ends.events)
 
 
 def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:

@@ -26,7 +26,7 @@ from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat
 from aeroloop.service.config import load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.review.review import review
+from aeroloop.service.review.review import read, review
 from aeroloop.service.testing.fork_server import fork_server
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.process_group import free_rendezvous
@@ -147,6 +147,20 @@ def test_in_lockstep_the_figures_are_those_of_the_experiment_to_the_last_bit(
     assert wire.measurement.size == (10 if settings else 7)
     assert figures.model_dump(include=FIGURES) == alone.model_dump(include=FIGURES)
     assert figures.trips == []
+
+
+def test_a_log_has_the_nodes_faults_to_the_tick_as_it_has_an_emulators(tmp_path: Path) -> None:
+    faults = ["command:drop=0.5@0.2..0.4", "rate:bias=0.01@0.5"]
+    with Loop(tmp_path, "udp_multicast", lockstep=True) as loop:
+        loop.start({"controller.duration_s": 1.0, "plant.faults": faults})
+        loop.hil.eventually("the end", lambda: not loop.hil.processes.running("controller"))
+        log = loop.hil.log
+    findings = read(log.path).findings
+    found = [(fault.fault, fault.begin_s, fault.end_s, fault.effect) for fault in findings.faults]
+    assert found == [(faults[0], 0.2, 0.4, "commands dropped"), (faults[1], 0.5, None, "samples shifted")]
+    assert 20 < findings.faults[0].changed < 80  # of 100 commands; its last report is after its end
+    marks = [(mark.text.partition(" (")[0], mark.time_s) for mark in findings.marks if mark.kind == "fault"]
+    assert marks == [("fault begins", 0.2), ("fault ends", 0.4), ("fault begins", 0.5)]
 
 
 @pytest.mark.parametrize(("interface", "settings"), BUSES[1:])

@@ -219,13 +219,13 @@ def test_a_tick_is_a_measurement_that_passes_with_what_was_received_before_it() 
         (0, 0, Outcome.NONE, -1, OFF),
         (1, 1, Outcome.ACTED, 0, five),
         (2, 2, Outcome.REPEATED, 0, five),
-        (3, 5, Outcome.ACTED, 2, seven),
-        (4, 6, Outcome.MALFORMED, 2, seven),
-        (5, 7, Outcome.ACTED, 6, OFF),  # whether it is the right answer is the node's to say
-        (6, 5 + COUNTERS, Outcome.NONE, 6, OFF),
+        (5, 5, Outcome.ACTED, 2, seven),  # two were lost on the bus
+        (6, 6, Outcome.MALFORMED, 2, seven),
+        (7, 7, Outcome.ACTED, 6, OFF),  # whether it is the right answer is the node's to say
+        (5 + COUNTERS, 5 + COUNTERS, Outcome.NONE, 6, OFF),
     ]
     assert it.watch(NOW + WATCHDOG_NS + 1)
-    assert (it.ticked, it.session_tick, it.answered, it.voltages) == (7, 6 + COUNTERS, -1, OFF)
+    assert (it.ticked, it.session_tick, it.answered, it.voltages) == (6 + COUNTERS, 6 + COUNTERS, -1, OFF)
     assert [(operation.kind, operation.tick) for operation in it.operations] == [("claim", -1)]
 
 

@@ -78,7 +78,9 @@ def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit(
 
 def test_review_gives_the_figures_that_the_demo_printed(tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
-    demo = aeroloop("demo", "--lockstep", "--duration", "2", "--log", str(log))
+    fault = "rate:bias=0.01@0.5..1"
+    demo = aeroloop("demo", "--lockstep", "--duration", "2", "--log", str(log), "--set", f'plant.faults=["{fault}"]')
+    assert [(one["fault"], one["begin_s"], one["end_s"]) for one in demo["faults"]] == [(fault, 0.5, 1.0)]
     judged = aeroloop("log", "review", str(log))
     figures = {name: judged[name] for name in demo}
     figures["reasons"] = {name: why for name, why in judged["reasons"].items() if name in demo}

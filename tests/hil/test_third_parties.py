@@ -2,6 +2,9 @@
 
 The ends and the third party are on hosts of their own, network namespaces of this machine. A watchdog of 0.5 s instead
 of 0.1 s allows for a busy machine; before this was mended a dead link stalled the loop for 1 to 2 s.
+
+A narrow link is measured in `tests/benchmarks/third_parties.py` instead: what it stalls, with Zenoh's default of
+threads, are little more than 100 ms, and a shared machine does that by itself.
 """
 
 from __future__ import annotations
@@ -23,13 +26,12 @@ AWAY_S = 2.0
 
 
 @pytest.fixture
-def hosts(tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosts]:
+def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosts]:
     """Hosts with an emulator and a controller, and a third one that records and watches; the plant is driven.
 
-    Zenoh has its default of threads, which a lingering socket stalls, except where the threads are what is tested.
+    Zenoh has its default of threads, which a lingering socket stalls.
     """
-    if request.node.callspec.params["happens"] is not narrow_the_link:
-        monkeypatch.setenv("ZENOH_RUNTIME", "(rx: (worker_threads: 2))")
+    monkeypatch.setenv("ZENOH_RUNTIME", "(rx: (worker_threads: 2))")
     try:
         with Hosts(["plant", "controller", "third"], tmp_path) as hosts:
             hosts.aeroloop("plant", "emulator", overrides=PATIENT)
@@ -58,12 +60,6 @@ def pull_the_cable(hosts: Hosts, _: list[object]) -> None:
     hosts.plug("third")
 
 
-def narrow_the_link(hosts: Hosts, _: list[object]) -> None:
-    hosts.narrow("third", 64)
-    time.sleep(2 * AWAY_S)
-    hosts.plug("third")
-
-
 def halt(_: Hosts, parties: list[object]) -> None:
     for party in parties:
         party.send_signal(signal.SIGSTOP)  # type: ignore[attr-defined]  # a process
@@ -77,7 +73,7 @@ def kill(_: Hosts, parties: list[object]) -> None:
         party.kill()  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("happens", [pull_the_cable, narrow_the_link, halt, kill])
+@pytest.mark.parametrize("happens", [pull_the_cable, halt, kill])
 def test_whatever_happens_to_a_third_party_the_session_goes_on(
     hosts: Hosts, tmp_path: Path, happens: Callable[[Hosts, list[object]], None]
 ) -> None:

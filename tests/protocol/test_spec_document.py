@@ -16,6 +16,7 @@ from aeroloop import protocol
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
 from aeroloop.protocol.messages.topics import TOPICS
+from aeroloop.protocol.transport.can_format import FaultPhase, FaultReport, fault_check
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
@@ -27,6 +28,7 @@ QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
 KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes | levels |"
 FRAMES: Final = "| frame | counter bits | bits of ε, ω / u | actuators | counter | codes | hex |"
 SENT: Final = "| heartbeat_s | period in ms | counter bits | codes | ticks that send | their counters |"
+REPORTS: Final = "| fault | place | phase | tick | check | changed | report |"
 REFUSED: Final = "| frame | counter bits | bits of ε, ω / u | actuators | hex | why |"
 
 Row = tuple[str, ...]
@@ -60,6 +62,7 @@ KIND_ROWS: Final = rows(KINDS, "Golden vectors")
 FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
 REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
 SENT_ROWS: Final = rows(SENT, "Golden vectors")
+REPORT_ROWS: Final = rows(REPORTS, "On a CAN bus")
 
 
 def number(text: str) -> int:
@@ -96,6 +99,7 @@ def as_bits(text: str) -> int | str:
         pytest.param(FRAME_ROWS, 14, id="frames"),
         pytest.param(REFUSED_ROWS, 4, id="refused"),
         pytest.param(SENT_ROWS, 8, id="sent"),
+        pytest.param(REPORT_ROWS, 3, id="fault reports"),
     ],
 )
 def test_the_golden_vectors_are_there(found: list[Row], least: int) -> None:
@@ -166,6 +170,17 @@ def test_frames_are_sent_as_their_golden_vectors_say(row: Row) -> None:
     sent = [k for k, code in computed if sender.due(k, code)]
     assert sent == [int(tick) for tick in ticks.split()]
     assert [k % counters for k in sent] == [int(counter) for counter in counted.split()]
+
+
+@pytest.mark.parametrize("row", REPORT_ROWS, ids=" ".join)
+def test_a_fault_report_has_the_bytes_of_its_golden_vector(row: Row) -> None:
+    fault, place, phase, tick, check, changed, packed = row
+    number, _, name = phase.partition(" ")
+    report = FaultReport(int(place), FaultPhase(int(number)), int(tick), bytes.fromhex(check), int(changed))
+    assert fault_check(fault).hex() == check
+    assert report.phase.name.lower() == name.replace(" ", "_")
+    assert report.pack() == bytes.fromhex(packed)
+    assert FaultReport.unpack(report.pack()) == report
 
 
 def size(count: int) -> str:

@@ -84,11 +84,13 @@ class Hosts:
         sets = [word for override in given for word in ("--set", override)]
         return self.start(host, "-m", "aeroloop", *words, *sets)
 
-    def start(self, host: str, *words: str, stdout: Path | None = None) -> subprocess.Popen[bytes]:
+    def start(
+        self, host: str, *words: str, stdin: int | None = None, stdout: Path | None = None
+    ) -> subprocess.Popen[bytes]:
         """Start this Python on a host."""
         command = ["ip", "netns", "exec", self._prefix + host, sys.executable, *words]
         with self.log(host).open("ab") as errors, (stdout or Path(os.devnull)).open("ab") as output:
-            process = subprocess.Popen(command, stdout=output, stderr=errors)
+            process = subprocess.Popen(command, stdin=stdin, stdout=output, stderr=errors)
         self._processes.append(process)
         return process
 

@@ -102,6 +102,33 @@ def test_an_operators_stop_after_the_session_replaces_how_it_ended(end: Tenancy)
     assert last.ended is TripCause.OPERATOR
 
 
+@pytest.mark.parametrize(
+    ("trips", "events", "cause"),
+    [
+        (lambda end: end.stop(), ["tripped"], "stopped by an operator: 0 V"),
+        (lambda end: end.lost("a"), ["tripped", "changed"], "a is gone: 0 V; then stopped by an operator"),
+    ],
+)
+def test_a_repeated_stop_is_no_second_trip_and_the_first_cause_stays(
+    end: Tenancy, trips: Callable[[Tenancy], object], events: list[str], cause: str
+) -> None:
+    claim(end, "a")
+    end.notices.clear()
+    trips(end)
+    trip = end.trip
+    for _ in range(3):
+        end.stop()
+    assert [notice.kind for notice in end.notices] == events
+    assert (end.trip, end.cause) == (trip, cause)
+
+
+def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: Tenancy) -> None:
+    end.stop()
+    end.stop(TripCause.DUPLICATE, "two plants")
+    end.stop()
+    assert (end.trip, [notice.kind for notice in end.notices]) == (TripCause.DUPLICATE, ["tripped", "tripped"])
+
+
 def test_a_session_without_a_record_leaves_none(end: Tenancy) -> None:
     claim(end, "a")
     end.keep(record("a"))

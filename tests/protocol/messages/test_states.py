@@ -329,8 +329,13 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
     def stop(self, _: str) -> None:
         """An operator stops."""
+        was_tripped, trip = self.endpoint.state is PlantState.TRIPPED, self.endpoint.trip
         self.endpoint.stop()
-        self.tripped(TripCause.OPERATOR)
+        if not was_tripped:
+            self.tripped(TripCause.OPERATOR)
+        else:
+            assert self.endpoint.trip is trip
+            self.reported += [] if self.stopped else ["changed"]
         self.stopped = True
 
     def release(self, name: str) -> None:

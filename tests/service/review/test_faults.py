@@ -12,6 +12,7 @@ from aeroloop.protocol.messages.models import FaultStatus, Status
 from aeroloop.service import examples
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
+from aeroloop.service.lab.demo import DemoFigures
 from aeroloop.service.logs.runs import Block
 from aeroloop.service.report.page.page import page
 from aeroloop.service.report.page.verdict import judgement
@@ -114,6 +115,18 @@ def test_the_terminal_and_json_list_them(faulty: Path, capsys: pytest.CaptureFix
     assert execute(["log", "review", "--json", str(faulty)]) == 0
     findings = Findings.model_validate_json(capsys.readouterr().out)
     assert [fault.source for fault in findings.faults] == ["configured", "injected", "configured"]
+
+
+def test_the_demos_summary_names_them_before_its_figures(
+    faulty: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aeroloop.service.lab.demo.run_demo", lambda *_: (DemoFigures.of([faulty]), True))
+    assert execute(["demo"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("with faults command:drop=0.3@0.2..0.6 from 0.200 s to 0.600 s")
+    assert " duration " in text
+    assert execute(["demo", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["faults"]) == 3
 
 
 # ── several sessions and processes ──
