@@ -121,8 +121,8 @@ def test_a_body_at_rest_near_its_reference_agrees_with_the_formulas_worked_by_ha
     V2 += 0.01 * d_omega + theta_err * k_we * d_z2 + d_u * 0.02
     Q = theta_err * d_z2 * d_omega + (V2 + hold) ** 2 / (2 * c0)
     assert 0 < hold < V2
-    assert (found.c0, found.delta_V1) == pytest.approx((c0, V1), rel=1e-9)
-    assert (found.delta_V2, found.delta_Q) == pytest.approx((V2, Q), rel=1e-4)  # k_ε's second order
+    assert found.c0 == pytest.approx(c0, rel=1e-9)
+    assert (found.delta_V1, found.delta_V2, found.delta_Q) == pytest.approx((V1, V2, Q), rel=1e-4)  # k_ε's second order
     assert found.radius == pytest.approx(sqrt(Q / (c0 / 2 - V1)), rel=1e-4)
 
 
@@ -172,7 +172,7 @@ def test_without_quantization_the_mean_square_vanishes_but_for_the_disturbance()
 
 @pytest.mark.parametrize(("out", "inp", "most"), [(12, 12, 0.028), (8, 6, 0.20)])
 def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, most: float) -> None:
-    """At 500 Hz, with the paper's gains and reference, if ‖θ‖ is known to be within that of the paper's first estimate."""
+    """At 500 Hz, with the paper's gains and reference, if ‖θ‖ is known to be within that of its first estimate."""
     found = certify(load_over(PAPER, [*SMALL, *bits(out, inp)]))
     assert found.pointwise_radius is not None
     assert found.pointwise_radius <= most
