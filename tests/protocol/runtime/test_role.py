@@ -13,19 +13,24 @@ def test_only_a_query_that_names_its_verb_acts() -> None:
     """Tools that list a network query `**`: a plant must be neither stopped nor armed by that."""
     done: list[str] = []
     with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
-        for verb in ("arm", "stop"):
 
-            def act(verb: str = verb) -> Answer:
+        def serve(verb: str) -> None:
+            def act() -> Answer:
                 done.append(verb)
                 return Answer(done=True, text=verb)
 
-            role.serve(verb, Request, lambda _, act=act: act)
+            role.serve(verb, Request, lambda _: act)
+
+        serve("arm")
+        serve("stop")
         session = gathering.join()
         eventually("a link", lambda: any(session.get("aeroloop/aero/description/plant", timeout=1.0)))
 
         def answers(key: str) -> list[str]:
             got: list[str] = []
-            session.get(key, lambda reply: got.append(str(reply.ok.key_expr)), target=zenoh.QueryTarget.ALL)
+            session.get(
+                key, lambda reply: got.append(str(reply.ok and reply.ok.key_expr)), target=zenoh.QueryTarget.ALL
+            )
             eventually("an answer", lambda: not role.take_inbox() and bool(got))
             return got
 
