@@ -144,6 +144,7 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         ConfigError: The configuration is wrong.
     """
     tree = Settings().description()
+    del tree["vehicle"]  # `op stop` without a configured vehicle stops all: `model_fields_set` has what is configured
     if file is not None:
         _merge(tree, _read(file))
     _merge(tree, _environment())

@@ -66,7 +66,8 @@ class RecorderSettings(BaseModel):
 
     directory: Path = Field(default=Path("logs"), description="folder of logs without a given path")
     path: Path | None = Field(
-        default=None, description="the log's first file, or a folder; named by the time if left out"
+        default=None,
+        description="the log's first file, or a folder (a name without an ending is one)",
     )
     chunk_s: float = Field(
         default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut loses [s]"

@@ -59,7 +59,7 @@ def demo(
     ] = None,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
-    log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="New log, or its folder.", show_default=False)] = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,

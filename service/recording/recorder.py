@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Loss, Status
+from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.publication import Delivery
@@ -206,8 +207,8 @@ class Recorder:
         written, log = self.log.written, self.log
         notes = [f"{count} messages lost: {reason}" for reason, count in sorted(self._lost.items())]
         if log.trouble:
-            notes.append(f"{log.trouble}; {len(self._backlog)} messages wait")
-        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "not recording"
+            notes.append(f"{len(self._backlog)} messages wait in memory")
+        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else NOT_RECORDING
         self._role.status(
             Status(
                 role=self._role.role,

@@ -46,6 +46,16 @@ def parts(path: Path) -> list[Path]:
     return [path, *followed] if path.exists() else followed
 
 
+def log_path(place: Path, named: str) -> Path:
+    """The new log at a place: the place itself, or a file in it, named by the time, if it is a folder.
+
+    A folder exists as one, or its name has no ending.
+    """
+    if place.suffix and not place.is_dir():
+        return place
+    return place / datetime.now().strftime(named)
+
+
 class RollingLog:
     """A log in files.
 
@@ -68,8 +78,8 @@ class RollingLog:
         self._report = report
         self._id = uuid.uuid4().hex
         place = settings.path or settings.directory
-        self._named_by_time = place is settings.directory or place.is_dir()
-        self._base = place / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap") if self._named_by_time else place
+        self._base = log_path(place, "aeroloop-%Y%m%d-%H%M%S.mcap")
+        self._named_by_time = self._base != place
         self._descriptions: dict[str, bytes] = {}
         self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []

@@ -50,6 +50,8 @@ def read_runs(
 ) -> list[Report]:
     """A report of every log or folder, each a run of its own, with names that differ. Raises as `report` does.
 
+    Logs of one name are named with their folders.
+
     Args:
         logs: A file or a folder each.
         limits: Limits that the figures of each must keep.
@@ -60,7 +62,14 @@ def read_runs(
         return None if progress is None else lambda part: progress((done + part) / len(logs))
 
     part = DrawnPart(points=MAX_POINTS // len(logs))  # one page holds them all
-    return named_apart([report([log], limits, share(i), part) for i, log in enumerate(logs)])
+    reports = [report([log], limits, share(i), part) for i, log in enumerate(logs)]
+    names = [run.name for run in reports]
+    return named_apart(
+        [
+            replace(run, name=f"{log.resolve().parent.name}/{run.name}") if names.count(run.name) > 1 else run
+            for log, run in zip(logs, reports, strict=True)
+        ]
+    )
 
 
 def named_apart(reports: Sequence[Report]) -> list[Report]:
