@@ -307,15 +307,12 @@ def _unproven(e: Evaluated) -> str:
     """Which properties of the plant, removed one after the other, leave a set that is proven."""
     p, body = e.plant, e.body
     without: tuple[tuple[str, dict[str, Any]], ...] = (
-        (f"its age of {p.age * 1e3:.3g} ms (rotor lag, period, transport)", {"age": 0.0}),
-        ("the held roll: u₁ is never applied", {"tilt": None}),
-        (f"the rate sensor's error of {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
+        (f"commands {p.age * 1e3:.3g} ms old (rotor lag, period, transport)", {"age": 0.0}),
+        ("the held roll (u₁ is never applied)", {"tilt": None}),
+        (f"a rate sensor that errs by {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
         (f"a torque of {p.k_tau_d:.2g} N·m", {"k_tau_d": body.k_tau_d}),
         ("the attitude sensor's error", {"delta_q": body.delta_q}),
-        (
-            f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)",
-            {"k_theta": 0.0, "k_theta_hat": 0.0},
-        ),
+        (f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"k_theta": 0.0, "k_theta_hat": 0.0}),
         ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}),
     )
     names = list[str]()
@@ -326,7 +323,7 @@ def _unproven(e: Evaluated) -> str:
             names.append(name)
             if reach(p) is not None:
                 break
-    return f"pointwise: no invariant set is proven; without {', and '.join(names)} there is one"
+    return f"pointwise: no invariant set is proven with {'; with '.join(names)}"
 
 
 def _condition(d: Lemma, t: Theorem) -> str:

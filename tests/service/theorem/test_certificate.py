@@ -190,14 +190,14 @@ def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
 @pytest.mark.parametrize(
     ("change", "names"),
     [
-        ("plant.ideal=false", "age"),
+        ("plant.ideal=false", "rotor lag"),
         ("wire.rate.limit=0.3", "range: wire.rate.limit"),
         ("wire.attitude.limit=0.7", "range: wire.attitude.limit"),
         ("wire.voltage.limit=1", "saturation: wire.voltage.limit"),
         ("plant.rigid_body.damping=[0.01, 0.01, 0.01]", "law.damping_bound"),
         ("plant.rigid_body.inertia=[0.03, 0.02, 0.02]", "inertia"),
         ('plant.faults=["attitude:drop=0.1"]', "plant.faults"),
-        ("loop.rate_hz=20", "age"),
+        ("loop.rate_hz=20", "ms old"),
         ("plant.rigid_body.allocation=[[0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]]", "torque"),
     ],
 )
@@ -283,7 +283,7 @@ def test_the_extremes_of_a_reference_are_those_of_what_the_law_is_given(referenc
             0.0 if jerk > 100 else jerk,
             np.abs(body).max(),
             half_angle,
-            abs(to_euler(tuple(q_d))[1]),
+            abs(to_euler((q_d[0], q_d[1], q_d[2], q_d[3]))[1]),
         )
         most = np.maximum(most, now)
     assert np.all(most < bounds)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from aeroloop.service.config import Settings, load_over
-from aeroloop.service.control.law import build_law
+from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.service.control.law import Law, LawSettings, build_law
 from aeroloop.service.control.reference import Floats, Plan
 from aeroloop.service.theorem.certificate import evaluate, premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
@@ -72,9 +73,9 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
         eps_e = eps_bar + kappa1 * w_s
         e = np.append(sqrt(1 - eps_e @ eps_e), eps_e)
         q = _product(q_d, e)
-        R_d, R = _matrix(q_d), _matrix(q)
+        R_d, R_b = _matrix(q_d), _matrix(q)
         omega_d, omega_d_dot = R_d @ b[i], R_d @ b_dot[i]  # inertial
-        omega = omega_e + R.T @ omega_d
+        omega = omega_e + R_b.T @ omega_d
         eps_Q = (
             q[1:] + settings.wire.attitude.quantizer().bound * np.sign(rng.standard_normal(3)) * rng.random(3) ** 0.1
         )
@@ -88,7 +89,7 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
         omega_dot = (np.array(Psi(q, omega)).ravel() - omega * theta + B @ u) / J  # (C.2)
         A = e[0] * np.identity(3) + _skew(eps_e)
         eps_e_dot = A @ omega_e / 2  # (C.17)
-        omega_e_dot = omega_dot - R.T @ omega_d_dot + np.cross(omega, R.T @ omega_d)
+        omega_e_dot = omega_dot - R_b.T @ omega_d_dot + np.cross(omega, R_b.T @ omega_d)
         z2_dot = omega_e_dot + C1 * eps_e_dot
         w_s_dot = w_s_dot_theta + b[i] * theta_hat_dot
         found1 = eps_e_dot - kappa1 * w_s_dot - (z_bar - C1 * eps_bar) / 2
@@ -155,7 +156,7 @@ def test_the_gains_are_the_largest_answers_to_bounded_inputs() -> None:
 )
 def test_the_set_grows_with_everything_that_disturbs(worse: dict[str, float]) -> None:
     p = of(load_over(PAPER, [f"wire.{name}.bits=10" for name in ("attitude", "rate", "voltage")]))
-    before, after = reach(p), reach(replace(p, **worse))
+    before, after = reach(p), reach(replace(p, **worse))  # type: ignore[arg-type]  # floats all
     assert before is not None
     assert after is None or after.radius > before.radius
     assert largest_start(replace(p, **worse)) < largest_start(p)
@@ -189,19 +190,18 @@ def test_the_reached_attitude_error_is_that_of_the_angle() -> None:
     assert e.body_reach.half_angle == pytest.approx(e.known.half_angle_d + asin(e.body_reach.eps_e))
 
 
-def _psi(law: object, built: object) -> ca.SX:
-    """Ψ of (C.4) for the true state, from u of (C.22): the law's own part without the rest is not separable."""
-    from aeroloop.protocol.wire.attitude import R, S
-
-    q, omega = built.q, built.omega  # type: ignore[attr-defined]
-    J = ca.diag(ca.SX(law.inertia))  # type: ignore[attr-defined]
-    f_g = ca.vertcat(0, 0, -law.mass * law.gravity)  # type: ignore[attr-defined]
-    return -S(omega) @ (J @ omega) + S(ca.SX(law.centre_of_mass)) @ R(q).T @ f_g  # type: ignore[attr-defined]
+def _psi(law: LawSettings, built: Law) -> ca.SX:
+    """Ψ of (C.4) at the true state."""
+    J = ca.diag(ca.SX(law.inertia))
+    f_g = ca.vertcat(0, 0, -law.mass * law.gravity)
+    Psi: ca.SX = -S(built.omega) @ (J @ built.omega) + S(ca.SX(law.centre_of_mass)) @ R(built.q).T @ f_g
+    return Psi
 
 
 def _direction(rng: np.random.Generator) -> Floats:
     v = rng.standard_normal(3)
-    return v / np.linalg.norm(v)
+    direction: Floats = v / np.linalg.norm(v)
+    return direction
 
 
 def _in_ball(rng: np.random.Generator, radius: float) -> Floats:
@@ -214,8 +214,9 @@ def _skew(v: Floats) -> Floats:
 
 
 def _matrix(q: Floats) -> Floats:
-    S = _skew(q[1:])
-    return np.identity(3) + 2 * q[0] * S + 2 * S @ S
+    V = _skew(q[1:])
+    matrix: Floats = np.identity(3) + 2 * q[0] * V + 2 * V @ V
+    return matrix
 
 
 def _product(p: Floats, q: Floats) -> Floats:
