@@ -98,8 +98,9 @@ class LonelyRole(Role):
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         del per_s, lossless
-        key, network = topics.key(topic, self.vehicle, role=self.role), self.zenoh
-        publisher: Any = SimpleNamespace(id=None, put=lambda payload: network.put.append((key, payload)))  # type: ignore[operator,arg-type]  # of the test
+        network: Any = self.zenoh
+        key = topics.key(topic, self.vehicle, role=self.role)
+        publisher: Any = SimpleNamespace(id=None, put=lambda payload: network.put.append((key, payload)))
         self._publishers[topic] = publisher
 
 
