@@ -7,12 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.transport.can_format import (
-    COMMAND_ID,
-    CanError,
-    CanSettings,
-    Heartbeat,
-)
+from aeroloop.protocol.transport.can_format import COMMAND_ID, CanError, CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
 from tests.support.can_in_process import PAPER, Flaws, Stranger, both_ends, virtual
 from tests.support.zenoh_network import PATIENCE_S, eventually

@@ -12,13 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import (
-    MEASUREMENT_ID,
-    PLANT_HEARTBEAT_ID,
-    CanError,
-    CanSettings,
-    Heartbeat,
-)
+from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.can_in_process import PAPER, Stranger, both_ends, virtual, wire_of

@@ -8,9 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import (
-    PLANT_HEARTBEAT_ID,
-)
+from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID
 from aeroloop.protocol.transport.can_link import CanLink
 from tests.support.can_in_process import Flaws, virtual
 from tests.support.can_stage import COUNTERS, OFF, Bus, command

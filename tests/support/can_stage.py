@@ -12,12 +12,7 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.can_node import CanFront
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.transport.can_format import (
-    MEASUREMENT_ID,
-    CanSettings,
-    Heartbeat,
-    fingerprint,
-)
+from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.loop import LoopSettings

@@ -9,9 +9,7 @@ import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
-from aeroloop.plant_emulator.faults.language import (
-    Fault,
-)
+from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.wire.spec import WireSpec

@@ -6,14 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.faults.language import (
-    MAX_ANGLE,
-    MAX_RATE,
-    MAX_TIME_S,
-    MAX_VOLTS,
-    SIGNALS,
-    Fault,
-)
+from aeroloop.plant_emulator.faults.language import MAX_ANGLE, MAX_RATE, MAX_TIME_S, MAX_VOLTS, SIGNALS, Fault
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.faults.language import (
-    Fault,
-)
+from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.faults.streams import FaultyStream
 from tests.support.faulty_streams import flat, letters, numbered, passed
 

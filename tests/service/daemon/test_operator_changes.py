@@ -14,18 +14,7 @@ from aeroloop.protocol.messages.operator import Change, Gains, Hold, Message, Po
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import (
-    LAW,
-    LEVEL,
-    PERIOD,
-    SWING,
-    WIRE,
-    FakeTime,
-    Loop,
-    gains_with,
-    measured,
-    turned,
-)
+from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, gains_with, measured, turned
 
 NO_VALID_VALUE: Final = [float("nan")] * 6
 LATER_TOO_FAST = Points(

@@ -6,12 +6,7 @@ from math import degrees, radians
 
 import pytest
 
-from aeroloop.protocol.messages.models import (
-    Description,
-    Event,
-    Loss,
-    Truth,
-)
+from aeroloop.protocol.messages.models import Description, Event, Loss, Truth
 from aeroloop.protocol.messages.operator import Message, Setpoint
 from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector, to_euler
 from aeroloop.service.config import load

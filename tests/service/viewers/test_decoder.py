@@ -71,10 +71,7 @@ def test_ticks_at_which_nothing_or_silence_was_sent_give_nothing() -> None:
     assert {shown.at_ns for shown in given} == {NOW + 2000}
 
 
-@given(
-    times=st.lists(st.integers(0, 3000), max_size=60).map(sorted),
-    cuts=st.sets(st.integers(1, 59)),
-)
+@given(times=st.lists(st.integers(0, 3000), max_size=60).map(sorted), cuts=st.sets(st.integers(1, 59)))
 def test_of_the_rows_in_a_slot_of_time_the_first_is_given_however_they_are_batched(
     times: list[int], cuts: set[int]
 ) -> None:

@@ -25,12 +25,7 @@ def readable(schema: dict[str, Any]) -> bool:
             return kind in ("boolean", "string", "number", "integer") and not {"oneOf", "anyOf", "$ref"} & set(schema)
 
 
-TYPES: dict[str, type | tuple[type, ...]] = {
-    "boolean": bool,
-    "string": str,
-    "number": (int, float),
-    "integer": int,
-}
+TYPES: dict[str, type | tuple[type, ...]] = {"boolean": bool, "string": str, "number": (int, float), "integer": int}
 
 
 def test_every_topic_that_is_given_is_listed_and_its_json_is_as_its_schema_says() -> None:

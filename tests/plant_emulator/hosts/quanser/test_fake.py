@@ -115,12 +115,7 @@ def test_it_refuses_what_c_would_misread_or_a_board_would_not_bear(
 
 @pytest.mark.parametrize(
     "use",
-    [
-        lambda h: h.write_analog(CH, 2, ZERO),
-        lambda h: h.watchdog_clear(),
-        lambda h: h.watchdog_is_expired(),
-        reader,
-    ],
+    [lambda h: h.write_analog(CH, 2, ZERO), lambda h: h.watchdog_clear(), lambda h: h.watchdog_is_expired(), reader],
 )
 def test_it_refuses_every_call_before_it_is_open_and_after(use: Callable[[FakeHIL], None]) -> None:
     with pytest.raises(MisuseError, match="not open"):

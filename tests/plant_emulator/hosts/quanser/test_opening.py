@@ -16,17 +16,7 @@ from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.plant_emulator.quanser_settings import QuanserSettings
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.wire.attitude import IDENTITY
-from tests.support.quanser_board import (
-    AERO,
-    OFF,
-    PERIOD,
-    VOLTS,
-    WATCHDOG,
-    Calls,
-    drive,
-    driven_plant,
-    plant_on_board,
-)
+from tests.support.quanser_board import AERO, OFF, PERIOD, VOLTS, WATCHDOG, Calls, drive, driven_plant, plant_on_board
 
 CLOSING = ["write_analog", "write_digital", "write_other", "watchdog_stop", "task_stop", "task_delete", "close"]
 DARK = [0.0, 0.0, 0.0]
