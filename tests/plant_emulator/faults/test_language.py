@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from math import inf, nan, nextafter, ulp
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from aeroloop.plant_emulator.faults.language import MAX_ANGLE, MAX_RATE, MAX_TIME_S, MAX_VOLTS, SIGNALS, Fault
 
@@ -32,41 +35,25 @@ def test_a_fault_is_read_as_it_is_written(text: str, fault: Fault) -> None:
         ("attitude", "it is written", "signal:kind[=value][@start[..end]]"),
         ("", "it is written", "attitude:off@5"),
         ("altitude:off", "no signal 'altitude'", "attitude, attitude.x"),
-        ("rate.w:off", "no signal 'rate.w'", "rate.z"),
-        ("motor0:off", "no signal 'motor0'", "motor1, motor2, motor3"),
         ("attitude:of", "takes no 'of'", "off, stuck, bias, noise, delay, drop and garble"),
         ("attitude.x:stuck", "attitude.x takes no 'stuck'", "off, bias, noise and drop; attitude as a whole does"),
         ("command:bias=1", "command takes no 'bias'", "off, stuck, delay, drop, garble, duplicate and reorder"),
-        ("measurement:noise=1", "measurement takes no 'noise'", "duplicate and reorder"),
         ("rate:duplicate=1", "rate takes no 'duplicate'", "drop and garble"),
-        ("motor1:reorder=1", "motor1 takes no 'reorder'", "drop and garble"),
         ("attitude:off=1", "off takes no value, but was given 1", "write off alone"),
-        ("motor1:stuck=0", "stuck takes no value, but was given 0", "write stuck alone"),
         ("rate:bias", "bias takes -35 to 35 rad/s", "bias=0.1"),
         ("rate:bias=nan", "not nan", "-35 to 35 rad/s"),
         ("attitude.x:bias=-3.2", "not -3.2", "-3.1416 to 3.1416 rad"),
         ("motors:bias=1e308", "not 1e+308", "-48 to 48 V"),
-        ("motor1:noise=48.1", "not 48.1", "0 to 48 V"),
         ("rate:noise=inf", "not inf", "0 to 35 rad/s"),
         ("rate:noise=-1", "not -1", "0 to 35 rad/s"),
         ("rate:delay=10.5", "not 10.5", "0 to 10 s"),
-        ("command:delay=-0.1", "not -0.1", "0 to 10 s"),
         ("rate:drop=0", "not 0", "a probability above 0 and up to 1"),
         ("rate:garble=1.01", "not 1.01", "a probability above 0 and up to 1"),
-        ("command:duplicate=2", "not 2", "a probability above 0 and up to 1"),
-        ("command:reorder", "reorder takes", "reorder=0.1"),
-        ("rate:bias=", "'' is not a number", ""),
         ("rate:bias=much", "'much' is not a number", ""),
-        ("rate:off@", "'' is not a number", ""),
         ("rate:off@soon", "'soon' is not a number", ""),
-        ("rate:off@1..", "'' is not a number", ""),
         ("rate:off@-1", "not at -1 s", "within 0 to 1e+08 s"),
-        ("rate:off@inf", "not at inf s", "within 0 to 1e+08 s"),
         ("rate:off@nan", "not at nan s", "within 0 to 1e+08 s"),
-        ("rate:off@1e308", "not at 1e+308 s", "within 0 to 1e+08 s"),
         ("rate:off@4..2", "not at 2 s", "after it begins at 4 s"),
-        ("rate:off@4..4", "not at 4 s", "after it begins at 4 s"),
-        ("rate:off@4..inf", "not at inf s", "after it begins at 4 s and by 1e+08 s"),
         ("rate:off@4..1e9", "not at 1000000000 s", "by 1e+08 s"),
         ("rate:off\n@1", "takes no 'off\\n'", "off, stuck"),
     ],
@@ -93,13 +80,14 @@ def test_fields_are_held_to_the_same_rules_as_texts() -> None:
         Fault.model_validate({"signal": "rate", "kind": "off", "until": 3})
 
 
-def values_of(signal: str, kind: str) -> st.SearchStrategy[float | None]:
+def range_of(signal: str, kind: str) -> tuple[float, float] | None:
+    """Least and largest value; None for a kind without one."""
     if kind in ("off", "stuck"):
-        return st.none()
+        return None
     if kind in ("bias", "noise"):
         size = {"attitude": MAX_ANGLE, "rate": MAX_RATE, "motors": MAX_VOLTS}[SIGNALS[signal].whole]
-        return st.floats(-size if kind == "bias" else 0.0, size)
-    return st.floats(0.0, 10.0) if kind == "delay" else st.floats(0.0, 1.0, exclude_min=True)
+        return -size if kind == "bias" else 0.0, size
+    return (0.0, 10.0) if kind == "delay" else (ulp(0.0), 1.0)
 
 
 @st.composite
@@ -108,12 +96,26 @@ def any_fault(draw: st.DrawFn) -> Fault:
     kind = draw(st.sampled_from(SIGNALS[signal].kinds))
     start = draw(st.floats(0.0, MAX_TIME_S, exclude_max=True))
     end = draw(st.none() | st.floats(start, MAX_TIME_S, exclude_min=True))
-    return Fault(signal=signal, kind=kind, value=draw(values_of(signal, kind)), start_s=start, end_s=end)
+    within = range_of(signal, kind)
+    value = None if within is None else draw(st.floats(*within))
+    return Fault(signal=signal, kind=kind, value=value, start_s=start, end_s=end)
 
 
 @given(fault=any_fault())
 def test_what_is_written_reads_back_the_same(fault: Fault) -> None:
     assert Fault.parse(str(fault)) == fault
+
+
+@given(fault=any_fault())
+def test_a_value_or_a_time_just_beyond_its_range_is_refused(fault: Fault) -> None:
+    within, start = range_of(fault.signal, fault.kind), fault.start_s
+    values = [0.0, 1.0] if within is None else [None, nan, nextafter(within[0], -inf), nextafter(within[1], inf)]
+    wrong: list[tuple[str, float | None]] = [("value", value) for value in values]
+    wrong += [("start_s", t) for t in (-ulp(0.0), nan, inf, MAX_TIME_S + 1)]
+    wrong += [("end_s", t) for t in (start, nan, inf, nextafter(MAX_TIME_S, inf))]
+    for field, value in wrong:
+        with pytest.raises(ValidationError):
+            Fault.model_validate(fault.model_dump() | {field: value})
 
 
 @given(text=st.text() | st.from_regex(r"(attitude|motor1|command):[a-z]*=?[-.0-9einf]*@?[-.0-9]*"))

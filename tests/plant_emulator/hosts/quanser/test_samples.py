@@ -13,11 +13,11 @@ from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.plant_emulator.quanser_settings import CardType, QuanserSettings
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
-from tests.plant_emulator.hosts.quanser.conftest import HandClock
 from tests.support.quanser_board import (
     AERO,
     PERIOD,
     Calls,
+    HandClock,
     drive,
     driven_plant,
     emulated_aero,
