@@ -82,25 +82,6 @@ def test_a_node_number_that_would_make_another_kind_of_id_is_refused(node: int) 
         CanSettings(node=node)
 
 
-def test_two_nodes_on_one_bus_do_not_receive_each_others_frames() -> None:
-    first, second = virtual(node=1), virtual(node=2)
-    second = second.model_copy(update={"channel": first.channel})
-    with both_ends(first) as (plant_1, controller_1, near_1), both_ends(second) as (plant_2, controller_2, near_2):
-        plant_1.send(b"\x10" + bytes(6))
-        controller_1.send(b"\x10\0\0")
-        plant_1.beat(Heartbeat(PlantState.DRIVEN, 0, MARK))
-        controller_1.beat(Heartbeat(PlantState.GRANTED, 5, MARK))
-        near_1.settle(plant_1, controller_1)
-        assert plant_2.peer is controller_2.peer is None
-        assert isinf(plant_2.silent_s())
-        assert isinf(controller_2.silent_s())
-        near_2.settle(plant_2, controller_2)
-        assert plant_2.take() is controller_2.take() is None
-        assert plant_1.take() is not None
-        assert controller_1.take() is not None
-        assert plant_2.refused == controller_2.refused == 0
-
-
 def test_the_newest_frame_wins_and_is_given_once() -> None:
     with both_ends(virtual()) as (plant, controller, stranger):
         before = time.monotonic_ns()
@@ -137,29 +118,21 @@ def test_a_frame_notifies_a_shared_condition() -> None:
         link.close()
 
 
-@pytest.mark.parametrize(
-    ("wire", "fd", "data"),
-    [
-        pytest.param(PAPER, False, bytes(6), id="short"),
-        pytest.param(PAPER, False, bytes(8), id="long"),
-        pytest.param(PAPER, False, b"", id="empty"),
-        pytest.param(PAPER, True, bytes(12), id="long-on-an-FD-bus"),
-        pytest.param(wire_of(11, 11, 6), True, bytes(8), id="FD-short"),
-        pytest.param(wire_of(16, 16, 6), True, bytes(12), id="FD-short-by-a-byte"),
-        pytest.param(wire_of(10, 10, 6), True, bytes(9) + b"\1\0\0", id="FD-first-byte-of-the-pad"),
-        pytest.param(wire_of(11, 11, 6), True, bytes(11) + b"\1", id="FD-last-byte-of-the-pad"),
-        pytest.param(wire_of(16, 16, 6), True, bytes(13) + b"\0\x80\0", id="FD-middle-of-the-pad"),
-        pytest.param(wire_of(None, None, 6), True, bytes(63) + b"\xff", id="FD-64"),
-    ],
-)
+@pytest.mark.parametrize(("wire", "fd", "measurement", "command"), LENGTHS)
 def test_a_frame_of_a_wrong_length_or_with_a_pad_that_is_not_zero_is_refused_and_counted(
-    wire: WireSpec, fd: bool, data: bytes
+    wire: WireSpec, fd: bool, measurement: tuple[int, int], command: tuple[int, int]
 ) -> None:
+    del command
+    size, length = measurement
+    wrong = [bytes(n) for n in (*range(9), 12, 16, 20, 32, 48, 64) if n < size or (n > size and length <= 8 >= n)]
+    wrong += [bytes(12)] if fd and length <= 8 else []
+    wrong += [bytes(place) + b"\x80" + bytes(length - place - 1) for place in range(size, length)]
     with both_ends(virtual(fd=fd), wire) as (_, controller, stranger):
-        stranger.say(MEASUREMENT_ID + 1, data)
+        for data in wrong:
+            stranger.say(MEASUREMENT_ID + 1, data)
         stranger.settle(controller)
         assert controller.take() is None
-        assert controller.refused == 1
+        assert controller.refused == len(wrong) > 0
 
 
 def test_a_refused_frame_neither_replaces_one_that_waits_nor_breaks_the_silence() -> None:
