@@ -62,7 +62,7 @@ def test_a_frame_crosses_byte_for_byte_and_is_padded_with_zeros(
 
 
 @pytest.mark.parametrize("node", [1, 42, 127])
-def test_ids_are_those_of_the_specification(node: int) -> None:
+def test_frames_and_heartbeats_are_sent_and_received_by_the_ids_of_the_specification(node: int) -> None:
     with both_ends(virtual(node=node)) as (plant, controller, stranger):
         plant.send(bytes(7))
         plant.beat(Heartbeat(PlantState.IDLE, 0, MARK))
@@ -74,6 +74,9 @@ def test_ids_are_those_of_the_specification(node: int) -> None:
             0x200 + node,
             0x380 + node,
         ]
+        for link in (plant, controller):
+            assert link.wait(PATIENCE_S) is not None
+            assert next_heartbeat(link)[:3] == (PlantState.IDLE, 0, MARK)
 
 
 @pytest.mark.parametrize("node", [0, 128])
