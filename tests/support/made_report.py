@@ -23,6 +23,8 @@ from aeroloop.service.review.report import (
 )
 
 BINS = [(2 ** (i / 16), count) for i, count in ((148, 90), (149, 400), (150, 300), (151, 60), (180, 3), (200, 1))]
+HELD = Check(text="z_track ≤ 0.005 s", holds=True, found="0.00458 s")
+HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""
 MARKS = (
     Mark(time_s=None, kind="started", role="controller", text="controller aero-1 on host h"),
     Mark(time_s=3.0, kind="changed", role="controller", text="gains: C2 = 0.2 0.2 0.2"),

@@ -11,7 +11,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.daemon.certificate_gate import UncertifiedError, gains_of
 from aeroloop.service.settings import ControllerSettings
-from tests.service.daemon.test_operator_changes import LAW, Loop
+from tests.support.operated_loop import LAW, Loop
 
 WIRE = WireSpec()
 FAILING = Gains(C1=(3.0, 3.0, 3.0))
