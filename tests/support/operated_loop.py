@@ -123,7 +123,7 @@ class Loop:
         k: The next tick.
         session: Name of the session, or "".
         log: Of each session, its frames: (tick, measurement, command).
-        assurance: What the theorem promises of it by a wire; OperatorChanges asks for it if a wire is given.
+        gate: Its certificates; OperatorChanges needs them if a certified configuration is given.
     """
 
     def __init__(
@@ -132,17 +132,17 @@ class Loop:
         settings: ControllerSettings = CONFIGURED,
         *,
         rolls: bool = False,
-        wire: WireSpec | None = None,
+        certified: Settings | None = None,
     ) -> None:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(role, "join", lambda _: self.network)
             self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
-        self.assurance = CertificateGate(self.role, wire or WIRE, LAW, reference, settings)
+        self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), reference)
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
         self.live = OperatorChanges(
-            self.role, LAW, reference, settings, self.trace, self.assurance if wire else None, rolls=rolls
+            self.role, LAW, reference, settings, self.trace, self.gate if certified else None, rolls=rolls
         )
         self.live.serve()
         self.controller = self.fresh()

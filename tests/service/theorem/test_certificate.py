@@ -24,6 +24,7 @@ from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError, extremes
 from aeroloop.service.theorem.lemma import Samples, coordinates, lemma_inequalities, rotation
 from tests.support import numpy_twin as twin
+from tests.support.certified import FREE, bits, certified_settings
 
 PAPER = Settings()
 EXAMPLES = Path(__file__).parents[3] / "service" / "examples"
@@ -33,23 +34,10 @@ KEYS = [
     "pointwise_deg", "plant_radius", "plant_deg", "assumptions", "violated", "terms", "remedies",
 ]  # fmt: skip
 SMALL = ["law.damping_bound=0.0119"]
-FREE = [
-    "plant.kind=rigid_body", "plant.ideal=true", "wire.actuators=3", "plant.rigid_body.damping=[0, 0.006, 0.006]",
-    "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "law.centre_of_mass=[0, 0, 0]", *SMALL,
-]  # fmt: skip
-"""A free body with the paper's inertia, gains and reference, three motors and nothing beyond the equations."""
-
-
-def bits(out: int | None, inp: int | None) -> list[str]:
-    return [f"wire.{name}.bits={n or 'cont'}" for name, n in (("attitude", out), ("rate", out), ("voltage", inp))]
 
 
 def with_bits(out: int | None, inp: int | None) -> Settings:
     return load_over(PAPER, bits(out, inp))
-
-
-def free(out: int | None, inp: int | None, *changes: str) -> Settings:
-    return load_over(PAPER, [*FREE, *bits(out, inp), *changes])
 
 
 def test_the_paper_s_experiment_agrees_with_its_formulas_worked_by_hand() -> None:
@@ -181,7 +169,7 @@ def test_the_bound_at_every_instant_for_the_paper_s_body(out: int, inp: int, mos
 
 
 def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
-    for settings in (with_bits(3, 3), load_over(PAPER, ["plant.ideal=true", *bits(3, 3)]), free(3, 3)):
+    for settings in (with_bits(3, 3), load_over(PAPER, ["plant.ideal=true", *bits(3, 3)]), certified_settings(3, 3)):
         found = certify(settings)
         assert not found.holds
         assert any("saturation" in reason or "range" in reason for reason in found.violated)
@@ -203,12 +191,12 @@ def test_three_bits_do_not_hold_and_the_reason_is_saturation() -> None:
 )
 def test_everything_that_the_proof_presumes_is_required(change: str, names: str) -> None:
     """Each of them alone keeps a certificate from holding that holds without."""
-    assert certify(free(12, 12)).holds
+    assert certify(certified_settings(12, 12)).holds
     changes = [change]
     if change == "plant.ideal=false":
         changes += ["plant.sensors.attitude=perfect", "plant.sensors.rate=perfect", "plant.friction.viscous=[]",
                     "plant.friction.coulomb=[]"]  # fmt: skip  # the rotors' lag remains
-    found = certify(free(12, 12, *changes))
+    found = certify(certified_settings(12, 12, *changes))
     assert not found.holds
     assert any(names in reason for reason in found.violated), found.violated
 
@@ -303,13 +291,14 @@ def test_a_stream_is_not_certified_and_the_reason_is_reported(capfd: pytest.Capt
 @pytest.mark.parametrize(
     ("settings", "to_blame"),
     [
-        (free(6, 6), "saturation"),
-        (free(12, 12, "law.C1=[8, 8, 8]"), "saturation"),
-        (free(12, 12, "wire.rate.limit=0.3"), "wire.rate.limit"),
-        (free(12, 12, "law.damping_bound=0.05"), "pointwise"),
-        (free(8, 8, "law.damping_bound=0.05"), "pointwise"),
+        (certified_settings(6, 6), "pointwise"),
+        (certified_settings(12, 12, "law.C2=[0.03, 0.03, 0.03]"), "pointwise"),
+        (certified_settings(12, 12, "wire.voltage.limit=3"), "saturation"),
+        (certified_settings(12, 12, "wire.rate.limit=0.3"), "wire.rate.limit"),
+        (certified_settings(12, 12, "law.damping_bound=0.05"), "pointwise"),
+        (certified_settings(8, 8, "law.damping_bound=0.05"), "pointwise"),
     ],
-    ids=["coarse", "large C1", "narrow rate", "unknown damping", "both"],
+    ids=["coarse", "small C2", "weak motors", "narrow rate", "unknown damping", "both"],
 )
 def test_one_that_fails_names_what_is_to_blame_and_each_remedy_cures_it(settings: Settings, to_blame: str) -> None:
     found = certify(settings)
@@ -323,7 +312,7 @@ def test_one_that_fails_names_what_is_to_blame_and_each_remedy_cures_it(settings
 
 
 def test_a_remedy_by_bits_is_the_fewest_that_do() -> None:
-    settings = free(5, 5)
+    settings = certified_settings(5, 5)
     bits_alone = [r.overrides for r in certify(settings).remedies if r.overrides and r.overrides[0].startswith("wire.")]
     assert bits_alone
     for overrides in bits_alone:
