@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.config import Settings
+    from aeroloop.service.vehicle_address import VehicleAddress
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -111,6 +112,14 @@ def report(message: str) -> None:
 def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
     """The effective configuration, with more overrides; a configuration error ends the command."""
     return reloadable(config, overrides, *more)[0]
+
+
+def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleAddress:
+    """Vehicle and network of the effective configuration; a configuration error ends the command."""
+    from aeroloop.service.vehicle_address import load_vehicle_address
+
+    with _configured():
+        return load_vehicle_address(config, overrides or ())
 
 
 def reloadable(
