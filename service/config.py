@@ -161,8 +161,7 @@ def from_description(config: dict[str, Any]) -> Settings:
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     """A configuration with some values replaced. Raises ConfigError as `load` does."""
     tree = settings.description()
-    for override in overrides:
-        merge(tree, tree_of([override]))
+    merge(tree, tree_of(overrides))
     return from_description(tree)
 
 
@@ -172,14 +171,10 @@ def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> 
     Raises:
         ConfigError: Not a number of bits, and not "cont".
     """
-    wire = settings.wire.model_dump()
+    overrides: list[str] = []
     for bits, signals, option in ((bits_out, ("attitude", "rate"), "--bits-out"), (bits_in, ("voltage",), "--bits-in")):
         if bits is not None:
             if bits != "cont" and not (bits.isdecimal() and MIN_BITS <= int(bits) <= MAX_BITS):
                 raise ConfigError(f"{option} takes {MIN_BITS} to {MAX_BITS} bits or cont, not {bits!r}")
-            for signal in signals:
-                wire[signal]["bits"] = bits if bits == "cont" else int(bits)
-    try:
-        return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
-    except ValidationError as error:  # some kinds of quantizer allow other numbers of bits
-        raise ConfigError("; ".join(f"wire.{problem}" for problem in problems(error, WireSpec))) from None
+            overrides += [f"wire.{signal}.bits={bits}" for signal in signals]
+    return load_over(settings, overrides)
