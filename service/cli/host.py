@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, guarded, settings_of, show
+from aeroloop.service.cli.common import Config, Json, NewLog, Overrides, guarded, settings_of, show
 
 group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
 
@@ -29,7 +29,7 @@ def doctor(json: Json = False, config: Config = None, overrides: Overrides = Non
 @group.command()
 def soak(
     minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="Length of the soak, in minutes.")] = 20.0,
-    log: Annotated[Path | None, typer.Option("--log", help="New log, or its folder.", show_default=False)] = None,
+    log: NewLog = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,

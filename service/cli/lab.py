@@ -15,6 +15,7 @@ from aeroloop.service.cli.common import (
     Duration,
     Force,
     Json,
+    Markdown,
     Overrides,
     checked,
     guarded,
@@ -48,7 +49,7 @@ def experiment(
 @group.command()
 def tables(
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    markdown: Markdown = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -149,7 +150,7 @@ def burden(
         Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
     ] = None,
     force: Force = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    markdown: Markdown = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,

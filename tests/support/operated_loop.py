@@ -21,6 +21,7 @@ from aeroloop.protocol.runtime import role, throttle
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.network import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.daemon import operator_changes

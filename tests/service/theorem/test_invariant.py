@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import asin, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.service.config import Settings, load_over
 from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.law import Law, LawSettings, build_law
 from aeroloop.service.control.reference import Floats, Plan
 from aeroloop.service.theorem.certificate import evaluate, premises
@@ -79,7 +79,7 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
         eps_Q = (
             q[1:] + settings.wire.attitude.quantizer().bound * np.sign(rng.standard_normal(3)) * rng.random(3) ** 0.1
         )
-        q_Q = np.append(np.sign(q[0]) * sqrt(max(0.0, 1 - eps_Q @ eps_Q)), eps_Q)
+        q_Q = np.append(np.sign(q[0]) * sqrt(max(0.0, 1.0 - float(eps_Q @ eps_Q))), eps_Q)
         omega_Q = omega + settings.wire.rate.quantizer().bound * rng.uniform(-1, 1, 3)
         u, theta_hat_dot = (
             np.array(part).ravel()
@@ -154,9 +154,9 @@ def test_the_gains_are_the_largest_answers_to_bounded_inputs() -> None:
         {"k_omega_d_dot": 0.2},
     ],
 )
-def test_the_set_grows_with_everything_that_disturbs(worse: dict[str, float]) -> None:
+def test_the_set_grows_with_everything_that_disturbs(worse: dict[str, Any]) -> None:
     p = of(load_over(PAPER, [f"wire.{name}.bits=10" for name in ("attitude", "rate", "voltage")]))
-    before, after = reach(p), reach(replace(p, **worse))  # type: ignore[arg-type]  # floats all
+    before, after = reach(p), reach(replace(p, **worse))
     assert before is not None
     assert after is None or after.radius > before.radius
     assert largest_start(replace(p, **worse)) < largest_start(p)
