@@ -16,14 +16,7 @@ _KEPT: Final[tuple[str, ...]] = ("description", "minimum", "exclusiveMinimum")
 
 
 class Shape(NamedTuple):
-    """Schema and encoding of a topic's messages.
-
-    Attributes:
-        name: Such as `foxglove.PoseInFrame` or `aeroloop.Tracking`.
-        encoding: Of the schema: `protobuf` or `jsonschema`.
-        schema: The schema itself.
-        message_encoding: `protobuf` or `json`.
-    """
+    """Schema of a topic's messages, by name and encoding (`protobuf` or `jsonschema`), and the messages' encoding."""
 
     name: str
     encoding: str
@@ -32,14 +25,7 @@ class Shape(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """A message to show.
-
-    Attributes:
-        topic: Such as `/aero/pose`.
-        shape: Its schema; the same for every message of a topic.
-        data: The message itself.
-        at_ns: When its source was published, ns since 1970.
-    """
+    """A message to show on a topic, with the topic's schema and when its source was published [ns since 1970]."""
 
     topic: str
     shape: Shape
