@@ -33,12 +33,7 @@ class TruthColumns(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Some ticks of one session, in order.
-
-    Attributes:
-        ticks: The ticks.
-        truth: The latest truth at each tick; NaN before the first.
-    """
+    """Some ticks of one session, in order, with the latest truth at each; NaN before the first."""
 
     vehicle: str
     session: str
@@ -47,14 +42,7 @@ class Rows(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column.
-
-    Attributes:
-        name: With its unit at the end, if it has one.
-        unit: `1` for a number without one, empty for what is not a quantity.
-        description: What it is, in a sentence.
-        kind: Type of its values.
-    """
+    """A column. Its name ends in its unit; the unit is `1` for a number without, empty for what is no quantity."""
 
     name: str
     unit: str
@@ -63,11 +51,7 @@ class Column(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Columns that are computed together.
-
-    Attributes:
-        of: Their values in some rows; NaN where there is none, except for integers and text. Shape (n, columns).
-    """
+    """Columns that are computed together by `of`; NaN where there is no value of a double. Shape (n, columns)."""
 
     columns: Sequence[Column]
     of: Callable[[Rows], Array]
@@ -153,8 +137,7 @@ def euler_deg(q: Array) -> Array:
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    degrees: Array = np.degrees(np.stack((roll, pitch, yaw), axis=1))
-    return degrees
+    return np.asarray(np.degrees(np.column_stack((roll, pitch, yaw))))
 
 
 def _group(
@@ -187,5 +170,4 @@ def _outermost(values: Array, level: float) -> Array:
 
 def _angle_deg(rows: Rows) -> Array:
     lengths = np.sqrt(np.sum(np.square(rows.ticks.attitude_error), axis=1))
-    degrees: Array = np.degrees(2 * np.arcsin(np.minimum(1.0, lengths)))
-    return degrees
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(1.0, lengths))))

@@ -16,8 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from aeroloop.service.logs.files import ReviewError
-
 Columns = Literal[1, 2]
 
 WIDTH_IN: Final[dict[Columns, float]] = {1: 3.5, 2: 7.16}
@@ -83,14 +81,10 @@ def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Save a figure in every format, and return the paths. Raises ReviewError if it cannot be written."""
+    """Save a figure in every format, and return the paths. Raises OSError if it cannot be written."""
     paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # laid out once, not for each format
-        for path, options in zip(paths, FORMATS.values(), strict=True):
-            figure.savefig(path, **options)
-    except OSError as error:
-        raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # laid out once, not for each format
+    for path, options in zip(paths, FORMATS.values(), strict=True):
+        figure.savefig(path, **options)
     return paths

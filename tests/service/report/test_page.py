@@ -20,10 +20,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.cli.compare import write_html
+from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.report.page.data import packed, page_data
 from aeroloop.service.report.page.markup import tag
-from aeroloop.service.report.page.page import page, write_page
+from aeroloop.service.report.page.page import page
 from aeroloop.service.report.rows import figure_rows, micros, percent
 from aeroloop.service.review.report import Band, Check, Line, Mark, Panel, Report
 from tests.support.made_report import MARKS, made_report, made_theorem
@@ -250,8 +251,8 @@ def test_a_run_without_values_has_a_page() -> None:
 
 
 def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ReviewError, match=r"cannot write .*: No such file or directory"):
-        write_page([made_report()], tmp_path / "none" / "page.html")
+    with pytest.raises(OutputError, match=r"cannot write .*: No such file or directory"):
+        write_html([made_report()], tmp_path / "none" / "page.html", [], force=False)
 
 
 def test_numbers_have_sensible_digits() -> None:
@@ -296,7 +297,7 @@ def open_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
     def open_page(*reports: Report) -> Page:
         out = folder / f"{next(numbers)}.html"
-        write_page(reports, out)
+        out.write_text(page(reports), encoding="utf-8")
         context = browser.new_context(
             viewport={"width": 1280, "height": 900}, color_scheme="light", reduced_motion="reduce"
         )
