@@ -6,8 +6,7 @@ The same bytes come out for the same figure: files have no date, and SVG ids no 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -61,11 +60,9 @@ _STYLE: Final[dict[str, Any]] = {
 }
 
 
-@contextmanager
-def figure_style() -> Iterator[None]:
+def figure_style() -> AbstractContextManager[None]:
     """Every figure that is drawn and saved within has the style."""
-    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]  # its keys are literals in the stubs
-        yield
+    return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]  # its keys are literals in the stubs
 
 
 def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure, list[Axes]]:

@@ -8,9 +8,12 @@ and a field that cannot be described is left out of the schema, not of the messa
 from __future__ import annotations
 
 import json
-from typing import Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pydantic import BaseModel
+
+if TYPE_CHECKING:  # recorder and reader of logs do without
+    import foxglove
 
 _KEPT: Final[tuple[str, ...]] = ("description", "minimum", "exclusiveMinimum")
 
@@ -33,15 +36,7 @@ class Decoded(NamedTuple):
     at_ns: int
 
 
-class Described(Protocol):
-    """A schema of foxglove-sdk."""
-
-    name: str
-    encoding: str
-    data: bytes
-
-
-def protobuf_shape(schema: Described) -> Shape:
+def protobuf_shape(schema: foxglove.Schema) -> Shape:
     """The shape of one of Foxglove's own messages, from its `get_schema()`."""
     return Shape(schema.name, schema.encoding, schema.data, "protobuf")
 
