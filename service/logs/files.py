@@ -135,8 +135,10 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     """Files, and those in folders without what `log export --to mcap` wrote there."""
     files: list[Path] = []
     for path in paths:
-        in_folder = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-decoded"))
-        if path.is_dir() and not in_folder:
+        found = [path]
+        if path.is_dir():
+            found = sorted(log for log in path.glob("*.mcap") if not log.stem.endswith("-decoded"))
+        if not found:
             raise ReviewError(f"there is no .mcap file in {path}")
-        files += in_folder or [path]
+        files += found
     return files

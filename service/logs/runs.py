@@ -254,7 +254,7 @@ class _Segment:
         """All rows; empty if there are none."""
         if self._batches:
             known = [self._rows] if self._rows else []
-            parts = [*known, _rows(self._batches)]
+            parts = [*known, _joined(self._batches)]
             self._rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
             self._batches.clear()
         return self._rows
@@ -328,13 +328,15 @@ class TraceJoin:
         if n or p:
             controller = {name: column[:n] for name, column in segment.rows.items()}
             changes, self._changes = self._changes, []
-            yield Block(self._which, *_joined(controller, plant, p), changes, segment.state)
+            yield _block(self._which, controller, plant, p, changes, segment.state)
             segment.drop(n)
             self._plant.drop(p)
 
 
-def _joined(controller: Rows, plant: Rows, p: int) -> tuple[Integers, Rows, Rows, Integers, Integers, Integers]:
-    """The fields k to `acted` of the block of these rows of the controller and the first p rows of the plant."""
+def _block(
+    which: SessionKey, controller: Rows, plant: Rows, p: int, changes: list[Change], state: dict[str, Any] | None
+) -> Block:
+    """The block of these rows of the controller and the first p rows of the plant."""
     ticks = computed = measured = acting = answers = np.empty(0, dtype=np.int64)
     if controller:
         received_as = controller["received_as"]
@@ -347,7 +349,7 @@ def _joined(controller: Rows, plant: Rows, p: int) -> tuple[Integers, Rows, Rows
         acting = acting[first]
     k = np.union1d(ticks, measured)
     at_controller, at_plant = _places(ticks, computed, k), _places(measured, np.arange(len(measured)), k)
-    return k, controller, plant, at_controller, at_plant, _places(answers, acting, k)
+    return Block(which, k, controller, plant, at_controller, at_plant, _places(answers, acting, k), changes, state)
 
 
 def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
@@ -358,7 +360,7 @@ def _places(ticks: Integers, places: Integers, k: Integers) -> Integers:
     return np.where(ticks[at] == k, places[at], -1)
 
 
-def _rows(batches: Sequence[tuple[Header, bytes]]) -> Rows:
+def _joined(batches: Sequence[tuple[Header, bytes]]) -> Rows:
     """Rows of one end's batches, concatenated."""
     rows = join_columns(batches)
     headers = [header for header, _ in batches]

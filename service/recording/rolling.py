@@ -168,22 +168,23 @@ class RollingLog:
     def _retry(self) -> None:
         """Write what is pending into the same file or, unless the disk is only full, into a new one."""
         try:
-            try:
-                replace = self._file.replaced
-                if not replace:
-                    self._file.commit()
-            except OSError as error:
-                if error.errno in FULL:
-                    raise
-                replace = True
-            if replace:
-                self._replace_file()
+            self._commit_or_replace()
         except OSError as error:
             self._refused(error)
             return
         self._unwritten.clear()
         self.trouble = ""
         self._report(f"recording again to {self.path}", False)
+
+    def _commit_or_replace(self) -> None:
+        try:
+            if not self._file.replaced:
+                self._file.commit()
+                return
+        except OSError as error:
+            if error.errno in FULL:
+                raise
+        self._replace_file()
 
     def _replace_file(self) -> None:
         """Begin a new file with what the last one has not written."""

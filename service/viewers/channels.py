@@ -44,9 +44,8 @@ _STATUS: Final = json_shape("aeroloop.RoleStatus", views.RoleStatus)
 _ATTITUDE: Final = json_shape("aeroloop.Attitude", views.Attitude)
 _HERE: Final = Vector3()
 
-_LEVELS: Final = dict.fromkeys(("tripped", "fault"), LogLevel.Error) | dict.fromkeys(
-    ("lost", "refused"), LogLevel.Warning
-)
+_ERROR, _WARNING = LogLevel.Error, LogLevel.Warning
+_LEVELS: Final = {"tripped": _ERROR, "fault": _ERROR, "lost": _WARNING, "refused": _WARNING}
 """Log level by kind of event; Info for all others."""
 
 SHAPES: Final = {
