@@ -62,8 +62,8 @@ class EventLog:
     Args:
         which: The session.
         period: Time between its ticks [s].
-        reached: As of `Run`, and `open_sessions` too.
-        open_sessions: See `reached`.
+        reached: As of `Run`.
+        open_sessions: As of `Run`.
         alone: Leave out the trips of other sessions.
 
     Attributes:
