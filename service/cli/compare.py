@@ -64,8 +64,8 @@ def check_page(out: Path, logs: Sequence[Path], force: bool) -> None:
 def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
     """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
     from aeroloop.service.logs.outputs import writing
-    from aeroloop.service.report.page.page import write_page
+    from aeroloop.service.report.page.page import page
 
     with writing(out, logs, force=force) as part:
-        write_page(reports, part)
+        part.write_text(page(reports), encoding="utf-8")
     typer.echo(f"aeroloop: wrote {out}", err=True)

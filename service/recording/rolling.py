@@ -57,18 +57,10 @@ def log_path(place: Path, named: str) -> Path:
 
 
 class RollingLog:
-    """A log in files.
+    """A log in files. Raises RecorderError if the first cannot be created.
 
-    Args:
-        settings: Where, and the limits of files.
-        report: Called with one line on the state of the disk, and whether it is a fault.
-
-    Attributes:
-        written: Messages added so far.
-        trouble: Why nothing can be written now; empty if it can.
-
-    Raises:
-        RecorderError: The first file cannot be created.
+    `report` is called with one line on the state of the disk, and whether it is a fault. `written` counts messages,
+    `trouble` is why nothing can be written now; empty if it can.
     """
 
     def __init__(self, settings: RecorderSettings, report: Callable[[str, bool], None]) -> None:
@@ -145,10 +137,7 @@ class RollingLog:
             self._retry()
 
     def close(self, waiting: int = 0) -> None:
-        """Write the rest and the index, and close the file.
-
-        Args:
-            waiting: Messages not added because the disk refused.
+        """Write the rest and the index, and close the file; `waiting` messages were not added: the disk refused.
 
         Raises:
             RecorderError: Not all could be written; all written before is whole.
@@ -189,10 +178,7 @@ class RollingLog:
     def _retry(self) -> None:
         """Write what is pending into the same file or, unless the disk is only full, into a new one."""
         try:
-            if self._file.replaced:
-                self._replace_file()
-            else:
-                self._commit_or_replace()
+            self._commit_or_replace()
         except OSError as error:
             self._refused(error)
             return
@@ -202,11 +188,13 @@ class RollingLog:
 
     def _commit_or_replace(self) -> None:
         try:
-            self._file.commit()
+            if not self._file.replaced:
+                self._file.commit()
+                return
         except OSError as error:
             if error.errno in FULL:
                 raise
-            self._replace_file()
+        self._replace_file()
 
     def _replace_file(self) -> None:
         """Begin a new file with what the last one has not written."""
@@ -263,12 +251,8 @@ class RollingLog:
         file = LogFile(path)
         try:
             started = datetime.now(UTC)
-            run = {
-                "run": self._base.stem,
-                "id": self._id,
-                "part": path.stem,
-                "started": started.isoformat(timespec="seconds"),
-            }
+            run = {"run": self._base.stem, "id": self._id, "part": path.stem}
+            run["started"] = started.isoformat(timespec="seconds")
             file.add_metadata(RECORDER_METADATA, {"json": json.dumps(run)})
             file.attach_specification(round(started.timestamp() * 1e9))
             for key, description in self._descriptions.items():

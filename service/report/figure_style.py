@@ -6,8 +6,7 @@ The same bytes come out for the same figure: files have no date, and SVG ids no 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -15,8 +14,6 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-
-from aeroloop.service.logs.files import ReviewError
 
 Columns = Literal[1, 2]
 
@@ -63,11 +60,9 @@ _STYLE: Final[dict[str, Any]] = {
 }
 
 
-@contextmanager
-def figure_style() -> Iterator[None]:
+def figure_style() -> AbstractContextManager[None]:
     """Every figure that is drawn and saved within has the style."""
-    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]  # its keys are literals in the stubs
-        yield
+    return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]  # its keys are literals in the stubs
 
 
 def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure, list[Axes]]:
@@ -83,14 +78,10 @@ def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Save a figure in every format, and return the paths. Raises ReviewError if it cannot be written."""
+    """Save a figure in every format, and return the paths. Raises OSError if it cannot be written."""
     paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # laid out once, not for each format
-        for path, options in zip(paths, FORMATS.values(), strict=True):
-            figure.savefig(path, **options)
-    except OSError as error:
-        raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # laid out once, not for each format
+    for path, options in zip(paths, FORMATS.values(), strict=True):
+        figure.savefig(path, **options)
     return paths

@@ -211,12 +211,9 @@ class Panel:
 
 @dataclass(frozen=True)
 class Band:
-    """A span of time that is shaded on every drawing over time, with a label: such as an injected fault.
+    """A span of the law's clock [s] that is shaded on every drawing over time, with a label: such as a fault.
 
-    Attributes:
-        start_s: On the law's clock [s].
-        end_s: None if it did not end within the session.
-        label: In a few words.
+    `end_s` is None if it did not end within the session.
     """
 
     start_s: float
@@ -264,22 +261,16 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 ADDRESSES: Final = (
-    "network.",
-    "recorder.path",
-    "recorder.directory",
-    "can.channel",
-    "can.node",
-    "can.options.",
+    "network.", "recorder.path", "recorder.directory", "can.channel", "can.node", "can.options.",
     "plant.quanser.card_identifier",
-)
+)  # fmt: skip
 """Keys that only say where something is."""
 
 
 def differences(reports: Sequence[Report]) -> list[tuple[str, list[Any]]]:
-    """What differs in the configurations of several runs, but addresses and paths.
+    """Dotted keys that differ in the configurations of several runs, but addresses and paths; and each run's value.
 
-    Returns:
-        Dotted keys, and each run's value (None if it has none).
+    A run that has none has None.
     """
     tables = [flat(report.settings) for report in reports]
     keys = sorted(key for key in set().union(*tables) if not key.startswith(ADDRESSES))

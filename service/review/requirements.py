@@ -17,9 +17,8 @@ UNITS: Final[dict[str, str]] = {
     "u_total": "V²·s",
     "max_error_deg": "°",
     "final_error_deg": "°",
-    **dict.fromkeys(
-        ("skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks", "invalid", "damages"), ""
-    ),
+    **dict.fromkeys(["skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks"], ""),
+    **dict.fromkeys(["invalid", "damages"], ""),
     **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
     **{f"timing.{spread}.{name}": "µs" for spread in _SPREADS for name in _PERCENTILES},
     **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},

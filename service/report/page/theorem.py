@@ -12,14 +12,9 @@ from aeroloop.service.report.rows import THEOREM, figure_rows, percent
 from aeroloop.service.review.report import Report, TheoremFindings
 
 COLUMNS: Sequence[Column] = (
-    ("Equation", False),
-    ("Left-hand side", False),
-    ("Samples", True),
-    ("Broken", True),
-    ("First at [s]", True),
-    ("Closest to its bound [%]", True),
-    ("At [s]", True),
-)
+    ("Equation", False), ("Left-hand side", False), ("Samples", True), ("Broken", True), ("First at [s]", True),
+    ("Closest to its bound [%]", True), ("At [s]", True),
+)  # fmt: skip
 
 UNMET: Final = {
     "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",

@@ -14,10 +14,11 @@ from zlib import decompress
 import numpy as np
 import pytest
 
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.cli.compare import write_html
+from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.report.page.data import packed, page_data
 from aeroloop.service.report.page.markup import tag
-from aeroloop.service.report.page.page import page, write_page
+from aeroloop.service.report.page.page import page
 from aeroloop.service.report.rows import figure_rows, micros, percent
 from aeroloop.service.review.report import Check, Line, Panel, Report
 from tests.support.made_report import HELD, HOSTILE, made_report, made_theorem
@@ -223,8 +224,8 @@ def test_a_run_without_values_has_a_page() -> None:
 
 
 def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ReviewError, match=r"cannot write .*: No such file or directory"):
-        write_page([made_report()], tmp_path / "none" / "page.html")
+    with pytest.raises(OutputError, match=r"cannot write .*: No such file or directory"):
+        write_html([made_report()], tmp_path / "none" / "page.html", [], force=False)
 
 
 def test_numbers_have_sensible_digits() -> None:

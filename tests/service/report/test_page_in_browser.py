@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
-from aeroloop.service.report.page.page import write_page
+from aeroloop.service.report.page.page import page
 from aeroloop.service.review.report import Band, Check, Line, Mark, Panel, Report
 from tests.support.made_report import HELD, HOSTILE, MARKS, made_report
 
@@ -47,7 +47,7 @@ def open_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
     def open_page(*reports: Report) -> Page:
         out = folder / f"{next(numbers)}.html"
-        write_page(reports, out)
+        out.write_text(page(reports), encoding="utf-8")
         context = browser.new_context(
             viewport={"width": 1280, "height": 900}, color_scheme="light", reduced_motion="reduce"
         )

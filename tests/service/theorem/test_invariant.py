@@ -205,7 +205,8 @@ def _direction(rng: np.random.Generator) -> Floats:
 
 
 def _in_ball(rng: np.random.Generator, radius: float) -> Floats:
-    return _direction(rng) * radius * rng.random() ** 0.1
+    inside: Floats = _direction(rng) * radius * rng.random() ** 0.1
+    return inside
 
 
 def _skew(v: Floats) -> Floats:
