@@ -137,7 +137,8 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """A grid of three cells, 4 s each, by the command: what it prints as JSON, and the figure that it draws."""
     figure = tmp_path_factory.mktemp("burden") / "burden.png"
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(printed), pytest.MonkeyPatch.context() as patched:
+        patched.setattr("aeroloop.service.lab.burden.Workers", InThisProcess)
         arguments = ["--bits", "8/6", "--bits", "2/2", "--quantizer", "uniform", "--sensors", "encoders"]
         assert execute(["lab", "burden", *arguments, "--duration", "4", "--figure", str(figure), "--json"]) == 0
     return printed.getvalue(), figure
