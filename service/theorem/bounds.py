@@ -18,7 +18,8 @@ Where the paper's text cannot be evaluated as printed, it is read as follows:
 - c₀ of (C.66): GᵀC₁G has rank 3 and the least eigenvalue 0. The proof needs z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃, which is at least
   λ_min(C₁) (1 + |η̃|)/2 ‖z₁‖².
 - (C.71) has δ_R λ_max(J) k_ωd where the proof has k_ω̇d; the proof is right.
-- Remark 5 says ‖θ̃‖ ≤ k_θ. The projection keeps θ̂, and Assumption 2 θ, within k_θ: that gives 2 k_θ.
+- Remark 5 says ‖θ̂‖ ≤ k_θ and ‖θ̃‖ ≤ k_θ. Assumption 2 keeps θ within k_θ, and the projection θ̂ within k_θ/0.95, as
+  Remark 5's inequality requires: ‖θ̃‖ ≤ (1 + 1/0.95) k_θ.
 - k of (C.66) is the largest allowed: the margin itself.
 """
 
@@ -27,6 +28,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import asin, cos, pi, sin, sqrt
 from typing import Annotated, NamedTuple
+
+from aeroloop.service.control.law import ESTIMATE_REACH
 
 
 class Term(NamedTuple):
@@ -111,7 +114,7 @@ class Theorem:
     coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
     alpha: Annotated[float, Term("δ_ᾱ2 λ_max(J)", "C.67", "N·m·s/rad", "δ_V1's part of ᾱ^Q")]
     delta_V1: Annotated[float, Term("δ_V1", "C.67", "N·m·s/rad", "loss of the damping c₀/2 by quantization")]
-    k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "2 k_θ: θ and θ̂ are both within k_θ")]
+    k_theta_err: Annotated[float, Term("max ‖θ̃‖", "Remark 5", "N·m·s/rad", "θ is within k_θ, and θ̂ within k_θ/0.95")]
     delta_theta1: Annotated[float, Term("δ_θ1", "C.70, C.76", "W", "part of δ_Q due to θ̃")]
     delta_theta2: Annotated[float, Term("δ_θ2", "C.72, C.76", "N·m", "part of δ_V2 due to θ and θ̃")]
     delta_V2: Annotated[float, Term("δ_V2", "C.71", "N·m", "quantization's effect as a torque")]
@@ -172,7 +175,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
     c0 = min(p.C1_min * least_share, p.C2_min)  # (C.66)
     coriolis, alpha = d.delta_S2 * p.lambda_J * p.k_omega_d, d.delta_alpha2 * p.lambda_J
     delta_V1 = d.delta_Psi2 + coriolis + alpha  # (C.67)
-    k_theta_err = 2 * p.k_theta
+    k_theta_err = (1 + ESTIMATE_REACH) * p.k_theta
     delta_theta1 = k_theta_err * d.delta_z2 * (p.delta_omega + p.k_omega_d)  # (C.70), (C.76)
     delta_theta2 = p.k_theta * p.delta_omega + k_theta_err * d.k_omega_e * d.delta_z2  # (C.72), (C.76)
     delta_V2 = (

@@ -177,7 +177,7 @@ def test_v_falls_as_fast_as_the_theorem_says() -> None:
     x, omega_d_dot = random_samples(wire, b, seed=5)
     rng = np.random.default_rng(5)
     body, voltage = body_of(LAW), wire.voltage.quantizer()
-    theta, estimate, torque = (_within(r, rng) for r in (LAW.damping_bound, LAW.damping_bound, disturbance))
+    theta, estimate, torque = (_within(r, rng) for r in (LAW.damping_bound, LAW.damping_bound / 0.95, disturbance))
     q = np.where((x.q * x.q_Q).sum(axis=1, keepdims=True) < 0, -x.q, x.q)
     c = coordinates(q, x.omega, x.q_d, x.omega_d, x.sign, np.array(LAW.C1))
     V_dot = np.empty(COUNT)
