@@ -42,7 +42,7 @@ def _positive(gains: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 ESTIMATE_REACH: Final = 1 / 0.95
-"""‖θ̂‖ may reach this times k_θ: Remark 5's inequality needs every θ of Assumption 2 within the projection's inner ball."""
+"""‖θ̂‖ may reach this times k_θ: Remark 5's inequality needs every θ of Assumption 2 in the projection's inner ball."""
 
 Diagonal = Annotated[tuple[float, float, float], AfterValidator(_positive)]
 """The diagonal of a positive definite matrix."""
@@ -69,7 +69,11 @@ class LawSettings(BaseModel):
     damping_estimate: tuple[float, float, float] = Field(
         default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
     )
-    damping_bound: float = Field(default=0.05, gt=0, description="k_θ: ‖θ‖ is assumed to be below this, and ‖θ̂‖ is kept below k_θ/0.95 [N·m·s/rad]")
+    damping_bound: float = Field(
+        default=0.05,
+        gt=0,
+        description="k_θ: ‖θ‖ is assumed to be below this, and ‖θ̂‖ is kept below k_θ/0.95 [N·m·s/rad]",
+    )
 
     @model_validator(mode="after")
     def _estimate_within_bound(self) -> LawSettings:

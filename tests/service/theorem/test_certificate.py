@@ -245,7 +245,7 @@ COARSE = ["wire.rate.limit=20", "wire.rate.bits=4"]
         (["law.C1=[2, 2, 2]"], "δ_ᾱ2"),
         (["law.C2=[0.01, 0.02, 0.01]"], "δ_ᾱ2"),
         (["wire.rate.limit=0.3"], "wire.rate.limit"),
-        (["wire.attitude.limit=0.7"], "wire.attitude.limit"),
+        (["wire.attitude.limit=0.5", "wire.attitude.bits=12"], "wire.attitude.limit"),
     ],
     ids=["coarse rate", "large C1", "small C2", "narrow rate", "narrow attitude"],
 )
