@@ -28,7 +28,7 @@ class Baseline(BaseModel):
 def baselines(
     published: Sequence[Sequence[Sequence[float]]], fitted: tuple[int, int], scored: tuple[int, int] | None = None
 ) -> list[Baseline]:
-    """The fitted cell everywhere, a constant, column means, and a sum of rows and columns.
+    """The fitted cell for all others, a constant, column means, and a sum of rows and columns.
 
     Args:
         published: A table for each figure, all of one shape.
@@ -51,7 +51,7 @@ def baselines(
     )
     alone = error([np.full(y.shape, y[fitted]) for y in tables])
     return [
-        Baseline(name="the fitted cell everywhere", parameters=1, cells=1, mare=None, mare_left_out=alone),
+        Baseline(name="fitted cell", parameters=1, cells=1, mare=None, mare_left_out=alone),
         # Every cell has the leverage p/n in these fits: left out, it is missed by 1/(1 − p/n) times as much.
         *(
             Baseline(name=name, parameters=p, cells=n, mare=error(form), mare_left_out=error(form) * n / (n - p))

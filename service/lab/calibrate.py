@@ -13,6 +13,7 @@ computes, with the dead zone beside them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import hypot
 from typing import Final
 
 import numpy as np
@@ -119,8 +120,8 @@ def _identification(
     parameters = [
         Named("Coulomb friction about yaw", "N·m", coulomb, MEASURED_YAW_COULOMB),
         Named("height of the centre of mass", "m", height, -TABLE_C1_HEIGHT),
-        Named("wind torque about pitch", "N·m", wind[0], float(np.hypot(*wind))),
-        Named("wind torque about yaw", "N·m", wind[1], float(np.hypot(*wind))),
+        Named("wind torque about pitch", "N·m", wind[0], hypot(*wind)),
+        Named("wind torque about yaw", "N·m", wind[1], hypot(*wind)),
         Named("dead zone", "V", dead_zone, MEASURED_DEAD_ZONE),
     ]
     cells = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]

@@ -177,7 +177,7 @@ def calibration_table(fit: Calibration) -> None:
     for name, residual in fit.residuals.items():
         Console().print(f"residual {name}: {residual:+.2%}")
     found = fit.identification
-    rows = [["parameter", "value", "± if the others are known", "± with all of them open"]]
+    rows = [["parameter", "value", "± if others known", "± jointly"]]
     for p in found.parameters:
         jointly = f"{p.jointly:.2g} {p.unit}{'' if p.identified else ': not identified'}"
         rows.append([p.name, f"{p.value:.3g} {p.unit}", f"{p.alone:.2g} {p.unit}", jointly])

@@ -11,17 +11,16 @@ import pytest
 
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import Settings, load, load_over
-from aeroloop.service.lab import tables as tables_module
+from aeroloop.service.lab import sensitivity, tables
 from aeroloop.service.lab.cells import Cell, Result
-from aeroloop.service.lab.sensitivity import measure_sensitivity
-from aeroloop.service.lab.tables import predict
 
 BENCH = load()
 
 
 def _result(settings: Settings, cell: Cell) -> Result:
-    """Figures of their own for each configuration and cell."""
-    rng = Random(f"{settings.plant} {settings.loop} {cell}")  # noqa: S311  # no secret
+    """Figures of their own for each configuration and cell, but for the bits of the input of calm cells."""
+    cell = cell if cell.windy else cell._replace(bits_in=None)
+    rng = Random(f"{settings.plant} {settings.loop} {cell}")  # no secret
     return Result(rng.uniform(30, 60), rng.uniform(7000, 9000))
 
 
@@ -42,23 +41,25 @@ class Pool:
 
 @pytest.fixture(autouse=True)
 def _no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables_module, "Pool", Pool)
+    for module in (sensitivity, tables):
+        monkeypatch.setattr(module, "Pool", Pool)
 
 
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_every_row_has_the_errors_that_the_tables_have_with_its_change(seeds: int) -> None:
-    first, *changes = measure_sensitivity(BENCH, seeds).changes
+    first, *changes = sensitivity.measure_sensitivity(BENCH, seeds).changes
     assert first.overrides == []
     for change in (first, *changes):
-        tables = predict(load_over(BENCH, change.overrides), seeds)
-        assert (change.z_track, change.u_total, change.windy) == (tables.C2.mare, tables.C3.mare, tables.C4.mare)
+        each = tables.predict(load_over(BENCH, change.overrides), seeds)
+        errors = change.z_track, change.u_total, change.windy
+        assert errors == pytest.approx((each.C2.mare, each.C3.mare, each.C4.mare), rel=1e-2)  # tables round to 0.01
     # every change does change something, and no two are the same
     assert len({(change.z_track, change.u_total, change.windy) for change in (first, *changes)}) == len(changes) + 1
 
 
 def test_a_change_leaves_all_else_as_configured() -> None:
     bench = load_over(BENCH, ["plant.friction.viscous=[0.001, 0.5]", "plant.aero.centre_of_mass=[0.01, 0.02, 0.03]"])
-    for change in measure_sensitivity(bench).changes:
+    for change in sensitivity.measure_sensitivity(bench).changes:
         plant = load_over(bench, change.overrides).plant
         assert (plant.friction.viscous[0], *plant.aero.centre_of_mass[:2]) == (0.001, 0.01, 0.02)
 
