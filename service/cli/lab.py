@@ -49,6 +49,9 @@ def experiment(
 @group.command()
 def tables(
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Print how the errors change with what was not fitted; takes minutes.")
+    ] = False,
     markdown: Markdown = False,
     json: Json = False,
     config: Config = None,
@@ -57,9 +60,17 @@ def tables(
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
     settings = settings_of(config, overrides)
     from aeroloop.service.lab.tables import markdown as as_markdown
-    from aeroloop.service.lab.tables import predict
-    from aeroloop.service.terminal.display import count_bar, paper_tables
+    from aeroloop.service.lab.tables import markdown_table, predict
+    from aeroloop.service.terminal.display import count_bar, paper_tables, rows_table
 
+    if sensitivity:
+        from aeroloop.service.lab.sensitivity import measure_sensitivity, rows
+
+        with guarded(), count_bar("cells", hidden=json) as update:
+            changes = measure_sensitivity(settings, seeds, update)
+        text = rows(changes)
+        show(changes, json, lambda _: typer.echo(markdown_table(text)) if markdown else rows_table(text))
+        return
     with guarded(), count_bar("cells", hidden=json) as update:
         result = predict(settings, seeds, update)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)

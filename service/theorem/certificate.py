@@ -18,15 +18,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.control.law import ESTIMATE_REACH
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.configured import Configured
 from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
 from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
 from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
 from aeroloop.service.theorem.remedies import Remedy, remedies
-
-PROJECTION: Final = 0.95
-"""The projection keeps ‖θ̂‖ within k_θ divided by this."""
 
 
 class CertificateTerm(BaseModel):
@@ -208,7 +206,7 @@ def premises(
         Gamma=law.Gamma,
         J=law.inertia,
         k_theta=law.damping_bound,
-        k_theta_hat=law.damping_bound / PROJECTION,
+        k_theta_hat=law.damping_bound * ESTIMATE_REACH,
         weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
         weight_roll=abs(law.centre_of_mass[1]) * gravity,
         norm_B=_norm_B(settings),
