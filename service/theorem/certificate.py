@@ -24,7 +24,7 @@ from aeroloop.service.theorem.configured import Configured
 from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
 from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
 from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
-from aeroloop.service.theorem.remedies import Remedy, remedies
+from aeroloop.service.theorem.remedies import Holds, Remedy, remedies
 
 
 class CertificateTerm(BaseModel):
@@ -79,12 +79,12 @@ class Certificate(BaseModel):
         """The certificate in a sentence."""
         if self.violated:
             more = len(self.violated) - 1
-            return f"Does not hold: {self.violated[0]}{f' (and {more} more)' if more else ''}."
+            return f"The certificate does not hold: {self.violated[0]}{f' (and {more} more)' if more else ''}."
         assert self.plant_radius is not None
         assert self.plant_deg is not None
         return (
-            f"Holds: once there, ‖z‖ stays within {self.plant_radius:.4g}, the attitude within {self.plant_deg:.2f}°; "
-            f"in the long run the root of the mean of ‖z‖² is at most {self.rms_radius:.4g}."
+            f"The certificate holds: once there, ‖z‖ stays within {self.plant_radius:.4g}, the attitude within "
+            f"{self.plant_deg:.2f}°; in the long run the root of the mean of ‖z‖² is at most {self.rms_radius:.4g}."
         )
 
     def value(self, symbol: str) -> float | None:
@@ -141,7 +141,11 @@ def certify(
     t = e.theorem
     violated, ways = _violated(settings, e), list[Remedy]()
     if violated:
-        ways = _range_remedies(settings, e) + remedies(settings, lambda tried: not _violated(tried, evaluated(tried)))
+
+        def holds(tried: Configured) -> bool:
+            return not _violated(tried, evaluated(tried))
+
+        ways = [*_range_remedies(settings, e, holds), *remedies(settings, holds)]
     return Certificate(
         holds=not violated,
         margin=t.margin,
@@ -309,7 +313,7 @@ def _unproven(e: Evaluated) -> str:
         ("the held roll (u₁ is never applied)", {"tilt": None}),
         (f"a rate sensor that errs by {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
         (f"a torque of {p.k_tau_d:.2g} N·m", {"k_tau_d": body.k_tau_d}),
-        ("the attitude sensor's error", {"delta_q": body.delta_q}),
+        ("the attitude sensor's error", {"delta_q": body.delta_q} if e.bounds.delta_eps else {}),
         (f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"k_theta": 0.0, "k_theta_hat": 0.0}),
         ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}),
     )
@@ -379,16 +383,18 @@ def _degrees(at: Reach | None) -> float | None:
     return None if at is None else degrees(2 * asin(at.eps_e))
 
 
-def _range_remedies(settings: Configured, e: Evaluated) -> list[Remedy]:
-    """Limits of the wire that hold the set, or the reference where no set is proven."""
-    at = e.plant_reach or without_error(e.plant)
-    wire = settings.wire
-    ways = list[Remedy]()
-    for name, reached, limit in (
-        ("wire.rate", at.axis_rate + e.plant.delta_omega, wire.rate.limit),
-        ("wire.attitude", sin(min(pi / 2, at.half_angle)), wire.attitude.limit),
+def _range_remedies(settings: Configured, e: Evaluated, holds: Holds) -> Iterator[Remedy]:
+    """Limits of the wire that hold the set, or the reference where no set is proven, and satisfy all else."""
+    at, wire = e.plant_reach or without_error(e.plant), settings.wire
+    for name, reached in (
+        ("rate", at.axis_rate + e.plant.delta_omega),
+        ("attitude", sin(min(pi / 2, at.half_angle))),
+        ("voltage", largest_voltage(settings, at)),
     ):
-        if reached > limit:
-            enough = f"{name}.limit={ceil(100 * reached) / 100:g}"
-            ways.append(Remedy(text=f"a range that holds it, {name}", overrides=[enough]))
-    return ways
+        signal = getattr(wire, name)
+        if reached > signal.limit:
+            enough = ceil(110 * reached) / 100  # a wider range has wider steps, and those need some of it
+            wider = wire.model_copy(update={name: signal.model_copy(update={"limit": enough})})
+            if holds(settings.model_copy(update={"wire": wider})):
+                override = f"wire.{name}.limit={enough:g}"
+                yield Remedy(text=f"a range that holds it, wire.{name}", overrides=[override])
