@@ -141,7 +141,9 @@ def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
     for name, value in settings.items():
         if isinstance(value, Mapping) and value:
             words += as_overrides(value, f"{section}{name}.")
-        else:
+        elif value is None and name.rpartition(".")[2] == "bits":
+            words.append(f"{section}{name}=cont")  # as in a TOML file, which has no null
+        elif value is not None:  # a None is a key that is not set
             words.append(f"{section}{name}={json.dumps(value, ensure_ascii=False, default=str)}")
     return words
 

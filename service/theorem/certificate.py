@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from math import asin, ceil, degrees, hypot, inf, pi, radians, sin, sqrt
 from typing import Any, Final, get_type_hints
 
@@ -143,7 +143,8 @@ def certify(
     if violated:
 
         def holds(tried: Configured) -> bool:
-            return not _violated(tried, evaluated(tried))
+            e = evaluated(tried, only_plant=True)
+            return e.plant_reach is not None and not _violated(tried, e)
 
         ways = [*_range_remedies(settings, e, holds), *remedies(settings, holds)]
     return Certificate(
@@ -173,8 +174,12 @@ def evaluate(
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
     late_s: float = 0.0,
+    only_plant: bool = False,
 ) -> Evaluated:
-    """The quantities of a certificate, to check a run against; arguments and errors as of `certify`."""
+    """The quantities of a certificate, to check a run against; arguments and errors as of `certify`.
+
+    With `only_plant` the paper's body is left out, which does not decide whether a certificate holds.
+    """
     stated = disturbance or 0.0
     if not 0 <= stated < inf:
         raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
@@ -182,7 +187,7 @@ def evaluate(
     bounds = plant_bounds(settings, disturbance is not None)
     body = premises(settings, desired, paper_body(settings), stated, late_s)
     plant = premises(settings, desired, bounds, stated, late_s)
-    body_reach = reach(body)
+    body_reach = None if only_plant else reach(body)
     plant_reach = reach(plant)
     start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
     p = _known(settings, desired, body, body_reach, radians(min(180.0, start_deg)))
@@ -221,7 +226,7 @@ def premises(
         k_omega_d_ddot=desired.jerk,
         axis_rate=desired.axis_rate,
         half_angle_d=desired.half_angle,
-        delta_q=chords(settings.reference, wire.attitude.quantizer().bound + plant.delta_eps),
+        delta_q=chords(settings.reference, _error(wire.attitude, 1) + plant.delta_eps),
         age=plant.age + late_s,
         rate_lag=plant.rate_lag,
         k_tau_d=plant.torque + disturbance,
@@ -261,6 +266,7 @@ def _norm_B(settings: Configured) -> float:  # noqa: N802  # the paper's letter
     return float(np.linalg.norm(np.array(settings.law.allocation)[first:, first:], 2))
 
 
+@lru_cache(maxsize=64)
 def _error(signal: SignalSpec, elements: int) -> float:
     """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
     return sqrt(elements) * signal.quantizer().bound
