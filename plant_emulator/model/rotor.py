@@ -25,7 +25,7 @@ class RotorSettings(BaseModel, extra="forbid"):
         ge=0,
         le=24,
         description="no thrust below this [V]; 2–3 V measured on an Aero, but off: with 2.5 V, height and friction "
-        "fitted again are -2.94 mm and 1.94 mN·m (published: -3.8 mm, 3.7 mN·m), and the tables are predicted no better",
+        "fitted again are -2.94 mm and 1.94 mN·m (published: -3.8, 3.7), and the tables are predicted no better",
     )
 
     @model_validator(mode="after")

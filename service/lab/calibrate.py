@@ -96,7 +96,7 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
         x, calm = fit(lambda p: _with_body(settings, p), start, (1e-4, 2e-5), "calm")
         body = _with_body(settings, x.tolist())
         w, windy = fit(lambda p: _with_wind(body, p), plant.wind.torque[:2], (5e-4, 5e-4), "wind")
-        identification = _identification(settings, [*x, *w, plant.rotor.dead_zone_v], evaluate)
+        identification = identification_at(settings, [*x, *w, plant.rotor.dead_zone_v], evaluate)
     return Calibration(
         yaw_coulomb=x[0],
         centre_of_mass_height=x[1],
@@ -113,9 +113,13 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
     )
 
 
-def _identification(
+def identification_at(
     settings: Settings, values: Sequence[float], evaluate: Callable[[Sequence[tuple[Settings, Cell]]], np.ndarray]
 ) -> Identification:
+    """Identification of yaw friction [N·m], height [m], wind about pitch and yaw [N·m] and dead zone [V] at `values`.
+
+    `evaluate` returns z_track and u_total of each experiment, shape (experiments, 2).
+    """
     coulomb, height, *wind, dead_zone = values
     parameters = [
         Named("Coulomb friction about yaw", "N·m", coulomb, MEASURED_YAW_COULOMB),

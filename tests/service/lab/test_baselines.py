@@ -19,12 +19,8 @@ def _design(name: str, rows: int, columns: int) -> np.ndarray:
     """Regressors of a form, a row for each cell."""
     row, column = (index.ravel() for index in np.indices((rows, columns)))
     of_row, of_column = np.eye(rows)[row], np.eye(columns)[column]
-    forms = {
-        "constant": np.ones((rows * columns, 1)),
-        "column mean": of_column,
-        "row + column": np.c_[of_row, of_column],
-    }
-    return forms[name]
+    one = np.ones((rows * columns, 1))
+    return {"constant": one, "column mean": of_column, "row + column": np.hstack([of_row, of_column])}[name]
 
 
 @pytest.mark.parametrize("shape", [(6, 4), (2, 2), (3, 7)])
@@ -35,7 +31,8 @@ def test_an_error_left_out_is_that_of_a_fit_made_again_without_each_cell(shape: 
     y = table.ravel()
     alone, *found = baselines([table.tolist()], fitted)
     others = np.delete(y, skipped)
-    assert (alone.mare, alone.mare_left_out) == (None, pytest.approx(np.mean(np.abs(y[skipped] / others - 1))))
+    assert alone.mare is None
+    assert alone.mare_left_out == pytest.approx(np.mean(np.abs(y[skipped] / others - 1)))
     assert [baseline.name for baseline in found] == ["constant", "column mean", "row + column"]
     for baseline in found:
         X = _design(baseline.name, *shape)

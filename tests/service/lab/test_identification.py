@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
+from aeroloop.service.config import Settings, load
 from aeroloop.service.lab import paper
+from aeroloop.service.lab.calibrate import identification_at
+from aeroloop.service.lab.cells import Cell
 from aeroloop.service.lab.identification import Named, identify
+from aeroloop.service.lab.tables import CASES
 
 THREE = [Named("friction", "N·m", 0.003, 0.004), Named("height", "m", 0.0, 0.01), Named("zone", "V", 1.0, 2.5)]
 
@@ -46,3 +52,24 @@ def test_the_scatter_is_that_of_the_published_cells_about_their_column_means() -
         cells = np.array(table)
         off = cells / cells.mean(axis=0) - 1
         assert scatter == pytest.approx(np.sqrt((off**2).sum() / (cells.size - cells.shape[1])), rel=0.03)
+
+
+def test_calibration_asks_for_the_figures_of_table_c4_around_what_it_fitted() -> None:
+    """With figures that are linear in the parameters, the Jacobian found is the one that they were made with."""
+    values = [0.003, -0.004, -0.0003, 0.0004, 0.5]  # the wind's torque is 0.5 mN·m
+    scales = np.array([0.0037, 0.0038, 0.0005, 0.0005, 2.5])
+    J = np.random.default_rng(3).normal(size=(2, 2, 2, 5))  # case, air, figure
+
+    def evaluate(jobs: Sequence[tuple[Settings, Cell]]) -> np.ndarray:
+        figures = []
+        for settings, cell in jobs:
+            plant, case = settings.plant, list(CASES.values()).index((cell.bits_out, cell.bits_in))
+            x = [plant.friction.coulomb[1], plant.aero.centre_of_mass[2], *plant.wind.torque, plant.rotor.dead_zone_v]
+            published = list(paper.WIND[list(CASES)[case]]["wind" if cell.windy else "calm"].values())
+            figures.append(published * (1 + paper.SCATTER * (J[case, int(cell.windy)] @ (x / scales))))
+        return np.array(figures)
+
+    found = identification_at(load(), values, evaluate)
+    assert [p.value for p in found.parameters] == values
+    assert found.singular_values == pytest.approx(np.linalg.svd(J.reshape(8, 5))[1])
+    assert [p.alone for p in found.parameters] == pytest.approx(scales / np.linalg.norm(J.reshape(8, 5), axis=0))
