@@ -97,6 +97,7 @@ class Evaluated:
     """The quantities of a certificate.
 
     Attributes:
+        desired: The reference's extremes.
         known: Inputs.
         lemma: The bounds of Lemma 1.
         theorem: The bounds of Theorem 1.
@@ -107,6 +108,7 @@ class Evaluated:
         bounds: What the plant does beyond the paper's equations.
     """
 
+    desired: Extremes
     known: Known
     lemma: Lemma
     theorem: Theorem
@@ -143,8 +145,8 @@ def certify(
     if violated:
 
         def holds(tried: Configured) -> bool:
-            e = evaluated(tried, only_plant=True)
-            return e.plant_reach is not None and not _violated(tried, e)
+            now = evaluated(tried, only_plant=True, desired=e.desired)  # the reference stays
+            return now.plant_reach is not None and not _violated(tried, now)
 
         ways = [*_range_remedies(settings, e, holds), *remedies(settings, holds)]
     return Certificate(
@@ -175,15 +177,17 @@ def evaluate(
     attitude_error_deg: float | None = None,
     late_s: float = 0.0,
     only_plant: bool = False,
+    desired: Extremes | None = None,
 ) -> Evaluated:
     """The quantities of a certificate, to check a run against; arguments and errors as of `certify`.
 
-    With `only_plant` the paper's body is left out, which does not decide whether a certificate holds.
+    With `only_plant` the paper's body is left out, which does not decide whether a certificate holds; `desired` are the
+    reference's extremes if they are known.
     """
     stated = disturbance or 0.0
     if not 0 <= stated < inf:
         raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
-    desired = extremes(settings.reference)
+    desired = desired or extremes(settings.reference)
     bounds = plant_bounds(settings, disturbance is not None)
     body = premises(settings, desired, paper_body(settings), stated, late_s)
     plant = premises(settings, desired, bounds, stated, late_s)
@@ -192,7 +196,7 @@ def evaluate(
     start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
     p = _known(settings, desired, body, body_reach, radians(min(180.0, start_deg)))
     lemma = lemma_1(p)
-    return Evaluated(p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
+    return Evaluated(desired, p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
 
 
 def premises(
@@ -226,7 +230,7 @@ def premises(
         k_omega_d_ddot=desired.jerk,
         axis_rate=desired.axis_rate,
         half_angle_d=desired.half_angle,
-        delta_q=chords(settings.reference, _error(wire.attitude, 1) + plant.delta_eps),
+        delta_q=chords(desired.samples, _error(wire.attitude, 1) + plant.delta_eps),
         age=plant.age + late_s,
         rate_lag=plant.rate_lag,
         k_tau_d=plant.torque + disturbance,
@@ -272,11 +276,11 @@ def _error(signal: SignalSpec, elements: int) -> float:
     return sqrt(elements) * signal.quantizer().bound
 
 
-def largest_voltage(settings: Configured, at: Reach) -> float:
+def largest_voltage(settings: Configured, desired: Extremes, at: Reach) -> float:
     """The largest |u_k| that the law commands within a set [V]."""
     first = 3 - settings.wire.actuators
     inverse = np.linalg.inv(np.array(settings.law.allocation)[first:, first:])
-    along = np.abs(feedforward(settings.reference, settings.law)[:, first:] @ inverse.T).max(axis=0)
+    along = np.abs(feedforward(desired.samples, settings.law)[:, first:] @ inverse.T).max(axis=0)
     return float((along + np.linalg.norm(inverse, axis=1) * at.deviation).max())
 
 
@@ -297,7 +301,7 @@ def _violated(settings: Configured, e: Evaluated) -> list[str]:
 def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
     """Which ranges the set exceeds."""
     wire = settings.wire
-    volts, limit = largest_voltage(settings, at), min(wire.voltage.limit, settings.plant.voltage_limit)
+    volts, limit = largest_voltage(settings, e.desired, at), min(wire.voltage.limit, settings.plant.voltage_limit)
     where = "the set" if e.plant_reach else "what the quantizers alone do along the reference"
     ranges = (
         (at.axis_rate + e.plant.delta_omega, wire.rate.limit, "|ω_k|", "rad/s", "range: wire.rate.limit"),
@@ -395,7 +399,7 @@ def _range_remedies(settings: Configured, e: Evaluated, holds: Holds) -> Iterato
     for name, reached in (
         ("rate", at.axis_rate + e.plant.delta_omega),
         ("attitude", sin(min(pi / 2, at.half_angle))),
-        ("voltage", largest_voltage(settings, at)),
+        ("voltage", largest_voltage(settings, e.desired, at)),
     ):
         signal = getattr(wire, name)
         if reached > signal.limit:

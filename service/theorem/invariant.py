@@ -31,12 +31,12 @@ import numpy as np
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.control.reference import Floats
 
-_SAMPLES: Final = 4000
+_SAMPLES: Final = 1000
 """Times of e^{As} until it has fallen by e^{-20}; the quadrature is rounded up by `_SLACK`."""
 _SLACK: Final = 1.002
 _MOST_ITERATIONS: Final = 300
 _INFLATED: Final = 1.001
-"""Each guess of the fixed point is raised by this, so that a guess that holds is found soon; the bound is as much wider."""
+"""Each guess of the fixed point is raised by this, so that one that holds is found soon; the bound is as much wider."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,8 @@ def _disturbances(
     roll = (p.k_theta_hat * p.k_omega_d + j * p.k_omega_d_dot + p.weight_roll) if held else 0.0
     push = theta * p.axis_rate + sine * roll
     slow = push / phi
-    eps_e = max(eps_e, eps_bar + kappa1 * slow)
+    needed = eps_bar + kappa1 * slow
+    eps_e = max(eps_e, needed)
     if not eps_e < sin(pi / 4):
         return None
     turned = 2 * eps_e * p.k_omega_d  # ‖R ω_d − R_d ω_d‖
@@ -310,7 +311,7 @@ def _disturbances(
         radius=sqrt(largest**2 + zeta**2 - eps_e**2),
         eps_bar=eps_bar,
         torque=torque,
-        eps_e=eps_e,
+        eps_e=needed,
         z2=z2,
         omega_e=omega_e,
         axis_rate=axis_omega,

@@ -187,7 +187,10 @@ def test_a_held_roll_takes_from_the_yaw_what_u1_would_have_added() -> None:
 def test_the_reached_attitude_error_is_that_of_the_angle() -> None:
     e = evaluate(PAPER)
     assert e.body_reach is not None
-    assert e.body_reach.half_angle == pytest.approx(e.known.half_angle_d + asin(e.body_reach.eps_e))
+    assert e.body_reach.half_angle == pytest.approx(
+        e.known.half_angle_d + asin(e.body_reach.eps_e),
+        rel=1e-3,  # guesses are raised by as much
+    )
 
 
 def _psi(law: LawSettings, built: Law) -> ca.SX:
