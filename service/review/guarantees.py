@@ -7,9 +7,8 @@ configured plant. Each piece begins anew, with its own V(t₀).
     mean square    ∫ k ‖z‖² dt ≤ V(t₀) + ∫ δ dt        k, δ of `mean_square.decay`; the integral by trapezoids
     every instant  ‖z(t)‖ ≤ `reach`(r)                  r the least ‖x(t₀)‖ of the piece so far
 
-δ at a tick is of the largest ‖z^Q‖ since the command that acts was computed; k, and both where rotors remember more, of
-the largest ‖z^Q‖ so far. Where θ is not known, the last term of V(t₀) is its bound, and so is the part of x that depends
-on it.
+δ at a tick is of the largest ‖z^Q‖ since the command that acts was computed; k, and δ where rotors lag, of the largest
+‖z^Q‖ so far. Where θ is not known, the last term of V(t₀) is its bound, and so is the part of x that depends on it.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ class Conditions(NamedTuple):
 
     def joined(self, other: Conditions) -> Conditions:
         """These ticks, followed by others."""
-        return Conditions(*map(np.concatenate, zip(self, other, strict=True)))
+        return Conditions(*map(np.concatenate, zip(self, other, strict=True)))  # type: ignore[arg-type]  # likewise
 
     def where(self, chosen: npt.NDArray[np.int64]) -> Conditions:
         """The ticks at these places."""
@@ -307,7 +306,8 @@ class Guarantees:
 
 def _sizes(seen: Array | float) -> Array:
     """Number of the next larger size for which k and δ are computed."""
-    return np.ceil(_PER_OCTAVE * np.log2(np.maximum(seen, _LEAST)))
+    sizes: Array = np.ceil(_PER_OCTAVE * np.log2(np.maximum(seen, _LEAST)))
+    return sizes
 
 
 def refused_commands(ticks: Ticks, delta_u: float, supply: float) -> Flags:

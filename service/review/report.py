@@ -104,8 +104,8 @@ class TheoremFindings(BaseModel, frozen=True):
         description="whether the run kept to all that could be judged: Lemma 1, the mean square, the invariant set"
     )
     radius: float | None = Field(
-        description="√(δ_Q/k), the root of the mean of ‖z‖² in the long run, of the configured plant while ‖z‖ is as in "
-        "the run [1, rad/s]"
+        description="√(δ_Q/k), the root of the mean of ‖z‖² in the long run, of the configured plant while ‖z‖ is as "
+        "at the run's end [1, rad/s]"
     )
     pointwise_radius: float | None = Field(
         description="bound of ‖z‖ at every instant, in the end [1, rad/s]; null where the certificate does not hold"

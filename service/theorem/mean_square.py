@@ -111,9 +111,9 @@ def mechanism_torque(p: Premises, size: float, omega: float, z2_dot: float) -> f
         n·ω_e = ± sin Δ_y ṗ_d                 |n·ω_e| ≤ 2 ‖ε̃‖ k_ω_d
         n·ω̇_e = −ṗ m·ω_e ± d/dt(sin Δ_y ṗ_d)  |n·ω̇_e| ≤ (‖ω‖ + k_ω_d) ‖ω_e‖ + 2 ‖ε̃‖ k_ω̇_d
 
-    the first since a = sin²(Δ_y/2), b = sin²(Δ_p/2) have a + b − ab = ‖ε̃‖², where √(ab) is largest at a = b; the last as
-    Δ̇_y = m·ω_e. So |n·z₂| ≤ κ ‖z‖, and n·J ż₂ follows from n·ω̇_e and n·C₁ ε̃' = C₁/2 (η̃ n·ω_e + n·(ε̃ × ω_e)). A diagonal D is not
-    D_x I: ‖D n − D_x n‖ ≤ |D_z − D_x| sin p adds to each.
+    the first since a = sin²(Δ_y/2), b = sin²(Δ_p/2) have a + b − ab = ‖ε̃‖², where √(ab) is largest at a = b; the last
+    as Δ̇_y = m·ω_e. So |n·z₂| ≤ κ ‖z‖, and n·J ż₂ follows from n·ω̇_e and n·C₁ ε̃' = C₁/2 (η̃ n·ω_e + n·(ε̃ × ω_e)). A
+    diagonal D is not D_x I: ‖D n − D_x n‖ ≤ |D_z − D_x| sin p adds to each.
 
     Args:
         p: Premises, of a held roll.

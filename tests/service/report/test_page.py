@@ -77,8 +77,9 @@ def test_the_page_states_what_was_asked_and_what_was_found() -> None:
 def test_the_page_states_what_the_theorem_promises_and_which_inequality_was_broken() -> None:
     held = page([made_report(theorem=made_theorem())])
     texts = Texts(held).texts
-    assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in texts
-    assert {"0.0638", "0.2004", "(C.57)", "97.0"} <= set(texts)
+    assert " Holds: once there, ‖z‖ stays within 0.2004." in texts
+    assert " The run kept to all of it that could be judged." in texts
+    assert {"0.0638", "0.1803", "0.2004", "31.0", "52.0", "(C.57)", "97.0"} <= set(texts)
     (judged,) = (text for text in texts if "belong to a tick" in text)
     assert "Judged until 8.5 s" in judged
     assert "Judged from" not in judged
@@ -88,14 +89,14 @@ def test_the_page_states_what_the_theorem_promises_and_which_inequality_was_brok
     assert judged.endswith("Lemma 1 is judged by the other 380.")
     broken = page([made_report(theorem=made_theorem(broken=7))])
     assert "Show 3.125 s: (C.57) ‖Φ − Φ^Q‖ first broken" in broken
-    assert {"7", "125.0"} <= set(Texts(broken).texts)
+    assert {"7", "125.0", " The run did not keep to it."} <= set(Texts(broken).texts)
     assert "first broken" not in held
 
 
 def test_where_no_run_was_checked_against_the_theorem_the_page_leaves_it_out() -> None:
     assert 'id="theorem"' not in page([made_report()])
     several = page([made_report("a"), made_report("b", theorem=made_theorem())])
-    assert " Theorem 1 holds: in the end ‖z‖ ≤ 0.2004." in Texts(several).texts
+    assert " Holds: once there, ‖z‖ stays within 0.2004." in Texts(several).texts
 
 
 def test_the_theorems_panels_stand_in_its_own_section_and_nowhere_else() -> None:
