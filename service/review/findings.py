@@ -45,7 +45,8 @@ def findings_of(
     if not known:
         few = "too few ticks have all four times of sending and receiving"
         reasons["clock_offset_us"] = LOCKSTEP if lockstep else few
-    theorem, unknown = observer.check.findings()
+    faults = events.faults.intervals()
+    theorem, unknown = observer.check.findings(faults=bool(faults))
     gaps = [gap for gap in run.missing if gap.vehicle == which[0]]
     return Findings(
         **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},
@@ -73,7 +74,7 @@ def findings_of(
         frames=frames,
         theorem=theorem,
         marks=[mark for mark in events.marks() if not _repeats(mark, theorem.verdict)],
-        faults=events.faults.intervals(),
+        faults=faults,
     )
 
 

@@ -213,7 +213,10 @@ class Observer:
         panels, time = panels_of(self._columns, points[:, 1:]), points[:, 0] * self._period
         since_s, until_s = self.check.judged_s
         judged = (time >= since_s) & (time < until_s)
-        return time, with_level(panels, "z_norm", "guaranteed in the end", self.check.radius, judged)
+        label, level = "bound, once within it", self.check.pointwise_radius
+        if level is None:
+            label, level = "bound of the root mean square", self.check.radius
+        return time, with_level(panels, "z_norm", label, level, judged)
 
 
 def _alternating(*tables: Array) -> Array:

@@ -21,7 +21,7 @@ from aeroloop.service.logs.runs import Run, Taker
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.logs.wire_check import WireCheck
-from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
+from aeroloop.service.review.certified_bounds import certified_bounds
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.findings import facts_of, findings_of, latency_of, name_of
 from aeroloop.service.review.observe import WHOLE, DrawnPart
@@ -103,7 +103,7 @@ def read(
 
         def check(changes: Sequence[Change]) -> TheoremCheck:
             certified = certified_bounds(settings, changes, description.certificate if description else None)
-            return TheoremCheck(certified, settings.loop.period, damping_of(settings.plant))
+            return TheoremCheck(certified, settings)
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
         judged = Session(settings, check, missing, watch, part)

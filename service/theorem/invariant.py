@@ -253,15 +253,7 @@ def _disturbances(
             + p.norm_B * p.delta_u
         )  # fmt: skip
         theta_dot = max(p.Gamma) * sqrt(max(p.Gamma) / min(p.Gamma)) * axis_omega * (z2 + delta_z2)
-        hold = p.age * (
-            omega_e / 2
-            + c2 * z2_dot
-            + p.k_theta_hat * omega_dot + theta_dot * axis_omega
-            + p.weight * omega + 2 * spread * omega * omega_dot
-            + j * (omega_e_dot * p.k_omega_d + omega_e * (p.k_omega_d_dot + omega_e * p.k_omega_d))
-            + j * (p.k_omega_d_ddot + omega * p.k_omega_d_dot)
-            + j * c1 / 2 * (omega_e_dot + omega_e**2 / 2)
-        )  # fmt: skip
+        hold = stale_torque(p, omega, axis_omega, omega_e, z2_dot, theta_dot)
         fast = noise + hold + theta * turned + p.k_tau_d
         if held:  # what u₁ should have added to the yaw, beyond the slow part and the feedback that φ counts
             rest = p.k_theta_hat * omega_e + j * (omega_e * p.k_omega_d + c1 * omega_e / 2) + spread * omega**2
@@ -323,6 +315,36 @@ def _disturbances(
         D2=D2,
         deviation=deviation,
     )
+
+
+def stale_torque(
+    p: Premises, omega: float, axis_omega: float, omega_e: float, z2_dot: float, theta_dot: float
+) -> float:
+    """The torque by which a command is out of date: its age times the largest rate at which the law's torque changes.
+
+    Args:
+        p: Premises.
+        omega: Largest ‖ω‖ [rad/s].
+        axis_omega: Largest |ω_k| [rad/s].
+        omega_e: Largest ‖ω_e‖ [rad/s].
+        z2_dot: Largest ‖ż₂‖ [rad/s²].
+        theta_dot: Largest rate of θ̂ [N·m/rad].
+
+    Returns:
+        [N·m].
+    """
+    j, c1, spread = max(p.J), max(p.C1), max(p.J) - min(p.J)
+    omega_e_dot = z2_dot + c1 * omega_e / 2
+    omega_dot = omega_e_dot + p.k_omega_d_dot + omega_e * p.k_omega_d
+    return p.age * (
+        omega_e / 2
+        + max(p.C2) * z2_dot
+        + p.k_theta_hat * omega_dot + theta_dot * axis_omega
+        + p.weight * omega + 2 * spread * omega * omega_dot
+        + j * (omega_e_dot * p.k_omega_d + omega_e * (p.k_omega_d_dot + omega_e * p.k_omega_d))
+        + j * (p.k_omega_d_ddot + omega * p.k_omega_d_dot)
+        + j * c1 / 2 * (omega_e_dot + omega_e**2 / 2)
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=256)
