@@ -60,7 +60,8 @@ def review(
         typer.Option(
             "--require",
             metavar="FIGURE=LIMIT",
-            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4, skipped=0 or latency.p99=2000.",
+            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4, skipped=0 or latency.p99=2000; "
+            "theorem=1: unless the run kept to all that is proven.",
             show_default=False,
         ),
     ] = None,
