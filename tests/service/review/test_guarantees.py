@@ -171,11 +171,12 @@ def test_a_gap_in_true_states_or_a_lost_frame_begins_a_new_piece(certified: Path
     assert theorem is not None
     assert theorem.mean_square_judged == 1499 - 149 - 1
     assert theorem.spacing_s == pytest.approx(0.002)
-    make_log(tmp_path / "b.mcap", 300, settings=settings(*CERTIFIED, bits=12), truth_every=1, lost=[200])
+    make_log(tmp_path / "b.mcap", 300, settings=settings(*CERTIFIED, bits=12), truth_every=10, lost=[205])
     theorem = read(tmp_path / "b.mcap").findings.theorem
     assert theorem is not None
-    assert (theorem.outside["C.30"], theorem.held) == (1, True)
-    assert theorem.mean_square_judged == 299 - 2  # to the tick and from it
+    assert (theorem.samples, theorem.outside["C.30"], theorem.held) == (30, 0, True)
+    assert theorem.mean_square_judged == 29 - 1
+    assert theorem.spacing_s == pytest.approx(0.02)
 
 
 def test_with_faults_at_the_plant_only_the_lemma_is_judged(tmp_path: Path) -> None:
