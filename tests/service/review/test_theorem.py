@@ -406,7 +406,7 @@ def test_the_account_and_the_json_say_what_held(ideal: Path, capfd: pytest.Captu
     findings = read(ideal).findings
     review_account(findings)
     said = " ".join(capfd.readouterr().out.split())
-    assert "certificate Does not hold" in said
+    assert "The certificate does not hold" in said
     assert "this run ✓ kept to Lemma 1, the mean square" in said
     assert re.search(r"mean square ∫k‖z‖² is at most [\d.]+ % of V\(t₀\) \+ ∫δ_Q", said)
     assert "every instant — (no invariant set is proven of the configured plant)" in said
