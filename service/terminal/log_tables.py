@@ -170,12 +170,12 @@ def _held(findings: Findings, found: TheoremFindings) -> tuple[str, str]:
     """Whether the run kept to all that could be judged, in words and in a style."""
     if found.held is None:
         return f"— ({findings.reasons.get('theorem.held', 'not available')})", ""
-    counts = {
-        "Lemma 1": found.judged,
-        "the mean square": found.mean_square_judged,
-        "the bound at every instant": found.pointwise_judged,
-    }
-    by = ", ".join(name for name, count in counts.items() if count)
+    counts = (
+        ("Lemma 1", found.judged),
+        ("the mean square", found.mean_square_judged),
+        ("the bound at every instant", found.pointwise_judged),
+    )
+    by = ", ".join(name for name, count in counts if count)
     return (f"✓ kept to {by}", "green") if found.held else (f"✗ does not keep to all of {by}", "bold red")
 
 
