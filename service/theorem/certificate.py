@@ -84,7 +84,7 @@ class Certificate(BaseModel):
         assert self.plant_deg is not None
         return (
             f"The certificate holds: once there, ‖z‖ stays within {self.plant_radius:.4g}, the attitude within "
-            f"{self.plant_deg:.2f}°; in the long run the root of the mean of ‖z‖² is at most {self.rms_radius:.4g}."
+            f"{self.plant_deg:.2f}°."
         )
 
     def value(self, symbol: str) -> float | None:
@@ -196,6 +196,9 @@ def evaluate(
     start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
     p = _known(settings, desired, body, body_reach, radians(min(180.0, start_deg)))
     lemma = lemma_1(p)
+    if body_reach is not None:  # the noise, too, is of a state that has changed since
+        noise = theorem_1(p, lemma).delta_V1 * body.age * body_reach.z_dot
+        p = replace(p, hold=p.hold + noise)
     return Evaluated(desired, p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
 
 
@@ -259,6 +262,7 @@ def _known(settings: Configured, desired: Extremes, body: Premises, within: Reac
         k_theta_hat=body.k_theta_hat,
         k_tau_d=body.k_tau_d,
         hold=within.hold if within else 0.0,
+        power=within.power if within else 0.0,
         omega_limit=wire.rate.limit,
         u_limit=wire.voltage.limit,
     )

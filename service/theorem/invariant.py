@@ -142,6 +142,8 @@ class Reach:
         slow: Largest ‖w_s‖ [N·m].
         fast: Largest torque of quantization, hold, lag, sensors and disturbance [N·m].
         hold: The part of it that comes from the age of the command [N·m].
+        power: Power by which the adaptation, held for a period, is out of date [W].
+        z_dot: Largest ‖ż‖ [1/s, rad/s²].
         D1: Bound of d₁ [1/s].
         D2: Bound of d₂ [N·m].
         deviation: Largest torque of the command beyond that of the reference [N·m].
@@ -159,6 +161,8 @@ class Reach:
     slow: float
     fast: float
     hold: float
+    power: float
+    z_dot: float
     D1: float
     D2: float
     deviation: float
@@ -168,7 +172,7 @@ def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
     c1, c2 = max(p.C1), max(p.C2)
     torque = p.delta_q(0.0) * (1 + c1 * c2) + c2 * p.delta_omega
-    return Reach(0, 0, 0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, torque)
+    return Reach(0, 0, 0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, 0, 0, torque)
 
 
 def reach(p: Premises, start: float = 0.0) -> Reach | None:
@@ -267,6 +271,9 @@ def _disturbances(
     else:
         return None
 
+    # θ̂ steps by Γ Φ^Q z₂^Q with the values at a tick, while z₂ᵀ Φ θ̃ acts all the while; the last term is its square.
+    omega_Q, z2_Q = omega + delta_omega, z2 + delta_z2  # the paper's letters
+    power = p.age * theta * (z2_dot * omega_Q + delta_z2 * omega_dot) + p.age / 2 * max(p.Gamma) * (omega_Q * z2_Q) ** 2
     push_dot = theta * p.k_omega_d_dot + p.axis_rate * theta_dot
     D2 = fast + theta * omega_e + max(1 - p.share, p.share - phi) * torque  # θ̃ acts on ω_e; φ beside its mean
     if held:
@@ -311,6 +318,8 @@ def _disturbances(
         slow=slow,
         fast=fast,
         hold=hold,
+        power=power,
+        z_dot=hypot(omega_e / 2, z2_dot),
         D1=D1,
         D2=D2,
         deviation=deviation,

