@@ -168,6 +168,8 @@ def _problem(shapes: Shapes, error: dict[str, Any]) -> str:
 
 
 def _unknown(shapes: Shapes, place: Sequence[str | int], key: str) -> str:
+    if not key.isprintable():  # the line stays one line
+        key = json.dumps(key)
     found = closest(key, (name for name, _ in shapes.every_key()))
     if found is not None:
         return f"unknown key {key}: did you mean {found}?"
