@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
@@ -45,18 +46,9 @@ _FREQUENCIES: Final = (0.3, 60.0)
 """Of waves: a tenth to ten times the loop's own, about [rad/s]."""
 DIVERGED: Final = 1e9
 """Stands for every value beyond it, and for NaN."""
-_LAYOUT: Final = {
-    "theta": 3,
-    "theta_hat": 3,
-    "start": 6,
-    "phase": 1,
-    "torque": 6,
-    "error": 6,
-    "offset": 9,
-}
+_LAYOUT: Final = {"theta": 3, "theta_hat": 3, "start": 6, "phase": 1, "torque": 6, "error": 6, "offset": 9}
 """Coordinates of an experiment, each −1…1. A wave has a vector, kind, frequency and angle."""
 Errors: TypeAlias = Literal["quantizers", "any"]
-
 
 _Worst: TypeAlias = dict[str, tuple[float, list[float]]]
 """Of each inequality: left over right side, and the instant."""
@@ -108,11 +100,11 @@ class _Round(BaseModel):
 
 
 class _Group(NamedTuple):
-    """Experiments with the same bounds, by the names of _UNITS; None where nothing is proven."""
+    """Experiments with the same bounds, by the names of _UNITS; without those that are not proven."""
 
     errors: Errors
     start: float
-    bounds: dict[str, float | None]
+    bounds: dict[str, float]
 
 
 _UNITS: Final = {
@@ -198,18 +190,22 @@ def _groups(settings: Settings, e: Evaluated) -> list[_Group]:
     found = list[_Group]()
     for start in starts:
         at = reach(e.body, start)
-        bounds = {
-            "z": at and at.radius,
-            "omega": at and at.axis_rate,
-            "eps": at and sin(min(pi / 2, at.half_angle)),
-            "u": at and largest_voltage(settings, at),
-            "mean_square": 1.0 if at and e.theorem.k and not start else None,
-        }
+        bounds = (
+            {}
+            if at is None
+            else {
+                "z": at.radius,
+                "omega": at.axis_rate,
+                "eps": sin(at.half_angle),
+                "u": largest_voltage(settings, at),
+                **({"mean_square": 1.0} if e.theorem.k and not start else {}),
+            }
+        )
         found += [_Group(errors, start, bounds) for errors in kinds]
     return found
 
 
-def _group_of(rows: int, groups: Sequence[_Group]) -> Floats:
+def _group_of(rows: int, groups: Sequence[_Group]) -> NDArray[np.intp]:
     """The group of each row of a round: in turns, so that every batch has all of them. Shape (rows,)."""
     return np.arange(rows) % len(groups)
 
@@ -282,7 +278,7 @@ def _judged(settings: Settings, e: Evaluated, groups: Sequence[_Group], ticks: i
     volts = min(wire.voltage.limit, settings.plant.voltage_limit)
     group_of = _group_of(len(o.z), groups)
     quantized = np.array([groups[g].errors == "quantizers" for g in group_of])
-    proven = np.array([groups[g].bounds["z"] is not None for g in group_of])
+    proven = np.array(["z" in groups[g].bounds for g in group_of])
     left = quantized & (
         (o.omega > wire.rate.limit - wire.rate.quantizer().bound)  # the shift of a grid is half a step
         | (o.eps > wire.attitude.limit - wire.attitude.quantizer().bound)
@@ -320,12 +316,13 @@ def _worst_instants(rounds: Sequence[_Round]) -> _Worst:
 
 def _of_runs(rounds: Sequence[_Round], groups: Sequence[_Group]) -> Iterator[Statement]:
     reached = {name: np.concatenate([each.reached[name] for each in rounds]) for name in rounds[0].reached}
-    group_of = np.arange(len(reached["z"])) % ROUND % len(groups)
+    group_of = np.tile(_group_of(ROUND, groups), len(rounds))
     for g, group in enumerate(groups):
         for name, (what, unit) in _UNITS.items():
-            bound = group.bounds[name]
-            # Leaving a range breaks what is claimed of ω and u if their bounds lie within it; of z it is a premise.
-            judged = (group_of == g) & ~((reached["left"] > 0) & (bound is not None) & (name in ("z", "mean_square")))
+            bound = group.bounds.get(name)
+            judged = group_of == g
+            if bound is not None and name in _PREMISED:
+                judged &= reached["left"] == 0
             if (name == "mean_square" and bound is None) or not judged.any():
                 continue
             experiment = int(np.argmax(np.where(judged, reached[name], -1.0)))

@@ -27,7 +27,7 @@ from aeroloop.service.control.law import build_law, law_function
 from aeroloop.service.control.reference import Floats, Plan, reference_function
 from aeroloop.service.theorem.lemma import coordinates, lyapunov, rotation, times
 
-WAVES: Final = ("constant", "sinusoid", "square", "bang-bang")
+WAVES: Final = ("square", "sinusoid", "constant", "bang-bang")
 _TURNS: Final = 4
 _LONGEST_S: Final = 300.0
 _SIZES: Final = {"q": 4, "omega": 3, "last": 4, "theta_hat": 3, "largest": 4, "square": 1}
@@ -258,7 +258,7 @@ def tick_function(settings: Settings) -> ca.Function:
 def _course(wave: ca.SX, time: ca.SX, bang: ca.SX) -> ca.SX:
     """The course of a wave, within ±1: one of WAVES. Shape of `bang`."""
     swing = ca.sin(wave[7] * time + wave[8])
-    return wave[3] + wave[4] * swing + wave[5] * ca.sign(swing) + wave[6] * bang
+    return wave[3] * ca.sign(swing) + wave[4] * swing + wave[5] + wave[6] * bang
 
 
 def _largest(vector: ca.SX) -> ca.SX:
@@ -267,7 +267,7 @@ def _largest(vector: ca.SX) -> ca.SX:
 
 def _columns(memory: Buffer, rows: int) -> Floats:
     """A view of what CasADi holds column by column. Shape (rows, m)."""
-    view: Floats = np.frombuffer(memory).reshape(-1, rows).T
+    view: Floats = np.asarray(memory).reshape(-1, rows).T
     return view
 
 
