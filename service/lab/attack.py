@@ -5,8 +5,8 @@ tick, and for r = 0 the mean square of (C.77). An instant is compared with Lemma
 x(t₀) in their balls, the reference's phase, direction and course of τ_d, and either a shift of each quantizer's grid
 or, within their bounds, the errors themselves. First it draws at random, then it mutates the best of each kind of run.
 
-‖z‖ and the mean square of a run that leaves the wire's ranges are not judged, as ranges are premises; |ω_k|, |ε_k| and
-|u_k| show whether they had to hold. Each round is a line of a file, from which a search resumes.
+A run is judged until it leaves the wire's ranges, as they are premises; |ω_k|, |ε_k| and |u_k| show whether it had to
+stay within them. Each round is a line of a file, from which a search resumes.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Attack(BaseModel):
 
 
 class _Round(BaseModel):
-    """A line of the file: the points of a round, what they reached, and for each inequality the worst instant."""
+    """A line of the file: the points of a round, what they reached, and each inequality's worst instant so far."""
 
     points: list[list[float]]
     reached: dict[str, list[float]]
@@ -115,7 +115,6 @@ _UNITS: Final = {
     "u": ("|u_k|", "V"),
 }
 """Name and unit of what is judged; the mean square as a share of what (C.77) allows."""
-_PREMISED: Final = ("z", "mean_square")
 
 
 def attack(
@@ -162,13 +161,13 @@ def attack(
         points = _points(rng, rounds, groups)
         jobs = [(config, ticks, disturbance or 0.0, groups, batch) for batch in np.split(points, BATCHES)]
         parts = workers.each(_run, jobs) if workers else [_run(*job) for job in jobs]
-        reached = _judged(settings, e, groups, ticks, Outcome(*map(np.concatenate, zip(*parts, strict=True))))
-        lists = {name: values.tolist() for name, values in reached.items()}
-        file.append(_Round(points=points.tolist(), reached=lists, instants=_instants(rng, rounds, instants)))
+        reached = {name: np.concatenate([getattr(part, name) for part in parts]).tolist() for name in Outcome._fields}
+        file.append(_Round(points=points.tolist(), reached=reached, instants=_instants(rng, rounds, instants)))
     took = time.monotonic() - began
     if progress:
         progress(len(rounds) * ROUND, runs)
-    done = [*_of_runs(rounds, groups), *_of_lemma(rounds)]
+    reached_by_all = {name: np.concatenate([each.reached[name] for each in rounds]) for name in Outcome._fields}
+    done = [*_of_runs(reached_by_all, e, groups), *_of_lemma(rounds)]
     return Attack(
         runs=len(rounds) * ROUND,
         instants=len(rounds) * _INSTANTS,
@@ -176,7 +175,7 @@ def attack(
         seed=seed,
         seconds=took,
         ticks_per_s=(len(rounds) - before) * ROUND * ticks / took if len(rounds) > before else 0.0,
-        left_ranges=int(sum(sum(each.reached["left"]) for each in rounds)),
+        left_ranges=int((reached_by_all["lasted"] < (ticks - 0.5) * settings.loop.period).sum()),
         beaten=any(each.share is not None and each.share > 1 for each in done),
         statements=done,
     )
@@ -217,7 +216,7 @@ def _points(rng: np.random.Generator, rounds: Sequence[_Round], groups: Sequence
     points = np.empty((ROUND, size))
     for g in range(len(groups)):
         mine = np.flatnonzero(group_of == g)
-        tried = [(each.reached["score"][i], each.points[i]) for each in rounds for i in mine]
+        tried = [(each.reached["z"][i], each.points[i]) for each in rounds for i in mine]
         best = sorted(tried, key=lambda pair: -pair[0])[:_PARENTS]
         points[mine] = proposals(rng, np.array([point for _, point in best]), len(mine), size)
     return points
@@ -272,30 +271,6 @@ def _wave(along: Floats, cube: Floats) -> Wave:
     )
 
 
-def _judged(settings: Settings, e: Evaluated, groups: Sequence[_Group], ticks: int, o: Outcome) -> dict[str, Floats]:
-    """What a round reached, beside whether it left the ranges, and the score by which parents are chosen."""
-    wire, t = settings.wire, e.theorem
-    volts = min(wire.voltage.limit, settings.plant.voltage_limit)
-    group_of = _group_of(len(o.z), groups)
-    quantized = np.array([groups[g].errors == "quantizers" for g in group_of])
-    proven = np.array(["z" in groups[g].bounds for g in group_of])
-    left = quantized & (
-        (o.omega > wire.rate.limit - wire.rate.quantizer().bound)  # the shift of a grid is half a step
-        | (o.eps > wire.attitude.limit - wire.attitude.quantizer().bound)
-        | (o.u > volts - wire.voltage.quantizer().bound)
-    )
-    allowed = (o.V + t.delta_Qdist * ticks * settings.loop.period) / t.k if t.k else np.full(len(o.z), np.inf)
-    return {
-        "z": o.z,
-        "omega": o.omega,
-        "eps": o.eps,
-        "u": o.u,
-        "mean_square": o.square / allowed,
-        "left": left.astype(float),
-        "score": np.where(left & proven, 0.0, o.z),
-    }
-
-
 def _instants(
     rng: np.random.Generator, rounds: Sequence[_Round], instants: Instants
 ) -> dict[str, tuple[float, list[float]]]:
@@ -314,19 +289,17 @@ def _worst_instants(rounds: Sequence[_Round]) -> _Worst:
     return rounds[-1].instants if rounds else {}
 
 
-def _of_runs(rounds: Sequence[_Round], groups: Sequence[_Group]) -> Iterator[Statement]:
-    reached = {name: np.concatenate([each.reached[name] for each in rounds]) for name in rounds[0].reached}
-    group_of = np.tile(_group_of(ROUND, groups), len(rounds))
+def _of_runs(reached: dict[str, Floats], e: Evaluated, groups: Sequence[_Group]) -> Iterator[Statement]:
+    allowed = (reached["V"] + e.theorem.delta_Qdist * reached["lasted"]) / (e.theorem.k or np.nan)  # (C.77)
+    values = reached | {"mean_square": reached["square"] / allowed}
+    group_of = np.arange(len(allowed)) % ROUND % len(groups)
     for g, group in enumerate(groups):
         for name, (what, unit) in _UNITS.items():
             bound = group.bounds.get(name)
-            judged = group_of == g
-            if bound is not None and name in _PREMISED:
-                judged &= reached["left"] == 0
-            if (name == "mean_square" and bound is None) or not judged.any():
+            if name == "mean_square" and bound is None:
                 continue
-            experiment = int(np.argmax(np.where(judged, reached[name], -1.0)))
-            found = float(reached[name][experiment])
+            experiment = int(np.argmax(np.where(group_of == g, values[name], -1.0)))
+            found = float(values[name][experiment])
             yield Statement(
                 what=what,
                 errors=group.errors,

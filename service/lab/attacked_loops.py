@@ -2,7 +2,8 @@
 
 The body is that of the certificate: (C.1), (C.78) with the law's own model, three torques, perfect sensors, commands
 held for a period. One CasADi function is a tick of the whole loop; `in_columns` runs each of its instructions over all
-rows. Largest values are those at ticks.
+rows. Largest values are those at ticks, up to the first at which a value is beyond the wire's range, as nothing is
+claimed of what follows.
 
 An error y^Q − y is either that of the wire's quantizers, whose grids may be shifted, or any within their bounds, as
 (C.13) allows: the wave of an adversary, without limit of range.
@@ -30,8 +31,8 @@ from aeroloop.service.theorem.lemma import coordinates, lyapunov, rotation, time
 WAVES: Final = ("square", "sinusoid", "constant", "bang-bang")
 _TURNS: Final = 4
 _LONGEST_S: Final = 300.0
-_SIZES: Final = {"q": 4, "omega": 3, "last": 4, "theta_hat": 3, "largest": 4, "square": 1}
-"""State of an experiment; `largest` is ‖z‖², |ω_k|, |ε_k|, |u_k|, and `square` ∫‖z‖² dt."""
+_SIZES: Final = {"q": 4, "omega": 3, "last": 4, "theta_hat": 3, "within": 1, "largest": 4, "square": 1, "lasted": 1}
+"""State of an experiment, and what it has reached: ‖z‖², |ω_k|, |ε_k|, |u_k|; ∫‖z‖² dt; the time while `within`."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Experiments:
 
 
 class Outcome(NamedTuple):
-    """What each experiment reached, from its start on. Shapes (n,).
+    """What each experiment reached until it left the wire's ranges. Shapes (n,).
 
     Attributes:
         z: Largest ‖z‖ [1, rad/s].
@@ -91,6 +92,7 @@ class Outcome(NamedTuple):
         eps: Largest |ε_k| [1].
         u: Largest |u_k| of the motors present, as the law asks [V].
         square: ∫‖z‖² dt [s].
+        lasted: Time until it left [s].
         V: V at the start [N·m].
     """
 
@@ -99,6 +101,7 @@ class Outcome(NamedTuple):
     eps: Floats
     u: Floats
     square: Floats
+    lasted: Floats
     V: Floats
 
 
@@ -140,6 +143,7 @@ class Loops:
         self._V = lyapunov(coordinates(q, omega, q_d, omega_d, np.ones(len(q)), C1), theta_error, law)
         for name, value in {"q": q, "last": q, "omega": omega, "theta_hat": chosen.theta_hat}.items():
             self._state[name][:] = value
+        self._state["within"][:] = 1.0
         self.forget()
         inputs = self._inputs
         inputs["theta"][:], inputs["offset"][:] = chosen.theta, chosen.offset
@@ -148,7 +152,8 @@ class Loops:
 
     def forget(self) -> None:
         """Begin anew with largest values and integrals."""
-        self._state["largest"][:] = self._state["square"][:] = 0.0
+        for name in ("largest", "square", "lasted"):
+            self._state[name][:] = 0.0
 
     def advance(self, ticks: int) -> Outcome:
         """Run some ticks; largest values since `begin` or `forget`."""
@@ -160,7 +165,8 @@ class Loops:
             state[:] = self._after
         self._k += ticks
         z_square, omega, eps, u = self._state["largest"].T.copy()
-        return Outcome(np.sqrt(z_square), omega, eps, u, self._state["square"][:, 0].copy(), self._V)
+        square, lasted = (self._state[name][:, 0].copy() for name in ("square", "lasted"))
+        return Outcome(np.sqrt(z_square), omega, eps, u, square, lasted, self._V)
 
 
 def balance(settings: Settings, q_d: Floats, omega_d: Floats, theta_error: Floats) -> Floats:
@@ -205,13 +211,17 @@ def tick_function(settings: Settings) -> ca.Function:
         "quantized": ca.SX.sym("quantized"),
     }
     state, desired, time, theta, torque, error, offset, with_quantizers = given.values()
-    q, omega, last, theta_hat, largest, square = ca.vertsplit(state, [0, *np.cumsum(list(_SIZES.values())).tolist()])
+    q, omega, last, theta_hat, within, largest, square, lasted = ca.vertsplit(
+        state, [0, *np.cumsum(list(_SIZES.values())).tolist()]
+    )
     q_d, omega_d, omega_d_dot = ca.vertsplit(desired, [0, 4, 7, 10])
 
-    def received(y: ca.SX, quantizer: Quantizer, shift: ca.SX, wave: ca.SX) -> ca.SX:
+    def received(y: ca.SX, quantizer: Quantizer, shift: ca.SX, wave: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """y^Q, and how far beyond the range y is."""
         o = shift * getattr(quantizer, "step", 0.0)
         on_grid = quantized(y + o, quantizer) - o
-        return ca.if_else(with_quantizers > 0, on_grid, y - quantizer.bound * wave)
+        beyond = with_quantizers * (_largest(y + o) - quantizer.limit)
+        return ca.if_else(with_quantizers > 0, on_grid, y - quantizer.bound * wave), beyond
 
     p = build_law(law)
     errors = ca.Function("errors", [p.q, p.omega, p.q_d, p.omega_d, p.s, p.C1], [ca.vertcat(p.z1, p.z2), p.z2])
@@ -219,20 +229,16 @@ def tick_function(settings: Settings) -> ca.Function:
 
     sent = ca.if_else(q[0] < 0, -1, 1) * q[1:4]
     wave = error[:3] * _course(error, time, ca.sign(z2))
-    eps = received(sent, wire.attitude.quantizer(), offset[:3], wave)
-    rate = received(omega, wire.rate.quantizer(), offset[3:6], wave)
+    eps, eps_beyond = received(sent, wire.attitude.quantizer(), offset[:3], wave)
+    rate, rate_beyond = received(omega, wire.rate.quantizer(), offset[3:6], wave)
     last, u, theta_hat, *_ = law_function(law, period)(
         last, theta_hat, eps, rate, q_d, omega_d, omega_d_dot, 1, law.C1, law.C2, law.Gamma
     )
     first = 3 - wire.actuators  # with two motors the first torque is fictitious: neither quantized nor limited
-    voltage, limit = wire.voltage.quantizer(), settings.plant.voltage_limit
-    opposite = ca.sign(ca.SX(np.array(law.allocation)).T @ wave)
-    motors = ca.if_else(
-        with_quantizers > 0,
-        ca.fmax(-limit, ca.fmin(limit, received(u, voltage, offset[6:], opposite))),
-        received(u, voltage, offset[6:], -opposite),
-    )
-    applied = ca.vertcat(u[:first], motors[first:])
+    pushed = -ca.sign(ca.SX(np.array(law.allocation)).T @ wave)  # as the wave's other errors push
+    motors, u_beyond = received(u[first:], wire.voltage.quantizer(), offset[6 + first :], pushed[first:])
+    limit = ca.if_else(with_quantizers > 0, settings.plant.voltage_limit, ca.inf)
+    applied = ca.vertcat(u[:first], ca.fmax(-limit, ca.fmin(limit, motors)))
 
     body = RigidBody(
         RigidBodySettings(
@@ -248,9 +254,17 @@ def tick_function(settings: Settings) -> ca.Function:
     moved = rk4(
         lambda x: body.derivative(x, applied, disturbance - theta * x[4:7]), ca.vertcat(q, omega), period, substeps=1
     )
-    now = [ca.sumsqr(z), _largest(omega), _largest(sent), _largest(u[first:])]
+    now = ca.vertcat(ca.sumsqr(z), _largest(omega), _largest(sent), _largest(u[first:]))
+    saturated = with_quantizers * (_largest(u[first:]) > settings.plant.voltage_limit)
+    beyond = ca.fmax(saturated, ca.mmax(ca.vertcat(eps_beyond, rate_beyond, u_beyond)))
     after = ca.vertcat(
-        body.settle(moved), last, theta_hat, ca.fmax(largest, ca.vertcat(*now)), square + period * now[0]
+        body.settle(moved),
+        last,
+        theta_hat,
+        within * (beyond <= 0),
+        ca.fmax(largest, within * now),
+        square + within * period * now[0],
+        lasted + within * period,
     )
     return ca.Function("tick", list(given.values()), [after], list(given), ["after"], {"cse": True})
 
