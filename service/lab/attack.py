@@ -74,6 +74,11 @@ class Statement(BaseModel):
     share: float | None = Field(description="found/bound [1]; above 1 the certificate is wrong")
     experiment: int | None = Field(default=None, description="number of the experiment in the file, from 0")
 
+    @property
+    def beaten(self) -> bool:
+        """Whether the bound is exceeded, beyond rounding."""
+        return self.share is not None and self.share > 1 + 1e-9
+
 
 class Attack(BaseModel):
     """Result of a search."""
@@ -176,7 +181,7 @@ def attack(
         seconds=took,
         ticks_per_s=(len(rounds) - before) * ROUND * ticks / took if len(rounds) > before else 0.0,
         left_ranges=int((reached_by_all["lasted"] < (ticks - 0.5) * settings.loop.period).sum()),
-        beaten=any(each.share is not None and each.share > 1 for each in done),
+        beaten=any(each.beaten for each in done),
         statements=done,
     )
 

@@ -290,14 +290,10 @@ def desired(settings: Settings, ticks: int) -> Floats:
     plan = Plan.of(settings.reference)
     t = np.arange(ticks) * settings.loop.period
     piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
-    found = reference_function().map(ticks)(
-        t[None],
-        plan.starts[piece][None],
-        plan.quintic[piece].transpose(2, 0, 1).reshape(3, -1),
-        plan.amplitude[piece].T,
-        plan.frequency[piece].T,
+    found = in_columns(reference_function(), ticks)(
+        t, plan.starts[piece], plan.quintic[piece].reshape(ticks, -1), plan.amplitude[piece], plan.frequency[piece]
     )
-    return np.ascontiguousarray(np.vstack([part.full() for part in found]).T)
+    return np.hstack([part.full() for part in found])
 
 
 def span(reference: Reference) -> float:

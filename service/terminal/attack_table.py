@@ -32,7 +32,7 @@ def attack_table(attack: Attack, *, verbose: bool = False) -> None:
 
 def _verdict(attack: Attack) -> tuple[str, str]:
     if attack.beaten:
-        beaten = [row.what for row in attack.statements if row.share is not None and row.share > 1]
+        beaten = [row.what for row in attack.statements if row.beaten]
         return f"Beaten: {', '.join(dict.fromkeys(beaten))} exceeds what is proven.", "bold red"
     if all(row.bound is None for row in attack.statements if row.what == "‖z‖"):
         return "No bound of ‖z‖ to beat: no invariant set is proven (`lab certify` says why).", "bold yellow"

@@ -137,9 +137,12 @@ def test_a_search_does_not_beat_what_is_proven_and_would_beat_less(out: str, inp
     assert largest(found, "‖z‖", "any") > 0.2
 
 
+@pytest.mark.processes
 def test_what_beats_a_bound_is_reported_and_exits_with_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    """Two workers compute, whenever they do: no time is in it."""
+
     def too_small(p: Premises, start: float = 0.0) -> Reach | None:
         at = reach(p, start)
         return at and replace(at, radius=0.3 * at.radius)
@@ -158,7 +161,7 @@ def test_what_beats_a_bound_is_reported_and_exits_with_1(
 
 
 def test_a_search_resumes_where_its_file_ends(tmp_path: Path) -> None:
-    settings, file = settings_of("8", "6"), tmp_path / "rounds.jsonl"
+    settings, file = settings_of("8", "6", "reference.kind=hold"), tmp_path / "rounds.jsonl"
     whole = attack(settings, 2 * ROUND, duration_s=0.1, out=tmp_path / "whole.jsonl")
     attack(settings, 1, duration_s=0.1, out=file)
     first = file.read_bytes()
@@ -179,7 +182,7 @@ def test_lemma_1_is_nearly_reached_and_half_of_it_is_broken() -> None:
     settings = settings_of("8", "6")
     found = attack(settings, 4 * ROUND, duration_s=0.01)
     shares = {s.what: s.found for s in found.statements if s.errors is None}
-    assert max(shares.values()) <= 1.0
+    assert not found.beaten
     assert min(shares[name] for name in ("C.26", "C.52", "C.53", "C.57")) > 0.85
 
     e = evaluate(settings)
