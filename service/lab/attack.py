@@ -46,6 +46,8 @@ _FREQUENCIES: Final = (0.3, 60.0)
 """Of waves: a tenth to ten times the loop's own, about [rad/s]."""
 DIVERGED: Final = 1e9
 """Stands for every value beyond it, and for NaN."""
+_SECTIONS: Final = ("loop", "wire", "reference", "law", "controller", "plant")
+"""Sections of the configuration that an attack depends on."""
 _LAYOUT: Final = {"theta": 3, "theta_hat": 3, "start": 6, "phase": 1, "torque": 6, "error": 6, "offset": 9}
 """Coordinates of an experiment, each −1…1. A wave has a vector, kind, frequency and angle."""
 Errors: TypeAlias = Literal["quantizers", "any"]
@@ -156,7 +158,8 @@ def attack(
     groups = _groups(settings, e)
     ticks = settings.loop.ticks(duration_s)
     instants = Instants(settings, e)
-    config = json.dumps(settings.description())
+    whole = settings.description()
+    config = json.dumps({name: whole[name] for name in _SECTIONS})
     file = _Rounds(out, {"seed": seed, "ticks": ticks, "disturbance": disturbance or 0.0, "config": config})
     rounds, before = file.rounds, len(file.rounds)
     while len(rounds) * ROUND < runs and (seconds is None or time.monotonic() - began < seconds or not rounds):

@@ -20,7 +20,7 @@ import numpy as np
 
 from aeroloop.plant_emulator.model.emulated import rk4
 from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
-from aeroloop.protocol.messages.operator import Points, Reference, Sinusoid, Stream
+from aeroloop.protocol.messages.operator import Points, Reference, Sinusoid
 from aeroloop.protocol.wire.quantizer import TIE, Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.service.config import Settings
@@ -112,9 +112,6 @@ class Loops:
         settings: The configuration.
         rows: How many.
         ticks: How long they run at most.
-
-    Raises:
-        ValueError: A stream, as its set-points are not known.
     """
 
     def __init__(self, settings: Settings, rows: int, ticks: int) -> None:
@@ -300,6 +297,4 @@ def span(reference: Reference) -> float:
     """A time within which the reference shows what it does, or most of it [s]."""
     if isinstance(reference, Sinusoid):
         return min(_LONGEST_S, _TURNS * 2 * pi / min([f for f in reference.frequency if f > 0], default=2 * pi))
-    if isinstance(reference, Stream):
-        raise ValueError("a stream's set-points are not known beforehand: attack a reference like them")
     return min(_LONGEST_S, reference.times[-1]) if isinstance(reference, Points) else 0.0
