@@ -17,15 +17,15 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from math import log, pi, sin
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings
 from aeroloop.service.control.reference import Floats
+from aeroloop.service.lab.attack_rounds import Round, Rounds, WorstInstants
 from aeroloop.service.lab.attacked_lemma import SIZE as INSTANT_SIZE
 from aeroloop.service.lab.attacked_lemma import Instants
 from aeroloop.service.lab.attacked_loops import WAVES, Experiments, Loops, Outcome, Wave
@@ -51,13 +51,6 @@ _SECTIONS: Final = ("loop", "wire", "reference", "law", "controller", "plant")
 _LAYOUT: Final = {"theta": 3, "theta_hat": 3, "start": 6, "phase": 1, "torque": 6, "error": 6, "offset": 9}
 """Coordinates of an experiment, each −1…1. A wave has a vector, kind, frequency and angle."""
 Errors: TypeAlias = Literal["quantizers", "any"]
-
-_Worst: TypeAlias = dict[str, tuple[float, list[float]]]
-"""Of each inequality: left over right side, and the instant."""
-
-
-class AttackError(AeroloopError):
-    """A search cannot begin or resume; one line with the reason."""
 
 
 class Statement(BaseModel):
@@ -96,14 +89,6 @@ class Attack(BaseModel):
     left_ranges: int = Field(description="experiments in which a value left the wire's range")
     beaten: bool = Field(description="whether anything exceeds what is proven")
     statements: list[Statement]
-
-
-class _Round(BaseModel):
-    """A line of the file: the points of a round, what they reached, and each inequality's worst instant so far."""
-
-    points: list[list[float]]
-    reached: dict[str, list[float]]
-    instants: _Worst
 
 
 class _Group(NamedTuple):
@@ -160,7 +145,7 @@ def attack(
     instants = Instants(settings, e)
     whole = settings.description()
     config = json.dumps({name: whole[name] for name in _SECTIONS})
-    file = _Rounds(out, {"seed": seed, "ticks": ticks, "disturbance": disturbance or 0.0, "config": config})
+    file = Rounds(out, {"seed": seed, "ticks": ticks, "disturbance": disturbance or 0.0, "config": config})
     rounds, before = file.rounds, len(file.rounds)
     while len(rounds) * ROUND < runs and (seconds is None or time.monotonic() - began < seconds or not rounds):
         if progress:
@@ -170,7 +155,7 @@ def attack(
         jobs = [(config, ticks, disturbance or 0.0, groups, batch) for batch in np.split(points, BATCHES)]
         parts = workers.each(_run, jobs) if workers else [_run(*job) for job in jobs]
         reached = {name: np.concatenate([getattr(part, name) for part in parts]).tolist() for name in Outcome._fields}
-        file.append(_Round(points=points.tolist(), reached=reached, instants=_instants(rng, rounds, instants)))
+        file.append(Round(points=points.tolist(), reached=reached, instants=_instants(rng, rounds, instants)))
     took = time.monotonic() - began
     if progress:
         progress(len(rounds) * ROUND, runs)
@@ -217,7 +202,7 @@ def _group_of(rows: int, groups: Sequence[_Group]) -> NDArray[np.intp]:
     return np.arange(rows) % len(groups)
 
 
-def _points(rng: np.random.Generator, rounds: Sequence[_Round], groups: Sequence[_Group]) -> Floats:
+def _points(rng: np.random.Generator, rounds: Sequence[Round], groups: Sequence[_Group]) -> Floats:
     """The next round: mutations of each group's best, and random points."""
     size = sum(_LAYOUT.values())
     group_of = _group_of(ROUND, groups)
@@ -280,7 +265,7 @@ def _wave(along: Floats, cube: Floats) -> Wave:
 
 
 def _instants(
-    rng: np.random.Generator, rounds: Sequence[_Round], instants: Instants
+    rng: np.random.Generator, rounds: Sequence[Round], instants: Instants
 ) -> dict[str, tuple[float, list[float]]]:
     """The worst instant of each inequality among new ones, some of them mutations of the worst so far."""
     worst = _worst_instants(rounds)
@@ -293,7 +278,7 @@ def _instants(
     return {name: max(pair, worst.get(name, pair), key=lambda each: each[0]) for name, pair in found.items()}
 
 
-def _worst_instants(rounds: Sequence[_Round]) -> _Worst:
+def _worst_instants(rounds: Sequence[Round]) -> WorstInstants:
     return rounds[-1].instants if rounds else {}
 
 
@@ -320,34 +305,6 @@ def _of_runs(reached: dict[str, Floats], e: Evaluated, groups: Sequence[_Group])
             )
 
 
-def _of_lemma(rounds: Sequence[_Round]) -> Iterator[Statement]:
+def _of_lemma(rounds: Sequence[Round]) -> Iterator[Statement]:
     for name, (share, _) in _worst_instants(rounds).items():
         yield Statement(what=name, unit="1", found=share, bound=1.0, share=share)
-
-
-class _Rounds:
-    """Rounds so far, in a file if one is given: its first line says of which search."""
-
-    def __init__(self, path: Path | None, head: dict[str, Any]) -> None:
-        self.rounds = list[_Round]()
-        self._path = path
-        if path is None:
-            return
-        try:
-            whole = path.read_bytes() if path.exists() else b""
-            whole = whole[: whole.rfind(b"\n") + 1]  # a line that was cut off is run again
-            first, *lines = whole.splitlines() or [b""]
-            if whole and json.loads(first) != head:
-                raise AttackError(f"{path} holds a search of another configuration, seed or length: name another file")
-            self.rounds += [_Round.model_validate_json(line) for line in lines]
-            path.write_bytes(whole or json.dumps(head).encode() + b"\n")
-        except OSError as error:
-            raise AttackError(f"{path} cannot be used: {error.strerror}") from None
-        except (json.JSONDecodeError, UnicodeDecodeError, ValidationError):
-            raise AttackError(f"{path} does not hold a search: name another file") from None
-
-    def append(self, done: _Round) -> None:
-        self.rounds.append(done)
-        if self._path is not None:
-            with self._path.open("ab") as file:
-                file.write(done.model_dump_json().encode() + b"\n")

@@ -20,7 +20,8 @@ from aeroloop.protocol.wire.quantizer import UniformQuantizer
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import Settings, load, with_bits
 from aeroloop.service.lab import attack as attacks
-from aeroloop.service.lab.attack import ROUND, Attack, AttackError, attack, experiments
+from aeroloop.service.lab.attack import ROUND, Attack, attack, experiments
+from aeroloop.service.lab.attack_rounds import AttackError
 from aeroloop.service.lab.attacked_lemma import SIZE, Instants
 from aeroloop.service.lab.attacked_loops import Experiments, Loops, Outcome, balance, desired, quantized
 from aeroloop.service.lab.experiment import run_experiment
@@ -172,10 +173,10 @@ def test_a_search_resumes_where_its_file_ends(tmp_path: Path) -> None:
     assert file.read_bytes() == (tmp_path / "whole.jsonl").read_bytes()
     assert resumed.statements == whole.statements
 
-    file.write_text("a diary\n")
+    file.write_text("a diary")
     with pytest.raises(AttackError, match="does not hold a search"):
         attack(settings, 1, out=file)
-    assert file.read_text() == "a diary\n"
+    assert file.read_text() == "a diary"
 
 
 def test_lemma_1_is_nearly_reached_and_half_of_it_is_broken() -> None:
