@@ -129,6 +129,51 @@ def certify(
 
 
 @group.command()
+def attack(
+    runs: Annotated[
+        int, typer.Option(min=1, help="Experiments, at least; the search goes on in rounds of 256.")
+    ] = 2048,
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="End after the round in which this time is over.", show_default=False)
+    ] = None,
+    duration: Annotated[float, typer.Option(metavar="S", min=0.01, help="Length of an experiment, in s.")] = 8.0,
+    disturbance: Annotated[float, typer.Option(min=0, help="Largest torque of the disturbance, in N·m.")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed finds the same.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Append each round to this file of JSON lines; the next time, go on.", show_default=False),
+    ] = None,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print every statement.")] = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Search, as an adversary, for a run of the paper's body that breaks the certificate; exit 1 if one is found."""
+    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    from aeroloop.service.lab.attack import attack
+    from aeroloop.service.lab.workers import Workers
+    from aeroloop.service.terminal.attack_table import attack_table
+    from aeroloop.service.terminal.display import count_bar
+
+    with guarded(), count_bar("experiments", hidden=json) as update, Workers() as workers:
+        result = attack(
+            settings,
+            runs,
+            seed=seed,
+            duration_s=duration,
+            disturbance=disturbance,
+            seconds=seconds,
+            out=out,
+            workers=workers,
+            progress=update,
+        )
+    show(result, json, lambda found: attack_table(found, verbose=verbose))
+    raise typer.Exit(1 if result.beaten else 0)
+
+
+@group.command()
 def burden(
     bits: Annotated[
         list[str] | None,
