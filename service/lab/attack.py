@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.service.config import Settings
+from aeroloop.service.control.law import ESTIMATE_REACH
 from aeroloop.service.control.reference import Floats
 from aeroloop.service.lab.attack_rounds import Round, Rounds, WorstInstants
 from aeroloop.service.lab.attacked_lemma import SIZE as INSTANT_SIZE
@@ -31,7 +32,7 @@ from aeroloop.service.lab.attacked_lemma import Instants
 from aeroloop.service.lab.attacked_loops import WAVES, Experiments, Loops, Outcome, Wave
 from aeroloop.service.lab.search_points import ball, proposals
 from aeroloop.service.lab.workers import Workers
-from aeroloop.service.theorem.certificate import PROJECTION, Evaluated, evaluate, largest_voltage
+from aeroloop.service.theorem.certificate import Evaluated, evaluate, largest_voltage
 from aeroloop.service.theorem.invariant import largest_start, reach
 
 BATCH: Final = 128
@@ -189,7 +190,7 @@ def _groups(settings: Settings, e: Evaluated) -> list[_Group]:
                 "z": at.radius,
                 "omega": at.axis_rate,
                 "eps": sin(at.half_angle),
-                "u": largest_voltage(settings, at),
+                "u": largest_voltage(settings, e.desired, at),
                 **({"mean_square": 1.0} if e.theorem.k and not start else {}),
             }
         )
@@ -244,7 +245,7 @@ def experiments(points: Floats, k_theta: float, k_tau_d: float, start: Floats, q
     return Experiments(
         start=ball(x) * start[:, None],
         theta=ball(theta) * k_theta,
-        theta_hat=ball(theta_hat) * k_theta / PROJECTION,
+        theta_hat=ball(theta_hat) * k_theta * ESTIMATE_REACH,
         phase=(phase[:, 0] + 1) / 2,
         torque=_wave(ball(torque[:, :3]) * k_tau_d, torque),
         error=_wave(error[:, :3] * (1 - quantized[:, None]), error),
