@@ -82,6 +82,24 @@ def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure
     return figure, axes
 
 
+def check_path(path: Path) -> Path:
+    """The path of a single figure. Raises ReviewError if its suffix or folder is wrong."""
+    suffixes = [f".{name}" for name in FORMATS]
+    if path.suffix not in suffixes:
+        raise ReviewError(f"a figure ends in {', '.join(suffixes)}, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise ReviewError(f"there is no folder {path.parent} for the figure")
+    return path
+
+
+def save_as(figure: Figure, path: Path) -> None:
+    """Save a figure in the format of the path's suffix. Raises ReviewError if it cannot be written."""
+    try:
+        figure.savefig(check_path(path), **FORMATS[path.suffix[1:]])
+    except OSError as error:
+        raise ReviewError(f"cannot write {path}: {error.strerror}") from None
+
+
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Save a figure in every format, and return the paths. Raises ReviewError if it cannot be written."""
     paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
