@@ -40,9 +40,9 @@ DURATION_S: Final = 20.0
 DIVERGED: Final = 0.3
 """‖z‖ of a diverged run; an attitude error of 17° alone has as much [1, rad/s]."""
 NO_SET: Final = "no set"
-_OLDEST_S: Final = 1.0
+OLDEST_S: Final = 1.0
 """Neither search goes beyond this age [s]."""
-_RESOLUTION_S: Final = 1e-6
+_RESOLUTION_S: Final = 1e-5
 
 
 class Ages(NamedTuple):
@@ -183,7 +183,7 @@ def largest_ages(settings: Settings, disturbance: float = 0.0) -> Ages:
 
 def _last(holds: Callable[[float], bool]) -> tuple[float | None, float]:
     """The last age at which it holds, by bisection, and the first at which it does not [s]; None if at none."""
-    low, high = 0.0, _OLDEST_S
+    low, high = 0.0, OLDEST_S
     if not holds(low):
         return None, low
     while high - low > _RESOLUTION_S:
@@ -212,7 +212,7 @@ def diverges_at(config: dict[str, Any], lost: bool, duration_s: float) -> int | 
     low, high = 0, max(1, settings.loop.ticks(0.1))
     while not diverges(high):
         low, high = high, 2 * high
-        if high * settings.loop.period > _OLDEST_S:
+        if high * settings.loop.period > OLDEST_S:
             return None
     while high - low > 1:
         middle = (low + high) // 2

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from aeroloop.service.lab.margins import Margin, Margins
+from aeroloop.service.lab.margins import OLDEST_S, Margin, Margins
 from aeroloop.service.report.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, WIDTH_IN, figure_style, save_as
 
 _STYLES: Final = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "p"), (BLACK, "D"))
@@ -35,7 +35,7 @@ def _figure(margins: Margins) -> Figure:
     _draw(delay, margins, lambda m: m.delay_ms, lambda m: m.diverges_delay_ms)
     _draw(lost, margins, lambda m: _ms(m.lost_frames, m), lambda m: _ms(m.diverges_lost_frames, m))
     delay.set_ylabel("beyond the hold of a period [ms]")
-    delay.set_ylim(top=1.8 * delay.get_ylim()[1])  # room for the names
+    delay.set_ylim(top=OLDEST_S * 1e3)
     for panel, name in ((delay, "delay, no frame lost"), (lost, "frames lost in a row · period, no delay")):
         panel.set_xlabel("rate [Hz]")
         panel.annotate(name, (0, 1), xycoords="axes fraction", xytext=(4, -4), textcoords="offset points", va="top")
@@ -67,7 +67,7 @@ def _draw(
             panel.plot(*places, line, color=color, marker=marker, markerfacecolor=face, markersize=4, linewidth=0.9)
     from_here = [[y for m in margins.margins if m.rate_hz == rate and (y := diverges(m))] for rate in rates]
     if all(from_here):
-        panel.fill_between(rates, [min(ys) for ys in from_here], 1e6, color="0.92", linewidth=0, zorder=0)
+        panel.fill_between(rates, [min(ys) for ys in from_here], OLDEST_S * 1e3, color="0.92", linewidth=0, zorder=0)
 
 
 def _styles(margins: Margins) -> list[tuple[str, tuple[str, str]]]:

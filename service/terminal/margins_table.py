@@ -15,27 +15,28 @@ def margins_table(margins: Margins) -> None:
     """Print the margins of every choice of bits and rate."""
     console = Console()
     first = {margin.bits: margin for margin in margins.margins}
-    ages = _table("largest age of a command", ["with a set, ms", "in its ranges, ms", "limited by"])
+    console.print(Text("largest age of a command", style="italic"))
+    ages = _table(["with a set, ms", "in its ranges, ms", "limited by"])
     for bits, margin in first.items():
         ages.add_row(bits, *map(Text, (_age(margin.set_age_ms), _age(margin.age_ms), margin.limited_by)))
     console.print(ages)
     rates = dict.fromkeys(f"{margin.rate_hz:g} Hz" for margin in margins.margins)
     grids: tuple[tuple[str, Callable[[Margin], str]], ...] = (
-        ("proven up to: delay, ms (or lost in a row)", _proven),
-        ("diverges from: delay, ms (or lost in a row)", _diverges),
+        ("proven up to: delay, ms (or frames lost in a row)", _proven),
+        ("simulation diverges from: delay, ms (or frames lost in a row)", _diverges),
     )
     for title, cell in grids:
-        grid = _table(title, [*rates])
+        grid = _table([*rates])
         for bits in first:
             grid.add_row(bits, *(Text(cell(margin)) for margin in margins.margins if margin.bits == bits))
-        console.print()
+        console.print(Text(f"\n{title}", style="italic"))
         console.print(grid)
     for line in _notes(margins):
         console.print(Text(f"\n{line}"), soft_wrap=not console.is_terminal)
 
 
-def _table(title: str, names: list[str]) -> Table:
-    table = Table("bits", title=title, title_justify="left", box=None, pad_edge=False)
+def _table(names: list[str]) -> Table:
+    table = Table("bits", box=None, pad_edge=False)
     for name in names:
         table.add_column(name, justify="left" if name == "limited by" else "right", min_width=10)
     return table
