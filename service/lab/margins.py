@@ -40,6 +40,7 @@ DURATION_S: Final = 20.0
 DIVERGED: Final = 0.3
 """‖z‖ of a diverged run; an attitude error of 17° alone has as much [1, rad/s]."""
 NO_SET: Final = "no set"
+FLOAT64: Final = "float64"
 OLDEST_S: Final = 1.0
 """Neither search goes beyond this age [s]."""
 _RESOLUTION_S: Final = 1e-5
@@ -81,7 +82,7 @@ class Margin(BaseModel):
     def bits(self) -> str:
         """Bits out and in, or float64."""
         if self.bits_out is self.bits_in is None:
-            return "float64"
+            return FLOAT64
         return "/".join("cont" if bits is None else str(bits) for bits in (self.bits_out, self.bits_in))
 
 

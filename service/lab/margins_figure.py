@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from aeroloop.service.lab.margins import OLDEST_S, Margin, Margins
+from aeroloop.service.lab.margins import FLOAT64, OLDEST_S, Margin, Margins
 from aeroloop.service.report.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, WIDTH_IN, figure_style, save_as
 
 _STYLES: Final = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "p"), (BLACK, "D"))
@@ -90,4 +90,5 @@ def _legend(margins: Margins) -> list[Line2D]:
 
 def _name(margins: Margins, bits: str) -> str:
     proven = any(margin.bits == bits and margin.delay_ms is not None for margin in margins.margins)
-    return bits if proven else f"{bits}, nothing proven"
+    name = bits if bits == FLOAT64 else f"{bits} bits"
+    return name if proven else f"{name}, nothing proven"

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from io import StringIO
 from itertools import pairwise, product
-from math import inf
+from math import hypot, inf, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ from matplotlib.image import imread
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load_over
+from aeroloop.service.control.controller import Controller
 from aeroloop.service.lab import margins
+from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.margins import (
     BITS,
     DIVERGED,
@@ -123,7 +125,8 @@ class Recording(EmulatedPlant):
     """Keeps what is in force in every period."""
 
     def __init__(self) -> None:
-        self.actuators, self.in_force, self.periods = 3, (0.0,), list[float]()
+        self.actuators, self.periods = 3, list[float]()
+        self.in_force: tuple[float, ...] = (0.0,)
 
     def actuate(self, voltages: Sequence[float]) -> None:
         self.in_force = tuple(voltages)
@@ -187,12 +190,29 @@ def test_the_search_finds_the_first_tick_that_diverges(monkeypatch: pytest.Monke
 
 
 def test_an_aero_is_simulated_as_the_paper_s_body() -> None:
-    """Three torques and what the law assumes of it: nothing is left to err but hold and coarse codes."""
+    """Three torques and what the law assumes of it: nothing is left to err but the hold."""
     body = three_torques(with_bits(PAPER, None, None))
     assert body.plant.rigid_body.allocation == body.law.allocation
+    assert [row[1:] for row in body.law.allocation[1:]] == [row[1:] for row in PAPER.law.allocation[1:]]
     assert body.wire.actuators == 3
-    assert largest_error(with_bits(at(PAPER, 200.0), None, None), 5.0) < 2e-3
     assert three_torques(FREE) == FREE
+    assert largest_error(at(body, 200.0), 5.0) < 2e-3
+
+
+def test_the_error_is_the_largest_z_of_the_second_half() -> None:
+    """Without quantization the controller's own errors are the true ones."""
+    body = three_torques(with_bits(at(PAPER, 100.0), None, None))
+    controller = Controller(body.wire, body.law, body.reference, body.loop.period)
+    norms = list[float]()
+
+    def watch(_k: int, _measurement: bytes, _command: bytes) -> None:
+        eps, omega, gains = controller.attitude_error, controller.rate_error, body.law.C1
+        z2 = [w + c * e for w, c, e in zip(omega, gains, eps, strict=True)]
+        norms.append(hypot(1 - sqrt(1 - hypot(*eps) ** 2), *eps, *z2))
+
+    run_experiment(body, 0.6, watch=watch, controller=controller)
+    assert largest_error(body, 0.6) == pytest.approx(max(norms[30:]), rel=1e-9)
+    assert max(norms[30:]) < 0.5 * max(norms)
 
 
 def made_up() -> Margins:
