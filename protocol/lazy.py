@@ -1,7 +1,7 @@
 """CasADi and NumPy, imported at their first use: reading a configuration or a message must not wait for them.
 
-They take most of the start of a command such as `aeroloop op stop`, which computes nothing. Modules that settings and
-messages are read with import them from here.
+They take a third of a second and 47 MB. `aeroloop show` and the recorder read the settings of law and plant, which
+stand beside their equations, and compute nothing. What settings and messages are read with imports them from here.
 """
 
 from __future__ import annotations

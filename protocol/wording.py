@@ -149,9 +149,10 @@ def _problem(shapes: Shapes, error: dict[str, Any]) -> str:
         return _unknown(shapes, place, key)
     if kind in ("value_error", "assertion_error"):
         text = str(error["ctx"]["error"])
-        of_a_section = isinstance(given, dict | BaseModel)  # its text names the values
+        named = isinstance(given, dict | BaseModel)  # of a section the text names the values
+        named |= isinstance(given, list) and any(isinstance(each, str) and each in text for each in given)
         joint = " " if text.startswith("must ") else ": "
-        return f"{key}{joint if key else ''}{text}{'' if of_a_section else f', not {_shown(given)}'}"
+        return f"{key}{joint if key else ''}{text}{'' if named else f', not {_shown(given)}'}"
     if kind == "json_invalid":
         return f"{key}: it is not JSON" if key else "it is not JSON"
     if kind in ("union_tag_invalid", "union_tag_not_found"):

@@ -1,4 +1,4 @@
-"""Configuration: all sections' models, filled from defaults, a TOML file, the environment and `--set`.
+"""Configuration: all sections' models, filled from defaults and from what `config_sources` reads.
 
 Each package owns the models of its own settings; only this module combines them. The defaults are the paper's
 experiment.
@@ -7,36 +7,28 @@ experiment.
 from __future__ import annotations
 
 import json
-import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, StringConstraints, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.network import NetworkSettings
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wording import Shapes, closest, problems
+from aeroloop.protocol.wording import Shapes, problems
+from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
+from aeroloop.service.config_sources import ConfigError as ConfigError
+from aeroloop.service.config_sources import merge, sources, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
-
-ENV_PREFIX: Final = "AEROLOOP_"
-"""Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
-
-
-class ConfigError(AeroloopError):
-    """The configuration is wrong; one line with the key and its allowed values."""
+from aeroloop.service.vehicle_address import VehicleAddress
 
 
 class PointsFile(BaseModel, extra="forbid"):
@@ -65,12 +57,9 @@ OneReference = Annotated[
 ]
 
 
-class Settings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
+class Settings(VehicleAddress):
     """Everything that can be configured; sections as in the TOML file."""
 
-    vehicle: Annotated[str, StringConstraints(pattern=f"^{topics.NAME}$")] = Field(
-        default="aero", description="name of the vehicle, one chunk of every key"
-    )
     loop: LoopSettings = Field(default=LoopSettings(), description="tick grid and process set-up of both ends")
     wire: WireSpec = Field(default=WireSpec(), description="quantizers and frames, on which both ends must agree")
     reference: OneReference = Field(default=Sinusoid(), description="attitude to follow over time")
@@ -79,9 +68,6 @@ class Settings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     plant: PlantSettings = Field(default=PlantSettings(), description="the plant end: plant, sensors, faults, limits")
     can: CanSettings = Field(default=CanSettings(), description="the CAN bus, for plant.via = 'can'")
     recorder: RecorderSettings = Field(default=RecorderSettings(), description="the recorder")
-    network: NetworkSettings = Field(
-        default=NetworkSettings(), description="Zenoh endpoints of this process and of others"
-    )
 
     @model_validator(mode="after")
     def _heartbeat_keeps_both_ends_alive(self) -> Settings:
@@ -144,10 +130,8 @@ def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         ConfigError: The configuration is wrong.
     """
     tree = Settings().description()
-    if file is not None:
-        _merge(tree, _read(file))
-    _merge(tree, _environment())
-    _merge(tree, _tree(overrides))
+    for given in sources(file, overrides, Settings):
+        merge(tree, given)
     return from_description(tree)
 
 
@@ -157,7 +141,9 @@ def as_overrides(settings: Mapping[str, Any], section: str = "") -> list[str]:
     for name, value in settings.items():
         if isinstance(value, Mapping) and value:
             words += as_overrides(value, f"{section}{name}.")
-        else:
+        elif value is None and name.rpartition(".")[2] == "bits":
+            words.append(f"{section}{name}=cont")  # as in a TOML file, which has no null
+        elif value is not None:  # a None is a key that is not set
             words.append(f"{section}{name}={json.dumps(value, ensure_ascii=False, default=str)}")
     return words
 
@@ -177,92 +163,8 @@ def from_description(config: dict[str, Any]) -> Settings:
 def load_over(settings: Settings, overrides: Sequence[str]) -> Settings:
     """A configuration with some values replaced. Raises ConfigError as `load` does."""
     tree = settings.description()
-    for override in overrides:
-        _merge(tree, _tree([override]))
+    merge(tree, tree_of(overrides))
     return from_description(tree)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        tree = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"no configuration file at {file}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file} is not TOML: {error}") from None
-    reference = tree.get("reference")
-    if isinstance(reference, dict) and isinstance(reference.get("path"), str):
-        reference["path"] = str(file.parent / reference["path"])
-    return tree
-
-
-def _environment() -> dict[str, Any]:
-    given = {name: text for name, text in os.environ.items() if name.upper().startswith(ENV_PREFIX)}
-    known = {_variable(key): key for key, _ in Shapes(Settings).every_key()} if given else {}
-    tree: dict[str, Any] = {}
-    for name, text in sorted(given.items()):
-        variable, _, option = name.upper().partition(_OPTIONS)
-        if option:
-            _merge(tree, {"can": {"options": {option.lower(): _value(text)}}})
-        elif variable in known:
-            _put(tree, known[variable], _value(text))
-        else:
-            found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
-            hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"
-            raise ConfigError(f"{name} in the environment is no setting: {hint}")
-    return tree
-
-
-def _variable(key: str) -> str:
-    return ENV_PREFIX + key.upper().replace(".", "__")
-
-
-_OPTIONS: Final = _variable("can.options.")
-"""What follows it names an option of the CAN interface; any may be given."""
-
-
-def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
-    value: Any
-    present: Any
-    for name, value in changes.items():
-        present = tree.get(name)
-        # A reference of another kind has other keys; the kinds of a quantizer share theirs.
-        other_kind = name == "reference" and isinstance(value, dict) and "kind" in value
-        if (
-            isinstance(value, dict)
-            and isinstance(present, dict)
-            and not (other_kind and value["kind"] != present["kind"])
-        ):
-            _merge(present, value)
-        else:
-            tree[name] = value
-
-
-def _tree(overrides: Sequence[str]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals or not key:
-            raise ConfigError(f"--set takes section.key=value, not {override!r}")
-        _put(tree, key.strip(), _value(text.strip()))
-    return tree
-
-
-def _put(tree: dict[str, Any], key: str, value: Any) -> None:
-    *sections, name = key.split(".")
-    for section in sections:
-        tree = tree.setdefault(section, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"{section} is given a value, and then {key}: set its keys one by one")
-    tree[name] = value
-
-
-def _value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
 
 
 def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
@@ -271,14 +173,10 @@ def with_bits(settings: Settings, bits_out: str | None, bits_in: str | None) -> 
     Raises:
         ConfigError: Not a number of bits, and not "cont".
     """
-    wire = settings.wire.model_dump()
+    overrides: list[str] = []
     for bits, signals, option in ((bits_out, ("attitude", "rate"), "--bits-out"), (bits_in, ("voltage",), "--bits-in")):
         if bits is not None:
             if bits != "cont" and not (bits.isdecimal() and MIN_BITS <= int(bits) <= MAX_BITS):
                 raise ConfigError(f"{option} takes {MIN_BITS} to {MAX_BITS} bits or cont, not {bits!r}")
-            for signal in signals:
-                wire[signal]["bits"] = bits if bits == "cont" else int(bits)
-    try:
-        return settings.model_copy(update={"wire": WireSpec.model_validate(wire)})
-    except ValidationError as error:  # some kinds of quantizer allow other numbers of bits
-        raise ConfigError("; ".join(f"wire.{problem}" for problem in problems(error, WireSpec))) from None
+            overrides += [f"wire.{signal}.bits={bits}" for signal in signals]
+    return load_over(settings, overrides)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class ControllerSettings(BaseModel):
+class ControllerSettings(BaseModel, extra="forbid"):
     """Settings of the controller daemon."""
-
-    model_config = ConfigDict(extra="forbid")
 
     stale_s: float = Field(
         default=0.1, gt=0, le=10, description="stop commanding after this long without a measurement [s]"
@@ -59,14 +57,13 @@ class ControllerSettings(BaseModel):
     )
 
 
-class RecorderSettings(BaseModel):
+class RecorderSettings(BaseModel, extra="forbid"):
     """Settings of the recorder."""
-
-    model_config = ConfigDict(extra="forbid")
 
     directory: Path = Field(default=Path("logs"), description="folder of logs without a given path")
     path: Path | None = Field(
-        default=None, description="the log's first file, or a folder; named by the time if left out"
+        default=None,
+        description="the log's first file, or a folder (a name without an ending is one)",
     )
     chunk_s: float = Field(
         default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut loses [s]"

@@ -13,7 +13,8 @@ PROCESSES = ("tests/hil/", "tests/can/test_buses.py", "tests/can/test_socketcan.
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what starts processes: `-m "not processes"` is the fast loop."""
+    """Mark what starts processes: `-m "not processes"` is the fast loop. Checks of types come first."""
+    items.sort(key=lambda item: item.path.name != "test_house.py")  # last, they would keep one core while others idle
     for item in items:
         if any(part in item.path.as_posix() for part in PROCESSES):
             item.add_marker(pytest.mark.processes)

@@ -26,13 +26,24 @@ MAX_WITHIN_S: Final = 600.0
 
 
 class Message(BaseModel):
-    """Base of all messages. Unknown fields are refused, so that a message of another version is not read in part."""
+    """Base of all messages. Unknown fields are refused, so that a message of another version is not read in part.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    A model's parser is built at its first use: a command of `aeroloop op` uses few of them, and starts sooner. A loop
+    builds all of them before its first tick, with `build_messages`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     def encode(self) -> bytes:
         """The message as JSON."""
         return self.model_dump_json().encode()
+
+
+def build_messages(base: type[Message] = Message) -> None:
+    """Build the parsers of all messages derived from `base`, some milliseconds each."""
+    for model in base.__subclasses__():
+        model.model_rebuild()
+        build_messages(model)
 
 
 def _finite(triple: Vector) -> Vector:

@@ -10,6 +10,9 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, Generic, TypeVar
 
+NOT_RECORDING: Final = "not recording"
+"""State of a recorder that cannot write."""
+
 
 class PlantState(StrEnum):
     """What the plant end is doing."""

@@ -125,27 +125,27 @@ class Tail(Message):
 
 
 _COLUMNS: Final[dict[End, dict[str, str]]] = {
-    "controller": {"tick": "<u4", "received_as": "u1", "sent_as": "u1", "received": "<u4", "sent": "<u4"},
+    "controller": {"tick": "I", "received_as": "B", "sent_as": "B", "received": "I", "sent": "I"},
     "plant": {
-        "tick": "<u8",
-        "session_tick": "<u4",
-        "sent_as": "u1",
-        "received_as": "u1",
-        "outcome": "u1",
-        "trip": "u1",
-        "answered": "<u4",
-        "sent": "<u4",
-        "received": "<u4",
+        "tick": "Q",
+        "session_tick": "I",
+        "sent_as": "B",
+        "received_as": "B",
+        "outcome": "B",
+        "trip": "B",
+        "answered": "I",
+        "sent": "I",
+        "received": "I",
     },
 }
-"""Types of a row's columns, before the frames and, at the plant, the voltages."""
+"""Types of a row's columns, as `struct` and numpy name them, before the frames and, at the plant, the voltages."""
 
 
 def row_dtype(end: End, measurement: int, command: int, actuators: int) -> np.dtype[np.void]:
     """Fields of a row, in the order of the columns. Sizes of the frames in bytes."""
     frames = [("measurement", f"V{measurement}"), ("command", f"V{command}")]
     voltages = [("voltages", "<f8", (actuators,))] if end == "plant" else []
-    return np.dtype([*_COLUMNS[end].items(), *frames, *voltages])
+    return np.dtype([*((name, f"<{kind}") for name, kind in _COLUMNS[end].items()), *frames, *voltages])
 
 
 class Header(NamedTuple):
@@ -450,5 +450,5 @@ def batches_per_s(loop: LoopSettings) -> float:
 
 def _record_format(end: End, measurement: int, command: int, actuators: int) -> str:
     """`row_dtype` as a format of struct."""
-    frames = f"{measurement}s{command}s"
-    return f"<IBBII{frames}" if end == "controller" else f"<QIBBBBIII{frames}{actuators}d"
+    voltages = f"{actuators}d" if end == "plant" else ""
+    return f"<{''.join(_COLUMNS[end].values())}{measurement}s{command}s{voltages}"

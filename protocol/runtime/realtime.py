@@ -1,4 +1,4 @@
-"""Real-time set-up of a process: scheduling class, locked memory, CPU affinity, no garbage collection.
+"""Real-time set-up of a process: scheduling class, locked memory, CPU affinity, no garbage collection, built parsers.
 
 Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
 second, which is warm-up, and stay. Without `MCL_ONFAULT`, every thread's stack and malloc's arenas are made resident in
@@ -14,6 +14,7 @@ from errno import EINVAL
 from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import build_messages
 from aeroloop.protocol.wire.loop import LoopSettings
 
 _PR_SET_TIMERSLACK: Final = 29
@@ -27,7 +28,7 @@ class RealtimeError(AeroloopError):
 
 
 def prepare_process(settings: LoopSettings) -> list[str]:
-    """Apply the real-time settings to this process, and report what was refused.
+    """Prepare this process for a loop: build the parsers of messages, apply the real-time settings.
 
     The garbage collector is switched off (the loop makes no cycles), the timer slack set to its minimum, memory locked,
     the process bound to `cpus`, SCHED_FIFO requested.
@@ -38,6 +39,7 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     Raises:
         RealtimeError: A setting was refused, and `realtime` is strict.
     """
+    build_messages()
     if settings.realtime == "off":
         return []
     gc.collect()

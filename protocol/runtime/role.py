@@ -168,6 +168,8 @@ class Role:
     def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
         """Answer a topic's queries between ticks, when the owner calls `take_inbox`.
 
+        A query whose key expression does not end with the topic's name is not answered and changes nothing.
+
         Args:
             topic: Name of a query in the table.
             model: Model of the request; any other payload is answered by an Answer with the error.
@@ -175,6 +177,7 @@ class Role:
                 returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
         """
         key = topics.key(topic, self.vehicle)
+        name = key.rpartition("/")[2]
 
         def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
             try:
@@ -185,6 +188,9 @@ class Role:
             query.drop()
 
         def received(query: zenoh.Query) -> None:
+            if not str(query.key_expr).endswith(f"/{name}"):  # `**`, by which tools list a network, asks for no verb
+                query.drop()
+                return
             try:
                 action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
             except ValidationError as error:

@@ -7,8 +7,9 @@ decodes to NaN.
     code   −2^(R−1)   −(2^(R−1) − 1)  …  −1   0   1  …  2^(R−1) − 1
     level  NaN        −y_max          …  −y₁  0   y₁ …  y_max
 
-With the paper's dead zone y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). For any other y₀ the step is such
-that the outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1).
+With y₀ = l/2 the levels are k·l and l = 2·limit / (2^R − 1). The paper gives this l and says only y₀ > 0; l/2 is
+inferred: with it, 2^R − 1 intervals of that length fill the range exactly. For any other y₀ the step is such that the
+outermost interval ends exactly at the limit, too: l = (limit − y₀) / (2^(R−1) − 1).
 
 The uniform quantizer is the paper's; `hysteresis` and `logarithmic` define two more kinds (Remark 8).
 """
@@ -125,7 +126,7 @@ class UniformQuantizer(CodedQuantizer):
     Args:
         bits: R, 2…16.
         limit: Edge of the range [signal's unit], > 0.
-        deadzone: y₀ [signal's unit]; l/2 if None, as in the paper.
+        deadzone: y₀ [signal's unit]; l/2 if None, as inferred from the paper's l.
 
     Attributes:
         step: l, the length of an interval [signal's unit].

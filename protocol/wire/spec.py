@@ -154,15 +154,13 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
 
     def differences(self, other: WireSpec) -> list[str]:
         """Where two specs differ, one line a field: `rate.bits: 8, not 10`. Empty if they are the same wire."""
-        mine, theirs = _flat(self.model_dump()), _flat(other.model_dump())
+        mine, theirs = flat(self.model_dump()), flat(other.model_dump())
         return [f"{name}: {mine[name]}, not {theirs[name]}" for name in mine if mine[name] != theirs[name]]
 
 
-def _flat(tree: dict[str, object], prefix: str = "") -> dict[str, object]:
-    leaves: dict[str, object] = {}
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested sections, by `section.key`."""
+    leaves: dict[str, Any] = {}
     for name, value in tree.items():
-        if isinstance(value, dict):
-            leaves |= _flat(value, f"{prefix}{name}.")
-        else:
-            leaves[prefix + name] = value
+        leaves |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return leaves

@@ -19,19 +19,25 @@ TYPE_CHECKING = (
 if TYPE_CHECKING:
     from typing import Any, Final
 
-    from aeroloop.plant_emulator.plant import Measurement, Plant
-    from aeroloop.protocol.errors import AeroloopError
-    from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-    from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-    from aeroloop.protocol.wire.quantizer import UniformQuantizer
-    from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-    from aeroloop.research import RecordedRun, certify, load_settings, read_run, run_experiment
-    from aeroloop.service.config import Settings
-    from aeroloop.service.control.controller import Controller
-    from aeroloop.service.figures import Figures
-    from aeroloop.service.logs.ticks import Ticks
-    from aeroloop.service.testing.hil import Hil
-    from aeroloop.service.theorem.certificate import Certificate
+    from aeroloop.plant_emulator.plant import Measurement as Measurement
+    from aeroloop.plant_emulator.plant import Plant as Plant
+    from aeroloop.protocol.errors import AeroloopError as AeroloopError
+    from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer as HysteresisQuantizer
+    from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer as LogarithmicQuantizer
+    from aeroloop.protocol.wire.quantizer import UniformQuantizer as UniformQuantizer
+    from aeroloop.protocol.wire.spec import SignalSpec as SignalSpec
+    from aeroloop.protocol.wire.spec import WireSpec as WireSpec
+    from aeroloop.research import RecordedRun as RecordedRun
+    from aeroloop.research import certify as certify
+    from aeroloop.research import load_settings as load_settings
+    from aeroloop.research import read_run as read_run
+    from aeroloop.research import run_experiment as run_experiment
+    from aeroloop.service.config import Settings as Settings
+    from aeroloop.service.control.controller import Controller as Controller
+    from aeroloop.service.figures import Figures as Figures
+    from aeroloop.service.logs.ticks import Ticks as Ticks
+    from aeroloop.service.testing.hil import Hil as Hil
+    from aeroloop.service.theorem.certificate import Certificate as Certificate
 
 _HOMES: Final = {
     "AeroloopError": "aeroloop.protocol.errors",
@@ -56,27 +62,7 @@ _HOMES: Final = {
 }
 """Module of each public name. Names load on first use: `import aeroloop` stays light, and so does every command."""
 
-__all__ = [
-    "AeroloopError",
-    "Certificate",
-    "Controller",
-    "Figures",
-    "Hil",
-    "HysteresisQuantizer",
-    "LogarithmicQuantizer",
-    "Measurement",
-    "Plant",
-    "RecordedRun",
-    "Settings",
-    "SignalSpec",
-    "Ticks",
-    "UniformQuantizer",
-    "WireSpec",
-    "certify",
-    "load_settings",
-    "read_run",
-    "run_experiment",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

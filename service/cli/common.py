@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.config import Settings
+    from aeroloop.service.vehicle_address import VehicleAddress
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -51,6 +52,18 @@ BitsOut = Annotated[
 BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files; never a log.")]
+Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown.")]
+NewLog = Annotated[Path | None, typer.Option("--log", help="New log, or its folder.", show_default=False)]
+Require = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--require",
+        metavar="FIGURE=LIMIT",
+        help="Exit with 1 unless a figure (of every run) is at most this, such as z_track=50e-4, skipped=0 or "
+        "latency.p99=2000; theorem=1: unless the run kept to all that is proven.",
+        show_default=False,
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Log only warnings and errors.")]
 LogFormat = Annotated[Literal["text", "json"], typer.Option("--log-format", help="Format of the log lines on stderr.")]
 WithParent = Annotated[int, typer.Option("--with-parent", metavar="PID", help="End with this process.", hidden=True)]
@@ -113,6 +126,14 @@ def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str
     return reloadable(config, overrides, *more)[0]
 
 
+def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleAddress:
+    """Vehicle and network of the effective configuration; a configuration error ends the command."""
+    from aeroloop.service.vehicle_address import load_vehicle_address
+
+    with checked():
+        return load_vehicle_address(config, overrides or ())
+
+
 def reloadable(
     config: Path | None, overrides: Sequence[str] | None, *more: str
 ) -> tuple[Settings, Callable[[], Settings]]:
@@ -122,7 +143,7 @@ def reloadable(
     def again() -> Settings:
         return load(config, [*(overrides or ()), *more])
 
-    with _configured():
+    with checked():
         return again(), again
 
 
@@ -130,18 +151,8 @@ def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) 
     """The settings with the bits given on the command line."""
     from aeroloop.service.config import with_bits
 
-    with _configured():
+    with checked():
         return with_bits(settings, bits_out, bits_in)
-
-
-@contextmanager
-def _configured() -> Iterator[None]:
-    try:
-        yield
-    except AeroloopError as error:
-        if state["debug"]:
-            raise
-        fail(str(error), 2)
 
 
 @contextmanager
@@ -174,12 +185,14 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
 
     try:
         yield
-    except ValidationError as error:
+    except (ValidationError, AeroloopError) as error:
+        if state["debug"]:
+            raise
+        if isinstance(error, AeroloopError):
+            fail(str(error), 2)
         from aeroloop.protocol.wording import problems
 
         fail(problems(error, *models)[0], 2)
-    except AeroloopError as error:
-        fail(str(error), 2)
 
 
 def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:

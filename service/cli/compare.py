@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Force, Json, checked, fail, guarded
+from aeroloop.service.cli.common import Force, Json, Require, checked, fail, guarded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,15 +22,7 @@ Html = Annotated[
 def compare(
     logs: Annotated[list[Path], typer.Argument(help="MCAP logs, or a folder for each run.", show_default=False)],
     html: Html = None,
-    require: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--require",
-            metavar="FIGURE=LIMIT",
-            help="Exit with 1 unless this figure of every run is at most that.",
-            show_default=False,
-        ),
-    ] = None,
+    require: Require = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -72,8 +64,8 @@ def check_page(out: Path, logs: Sequence[Path], force: bool) -> None:
 def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
     """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
     from aeroloop.service.logs.outputs import writing
-    from aeroloop.service.report.page.page import write_page
+    from aeroloop.service.report.page.page import page
 
     with writing(out, logs, force=force) as part:
-        write_page(reports, part)
+        part.write_text(page(reports), encoding="utf-8")
     typer.echo(f"aeroloop: wrote {out}", err=True)

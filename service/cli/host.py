@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, guarded, settings_of, show
+from aeroloop.service.cli.common import Config, Json, NewLog, Overrides, guarded, settings_of, show
 
 group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
 
@@ -29,19 +29,18 @@ def doctor(json: Json = False, config: Config = None, overrides: Overrides = Non
 @group.command()
 def soak(
     minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="Length of the soak, in minutes.")] = 20.0,
-    log: Annotated[Path | None, typer.Option("--log", help="Path of the new log.", show_default=False)] = None,
+    log: NewLog = None,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Run the three processes for a long time and report growth, drift and losses."""
     settings = settings_of(config, overrides)
-    from datetime import datetime
-
     from aeroloop.service.lab.soak import run_soak
+    from aeroloop.service.recording.rolling import log_path
     from aeroloop.service.terminal.display import progress_bar, soak_table
 
-    path = log or settings.recorder.directory / datetime.now().strftime("soak-%Y%m%d-%H%M%S.mcap")
+    path = log_path(log or settings.recorder.directory, "soak-%Y%m%d-%H%M%S.mcap")
     with guarded(), progress_bar("soak", minutes * 60, hidden=json) as update:
         result = run_soak(settings, minutes, path, update)
     show(result, json, soak_table)

@@ -17,6 +17,7 @@ from aeroloop.service.cli.common import (
     Duration,
     Force,
     Json,
+    Markdown,
     Overrides,
     checked,
     fail,
@@ -55,7 +56,10 @@ def experiment(
 @group.command()
 def tables(
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Print how the errors change with what was not fitted; takes minutes.")
+    ] = False,
+    markdown: Markdown = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -63,9 +67,17 @@ def tables(
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
     settings = settings_of(config, overrides)
     from aeroloop.service.lab.tables import markdown as as_markdown
-    from aeroloop.service.lab.tables import predict
-    from aeroloop.service.terminal.display import count_bar, paper_tables
+    from aeroloop.service.lab.tables import markdown_table, predict
+    from aeroloop.service.terminal.display import count_bar, paper_tables, rows_table
 
+    if sensitivity:
+        from aeroloop.service.lab.sensitivity import measure_sensitivity, rows
+
+        with guarded(), count_bar("cells", hidden=json) as update:
+            changes = measure_sensitivity(settings, seeds, update)
+        text = rows(changes)
+        show(changes, json, lambda _: typer.echo(markdown_table(text)) if markdown else rows_table(text))
+        return
     with guarded(), count_bar("cells", hidden=json) as update:
         result = predict(settings, seeds, update)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)
@@ -193,7 +205,7 @@ def burden(
         Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
     ] = None,
     force: Force = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    markdown: Markdown = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,

@@ -14,6 +14,7 @@ from aeroloop.service.cli.common import (
     Force,
     Json,
     Overrides,
+    Require,
     checked,
     fail,
     guarded,
@@ -55,15 +56,7 @@ def review(
     until_s: Annotated[
         float | None, typer.Option("--to", metavar="S", help="Draw to this time only.", show_default=False)
     ] = None,
-    require: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--require",
-            metavar="FIGURE=LIMIT",
-            help="Exit with 1 unless a figure is at most this, such as z_track=50e-4, skipped=0 or latency.p99=2000.",
-            show_default=False,
-        ),
-    ] = None,
+    require: Require = None,
     session: Annotated[
         str | None,
         typer.Option("--session", metavar="N|NAME", help="Session; the longest if left out.", show_default=False),

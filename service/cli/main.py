@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from difflib import get_close_matches
+from itertools import takewhile
 from typing import Annotated, Any, Final
 
 import typer
+from pydantic_core import ValidationError
 from typer.core import TyperOption
 from typer.exceptions import TyperException
 
@@ -52,9 +54,10 @@ def execute(arguments: Sequence[str]) -> int:
     try:
         return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
-        if message := error.format_message():  # empty where no verb was given and help was printed
+        if message := _reason(error):  # empty where no verb was given and help was printed
             context = getattr(error, "ctx", None)
-            command = context.command_path if context else "aeroloop"
+            words = takewhile(lambda word: not word.startswith("-"), arguments[:2])
+            command = context.command_path if context else " ".join(["aeroloop", *words])
             typer.echo(f"aeroloop: {message.rstrip('.')}{_alike(error)} (see `{command} --help`)", err=True)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
@@ -71,6 +74,31 @@ def execute(arguments: Sequence[str]) -> int:
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         report(f"unexpected {text}; `aeroloop --debug …` shows where")
         return 1
+
+
+_MUST_BE: Final = {
+    "float_parsing": "must be a number",
+    "int_parsing": "must be a whole number",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than_equal": "must be at most {le}",
+    "value_error": "{error}",
+}
+"""By the type of pydantic's errors, what the value of an option or an argument must be."""
+
+
+def _reason(error: TyperException) -> str:
+    """What is wrong with a command line: pydantic's and Typer's own words are for programmers."""
+    if alike := getattr(error, "possibilities", None):
+        return f"No such option: {getattr(error, 'option_name', '')}; did you mean {' or '.join(sorted(alike))}?"
+    parameter, cause = getattr(error, "param", None), error.__cause__
+    if parameter is not None and isinstance(cause, ValidationError):
+        found = cause.errors()[0]
+        if text := _MUST_BE.get(found["type"]):
+            name = parameter.opts[0] if parameter.opts else parameter.name
+            given = "" if found["type"] == "value_error" else f", not {found['input']!r}"
+            joint = ":" if found["type"] == "value_error" else ""
+            return f"{name}{joint} {text.format(**found.get('ctx', {}))}{given}"
+    return error.format_message()
 
 
 def _alike(error: TyperException) -> str:

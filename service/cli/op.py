@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, Overrides, checked, fail, guarded, settings_of
+from aeroloop.service.cli.common import Config, Json, Overrides, address_of, checked, fail, guarded
 
 if TYPE_CHECKING:
     from aeroloop.protocol.messages.operator import Message, Reference
-    from aeroloop.service.config import Settings
     from aeroloop.service.host.operator import Stopped
+    from aeroloop.service.vehicle_address import VehicleAddress
 
 Three = tuple[float, float, float]
 Within = Annotated[
@@ -42,12 +42,12 @@ def status(
     overrides: Overrides = None,
 ) -> None:
     """Print the status of every role of every vehicle on the network; exits with 1 if no role answers."""
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     from aeroloop.service.host.health import troubles
     from aeroloop.service.host.operator import gather
 
     with guarded():
-        found = gather(settings.network)
+        found = gather(address.network)
     well = not check or not troubles(found)
     if json:
         from json import dumps
@@ -72,7 +72,7 @@ def status(
 @group.command()
 def top(config: Config = None, overrides: Overrides = None) -> None:
     """Show every vehicle and role on the network, live; s stops, q quits."""
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     import threading
 
     from aeroloop.service.terminal.display import live_screen
@@ -85,11 +85,11 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
         signals.append(number)
         stop.set()
 
-    footer = Footer(lambda: _stop(settings), _stopped_vehicle(settings) or "every plant")
+    footer = Footer(lambda: _stop(address), _stopped_vehicle(address) or "every plant")
     with guarded(), keyboard() as read, live_screen() as show:
         for which in (signal.SIGINT, signal.SIGTERM):
             signal.signal(which, end)
-        watch(settings.network, show, stop, read, footer)
+        watch(address.network, show, stop, read, footer)
     if signals:
         raise typer.Exit(128 + signals[0])
 
@@ -102,11 +102,11 @@ def show(
     overrides: Overrides = None,
 ) -> None:
     """Print gains and reference as the commands that set them."""
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     from aeroloop.service.host.operator import show as record_of
 
     with guarded():
-        record = record_of(settings.network, settings.vehicle, last=last)
+        record = record_of(address.network, address.vehicle, last=last)
     if json:
         typer.echo(record.model_dump_json(indent=2))
     else:
@@ -119,7 +119,7 @@ def show(
 @group.command()
 def arm(config: Config = None, overrides: Overrides = None) -> None:
     """Arm the plant for the next claim, and let controllers that hold or are faulted claim again."""
-    _send(settings_of(config, overrides), "arm")
+    _send(address_of(config, overrides), "arm")
 
 
 @group.command()
@@ -129,30 +129,30 @@ def stop(
     overrides: Overrides = None,
 ) -> None:
     """Stop the configured vehicle's plant at once, or all plants if none is configured: 0 V until `op arm`."""
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     with guarded():
-        answers, failures = _stop(settings, every=every)
+        answers, failures = _stop(address, every=every)
     for line in answers:
         typer.echo(line)
     if failures:
         fail("; ".join(failures), 1)
 
 
-def _stop(settings: Settings, *, every: bool = False) -> Stopped:
+def _stop(address: VehicleAddress, *, every: bool = False) -> Stopped:
     from aeroloop.service.host.operator import stop as stop_plants
 
-    return stop_plants(settings.network, None if every else _stopped_vehicle(settings))
+    return stop_plants(address.network, None if every else _stopped_vehicle(address))
 
 
-def _stopped_vehicle(settings: Settings) -> str | None:
+def _stopped_vehicle(address: VehicleAddress) -> str | None:
     """The vehicle that is stopped: the configured one, or every vehicle if none is configured."""
-    return settings.vehicle if "vehicle" in settings.model_fields_set else None
+    return address.vehicle if "vehicle" in address.model_fields_set else None
 
 
 @group.command()
 def release(config: Config = None, overrides: Overrides = None) -> None:
     """Make the controller release the vehicle and hold until `op arm`, so that another can claim it."""
-    _send(settings_of(config, overrides), "stand_down")
+    _send(address_of(config, overrides), "stand_down")
 
 
 @group.command()
@@ -173,7 +173,7 @@ def inject(
     from aeroloop.plant_emulator.faults.language import Fault
     from aeroloop.protocol.messages.operator import Inject
 
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     if not (faults or clear):
         fail("name a fault, such as rate:off@1..2, or give --clear", 2)
     try:
@@ -182,7 +182,7 @@ def inject(
         fail(str(error), 2)
     with checked():
         message = Inject(faults=texts, clear=clear)
-    _send(settings, "inject", message)
+    _send(address, "inject", message)
 
 
 @group.command("set-gains")
@@ -200,12 +200,12 @@ def set_gains(
     """Change the law's gains between two ticks; gains left out stay as they are."""
     from aeroloop.protocol.messages.operator import Gains
 
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     if c1 is c2 is gamma is None:
         fail("give --C1, --C2 or --Gamma, three numbers each", 2)
     with checked(Gains):
         gains = Gains(C1=c1, C2=c2, Gamma=gamma)
-    _send(settings, "set_gains", gains)
+    _send(address, "set_gains", gains)
 
 
 @group.command(context_settings={"ignore_unknown_options": True})  # a negative angle is no option
@@ -220,10 +220,10 @@ def goto(
     """Brake, turn to an attitude and hold it."""
     from aeroloop.protocol.messages.operator import Hold, Track
 
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     with checked(Track, Hold):
         track = Track(reference=Hold(attitude=(roll, pitch, yaw)), within_s=within_s)
-    _send(settings, "track", track)
+    _send(address, "track", track)
 
 
 @group.command()
@@ -251,7 +251,7 @@ def track(
     from aeroloop.protocol.messages.operator import Hold, Sinusoid, Stream, Track
     from aeroloop.service.points_file import read_points
 
-    settings = settings_of(config, overrides)
+    address = address_of(config, overrides)
     given = {"amplitude": amplitude, "frequency": frequency, "timeout_s": timeout_s}
     options = {name: value for name, value in given.items() if value is not None}
     misplaced = set(options) - {"sinusoid": {"amplitude", "frequency"}, "stream": {"timeout_s"}}.get(what, set())
@@ -271,12 +271,12 @@ def track(
             case _:
                 reference = read_points(Path(what))
         message = Track(reference=reference, within_s=within_s)
-    _send(settings, "track", message)
+    _send(address, "track", message)
 
 
-def _send(settings: Settings, topic: str, message: Message | None = None) -> None:
+def _send(address: VehicleAddress, topic: str, message: Message | None = None) -> None:
     from aeroloop.protocol.messages.operator import Request
     from aeroloop.service.host.operator import send
 
     with guarded():
-        typer.echo(send(settings.network, settings.vehicle, topic, message or Request()))
+        typer.echo(send(address.network, address.vehicle, topic, message or Request()))

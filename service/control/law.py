@@ -41,6 +41,9 @@ def _positive(gains: tuple[float, float, float]) -> tuple[float, float, float]:
     return gains
 
 
+ESTIMATE_REACH: Final = 1 / 0.95
+"""‖θ̂‖ may reach this times k_θ: Remark 5's inequality needs every θ of Assumption 2 in the projection's inner ball."""
+
 Diagonal = Annotated[tuple[float, float, float], AfterValidator(_positive)]
 """The diagonal of a positive definite matrix."""
 
@@ -66,7 +69,11 @@ class LawSettings(BaseModel):
     damping_estimate: tuple[float, float, float] = Field(
         default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
     )
-    damping_bound: float = Field(default=0.05, gt=0, description="k_θ: ‖θ‖ is assumed to be below this [N·m·s/rad]")
+    damping_bound: float = Field(
+        default=0.05,
+        gt=0,
+        description="k_θ: ‖θ‖ is assumed to be below this, and ‖θ̂‖ is kept below k_θ/0.95 [N·m·s/rad]",
+    )
 
     @model_validator(mode="after")
     def _estimate_within_bound(self) -> LawSettings:
@@ -144,9 +151,10 @@ def build_law(p: LawSettings) -> Law:
 
 
 def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
-    """Proj{τ} of (C.38): the smooth projection of Krstić, Kanellakopoulos and Kokotović onto ‖θ̂‖ ≤ k_θ (Remark 5).
+    """Proj{τ} of (C.38): the smooth projection of Krstić, Kanellakopoulos and Kokotović (Remark 5).
 
-    For ‖θ̂‖ ≤ 0.95 k_θ it is τ itself; from there to k_θ a growing share of the outward component is removed.
+    For ‖θ̂‖ ≤ k_θ it is τ itself; from there to k_θ/0.95 a growing share of the outward component is removed. So
+    −θ̃ᵀΓ⁻¹Proj{τ} ≤ −θ̃ᵀΓ⁻¹τ for every ‖θ‖ ≤ k_θ: what is removed is along Γθ̂, and θ̃ᵀθ̂ = θᵀθ̂ − ‖θ̂‖² < 0 where any is.
 
     Args:
         tau: Γ Φ z₂, the update without projection. Shape (3,).
@@ -154,8 +162,8 @@ def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:
         Gamma: Adaptation gain. Shape (3, 3).
         bound: k_θ [N·m·s/rad].
     """
-    inner = 0.95 * bound
-    outside = (ca.dot(theta, theta) - inner**2) / (bound**2 - inner**2)
+    outer = ESTIMATE_REACH * bound
+    outside = (ca.dot(theta, theta) - bound**2) / (outer**2 - bound**2)
     outward = ca.dot(theta, tau)
     weight = ca.fmin(1, outside) / ca.fmax(ca.dot(theta, Gamma @ theta), 1e-300)
     return tau - ca.if_else(ca.logic_and(outside > 0, outward > 0), weight * outward, 0) * Gamma @ theta
@@ -203,8 +211,8 @@ def law_steps(p: LawSettings, period: float) -> Steps:
     law = build_law(p)
     last, eps, tau = ca.SX.sym("last", 4), ca.SX.sym("eps", 3), ca.SX.sym("tau", 3)
     theta_next = law.theta + period * projection(tau, law.theta, ca.diag(law.Gamma), p.damping_bound)  # (C.38)
-    # Euler's step leaves the ball along its tangent; the projection of Remark 5 holds in continuous time only.
-    theta_next *= ca.fmin(1, p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
+    # Euler's step leaves the outer ball along its tangent; the projection keeps θ̂ within in continuous time only.
+    theta_next *= ca.fmin(1, ESTIMATE_REACH * p.damping_bound / ca.fmax(ca.norm_2(theta_next), 1e-300))
     errors = law.q, law.omega, law.q_d, law.omega_d
     return Steps(
         ca.Function("attitude", [last, eps], [received(eps, last)], ["last", "eps"], ["q"]),

@@ -57,6 +57,7 @@ class Verdict(NamedTuple):
     def of(cls, certificate: Certificate) -> Verdict:
         """The verdict of a certificate."""
         text = certificate.verdict.rstrip(".")
+        text = text[0].lower() + text[1:]  # within a sentence
         if certificate.holds:
             return cls(certificate, text)
         ways = [remedy.text for remedy in certificate.remedies if remedy.overrides]

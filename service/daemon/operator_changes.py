@@ -133,8 +133,8 @@ class OperatorChanges:
     def serve(self) -> None:
         """Serve operators' queries and set-points."""
         role = self._role
-        role.serve("set_gains", Gains, lambda gains: GainsChange(self, gains).prepare())
-        role.serve("track", Track, lambda track: ReferenceChange(self, track).prepare())
+        role.serve("set_gains", Gains, self._prepare_gains)
+        role.serve("track", Track, self._prepare_reference)
         role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), self._receive_setpoint)
 
     def prospect(self, law: LawSettings, reference: Reference) -> tuple[Gains, Reference]:
@@ -263,7 +263,34 @@ class OperatorChanges:
         self._note()
         self._role.event("changed", text, self._session, self._k)
 
-    # ── requests ──
+    # ── requests: prepared in any thread, applied between two ticks ──
+
+    def _prepare_gains(self, gains: Gains) -> Callable[[], Answer]:
+        """Check new gains. Raises FollowError or UncertifiedError where they are refused."""
+        self.admit(gains=gains)
+
+        def apply() -> Answer:
+            self.admit(gains=gains)  # cached, unless more has changed since
+            answer = self.set_gains(gains)
+            self.certify()
+            return answer
+
+        return apply
+
+    def _prepare_reference(self, track: Track) -> Callable[[], Answer]:
+        """Plan and check a new reference. Raises FollowError or UncertifiedError where it is refused."""
+        source: Source = "operator" if track.reference is not None else "configured"
+        reference = track.reference or self.configured
+        plan = self.plan(reference)
+        self.admit(reference=reference)
+
+        def apply() -> Answer:
+            self.admit(reference=reference)
+            answer = self.follow(reference, plan, track.within_s, source)
+            self.certify()
+            return answer
+
+        return apply
 
     def admit(self, gains: Gains | None = None, reference: Reference | None = None) -> None:
         """Check a change against the certificate, where one is required; what is None stays as it is.
@@ -391,54 +418,3 @@ class OperatorChanges:
             within_s=self._within_s,
             since_tick=self._since_tick,
         )
-
-
-class GainsChange:
-    """An operator's new gains. `prepare` runs in any thread, `apply` between two ticks.
-
-    Args:
-        changes: The changes of the controller.
-        gains: The gains; None where one stays.
-    """
-
-    def __init__(self, changes: OperatorChanges, gains: Gains) -> None:
-        self._changes, self._gains = changes, gains
-
-    def prepare(self) -> Callable[[], Answer]:
-        """Check the gains, which may take time. Raises FollowError or UncertifiedError where they are refused."""
-        self._changes.admit(gains=self._gains)
-        return self.apply
-
-    def apply(self) -> Answer:
-        """Use the gains from this tick on."""
-        self._changes.admit(gains=self._gains)  # cached, unless more has changed since
-        answer = self._changes.set_gains(self._gains)
-        self._changes.certify()
-        return answer
-
-
-class ReferenceChange:
-    """An operator's new reference. `prepare` runs in any thread, `apply` between two ticks.
-
-    Args:
-        changes: The changes of the controller.
-        track: The reference, and in what time to reach it.
-    """
-
-    def __init__(self, changes: OperatorChanges, track: Track) -> None:
-        self._changes, self._within_s = changes, track.within_s
-        self._source: Source = "operator" if track.reference is not None else "configured"
-        self._reference: Reference = track.reference or changes.configured
-
-    def prepare(self) -> Callable[[], Answer]:
-        """Plan and check the reference, which takes time. Raises FollowError or UncertifiedError if it is refused."""
-        self._plan = self._changes.plan(self._reference)
-        self._changes.admit(reference=self._reference)
-        return self.apply
-
-    def apply(self) -> Answer:
-        """Follow the reference from this tick on."""
-        self._changes.admit(reference=self._reference)
-        answer = self._changes.follow(self._reference, self._plan, self._within_s, self._source)
-        self._changes.certify()
-        return answer

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from aeroloop.protocol.runtime.role import Action, Role
+from aeroloop.protocol.wire.spec import flat
 from aeroloop.service.config import Settings
 
 LIVE: Final = {
@@ -92,7 +93,7 @@ def _with_live_keys(effective: dict[str, Any], after: dict[str, Any], role: str)
 
 def differences(before: Settings, after: Settings, role: str) -> list[str]:
     """The changes for a role, a line per key: old value, new value, and whether it needs a restart."""
-    old, new = (_flat(settings.model_dump(mode="json", include=_SECTIONS[role])) for settings in (before, after))
+    old, new = (flat(settings.model_dump(mode="json", include=_SECTIONS[role])) for settings in (before, after))
     live = tuple(f"{name}." for name in LIVE[role])
     return [
         f"{key}: {_short(old.get(key))} → {_short(new.get(key))}"
@@ -105,10 +106,3 @@ def differences(before: Settings, after: Settings, role: str) -> list[str]:
 def _short(value: object) -> str:
     """A value in a line: the points of a reference may be thousands."""
     return f"{len(value)} values" if isinstance(value, list) and len(value) > _MOST_SHOWN else str(value)
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    leaves: dict[str, Any] = {}
-    for name, value in tree.items():
-        leaves |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return leaves

@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import Percentiles
+from aeroloop.protocol.runtime.host_facts import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming, summary
@@ -26,10 +26,8 @@ SHARE_OF_PERIOD: Final = 0.25
 """Latest wake-up, as a share of the period; after it too little time is left for two crossings of the network."""
 
 
-class Finding(BaseModel):
+class Finding(BaseModel, frozen=True):
     """One thing that was checked."""
-
-    model_config = ConfigDict(frozen=True)
 
     what: str
     good: bool
@@ -37,10 +35,8 @@ class Finding(BaseModel):
     advice: str = Field(default="", description="what to change, where it is not good")
 
 
-class Diagnosis(BaseModel):
+class Diagnosis(BaseModel, frozen=True):
     """All findings and the trial."""
-
-    model_config = ConfigDict(frozen=True)
 
     holds: bool = Field(description="whether the trial kept the configured rate")
     rate_hz: float
@@ -78,22 +74,13 @@ def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None
     )
 
 
-def _read(path: str) -> str | None:
-    try:
-        return Path(path).read_text().strip()
-    except OSError:
-        return None
-
-
 def _settings() -> list[Finding]:
     """The kernel's settings and this process's limits."""
     root = os.geteuid() == 0
     priority, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     memory, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     unlimited = memory == resource.RLIM_INFINITY
-    clock = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-    runtime = _read("/proc/sys/kernel/sched_rt_runtime_us")
-    governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    clock, runtime, governor = map(host_facts().get, ("clock", "realtime_throttling_us", "governor"))
     return [
         Finding(
             what="clock source",

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final, Literal, NamedTuple
 
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.states import ControllerState, PlantState
+from aeroloop.protocol.messages.states import NOT_RECORDING, ControllerState, PlantState
 from aeroloop.service.host.operator import Gathered
 
 SILENT_S: Final = 3.0
@@ -21,16 +21,16 @@ class Trouble(NamedTuple):
     """Something that is wrong.
 
     Attributes:
-        kind: tripped (a plant), faulted (a controller), silent (no status for `SILENT_S`, or a process that accepts
-            connections and does not answer), late (more than `LATE_SHARE` of the last 10 s' ticks skipped, or commands
-            that take longer than a period at the 99th percentile), missing (a controller or a plant of a vehicle that
-            has another role).
+        kind: tripped (a plant), faulted (a controller), not recording (a recorder), silent (no status for `SILENT_S`,
+            or a process that accepts connections and does not answer), late (more than `LATE_SHARE` of the last 10 s'
+            ticks skipped, or commands that take longer than a period at the 99th percentile), missing (a controller or
+            a plant of a vehicle that has another role).
         vehicle: Its name; None for a process that does not answer.
         role: Its role, likewise.
         text: One line.
     """
 
-    kind: Literal["tripped", "faulted", "silent", "late", "missing"]
+    kind: Literal["tripped", "faulted", "not recording", "silent", "late", "missing"]
     vehicle: str | None
     role: str | None
     text: str
@@ -56,6 +56,8 @@ def _of_role(vehicle: str, role: str, status: Status) -> Iterator[Trouble]:
         yield Trouble("tripped", vehicle, role, f"{name} tripped: {status.cause}; `aeroloop op arm` arms it")
     if status.state == ControllerState.FAULTED:
         yield Trouble("faulted", vehicle, role, f"{name} faulted; `aeroloop op arm` lets it claim again")
+    if status.state == NOT_RECORDING:
+        yield Trouble("not recording", vehicle, role, f"{name} records nothing: {status.cause}")
     period = status.timing.recent_period if status.timing else None
     if period is None:
         return

@@ -33,7 +33,7 @@ _TICKS: Final = [digit * 10**power for power in range(-1, 6) for digit in (1, 2,
 
 
 def draw_burden(burden: Burden, path: Path) -> None:
-    """Draw the grid into a file. Raises ReviewError if its name is wrong, or it cannot be written."""
+    """Draw the grid into a file. Raises OutputError if its name is wrong, or it cannot be written."""
     with figure_style():
         save_as(_figure(burden), path)
 

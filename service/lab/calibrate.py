@@ -2,13 +2,18 @@
 
 The calm cell cont/cont has two figures and determines two parameters: Coulomb friction of the yaw axis (chiefly from
 z_track) and the height of the centre of mass (chiefly from u_total). The windy cell cont/cont determines the wind's
-steady torque about pitch and yaw. All other parameters keep their published measurements, and no other cell is used.
+steady torque about pitch and yaw. No other cell is used, and all other parameters keep their configured values:
+published measurements and assumptions, and a dead zone of 0 where 2–3 V were measured.
 Each pair of equations is solved by Newton's method with a finite-difference Jacobian.
+
+Two equations always determine two parameters. How well the paper's figures identify them is what `identification.py`
+computes, with the dead zone beside them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import hypot
 from typing import Final
 
 import numpy as np
@@ -18,11 +23,17 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings
 from aeroloop.service.lab import paper
 from aeroloop.service.lab.cells import Cell, Pool
+from aeroloop.service.lab.identification import Identification, Named, identify
+from aeroloop.service.lab.tables import CASES
 
 MEASURED_YAW_COULOMB: Final = 0.0037
 """Coulomb friction of the yaw axis as measured from spin-downs of another Aero [N·m]."""
 TABLE_C1_HEIGHT: Final = -0.0038
 """Height of the centre of mass in the paper's Table C.1 [m]."""
+MEASURED_DEAD_ZONE: Final = 2.5
+"""Voltage below which the rotors of another Aero made no thrust [V]; 2–3 V."""
+PROBE: Final = 0.1
+"""Finite difference for the identification, as a part of a parameter's scale: far above the encoders' grain."""
 MAX_ROUNDS: Final = 8
 TOLERANCE: Final = 1e-3
 """Relative tolerance of a fitted figure; the published ones have two to four digits."""
@@ -41,6 +52,7 @@ class Calibration(BaseModel):
     calm: dict[str, float] = Field(description="z_track [1e-4 s] and u_total [V²·s] reached in the calm cell")
     windy: dict[str, float] = Field(description="the same in the windy cell")
     residuals: dict[str, float] = Field(description="relative residual of each of the four figures")
+    identification: Identification
     runs: int = Field(description="number of experiments")
 
 
@@ -58,12 +70,10 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
     published = paper.WIND["continuous"]
     with Pool() as pool:
 
-        def evaluate(candidates: Sequence[Settings], *, windy: bool) -> np.ndarray:
+        def evaluate(jobs: Sequence[tuple[Settings, Cell]]) -> np.ndarray:
             nonlocal runs
-            results = pool.run((candidate, Cell(None, None, windy)) for candidate in candidates)
-            runs += len(candidates)
-            if progress is not None:
-                progress(runs)
+            results = pool.run(jobs, lambda done: progress(runs + done) if progress else None)
+            runs += len(jobs)
             return np.array(results)
 
         def fit(
@@ -73,7 +83,8 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
             x = np.array(start)
             for _ in range(MAX_ROUNDS):
                 probes = [x, *(x + step * axis for step, axis in zip(steps, np.eye(2), strict=True))]
-                reached, *moved = evaluate([build(probe.tolist()) for probe in probes], windy=air == "wind")
+                cell = Cell(None, None, windy=air == "wind")
+                reached, *moved = evaluate([(build(probe.tolist()), cell) for probe in probes])
                 if np.all(np.abs(reached / target - 1) < TOLERANCE):
                     return x, reached
                 jacobian = np.column_stack([(m - reached) / step for m, step in zip(moved, steps, strict=True)])
@@ -85,6 +96,7 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
         x, calm = fit(lambda p: _with_body(settings, p), start, (1e-4, 2e-5), "calm")
         body = _with_body(settings, x.tolist())
         w, windy = fit(lambda p: _with_wind(body, p), plant.wind.torque[:2], (5e-4, 5e-4), "wind")
+        identification = identification_at(settings, [*x, *w, plant.rotor.dead_zone_v], evaluate)
     return Calibration(
         yaw_coulomb=x[0],
         centre_of_mass_height=x[1],
@@ -96,8 +108,40 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
             for air, pair in (("calm", calm), ("wind", windy))
             for name, reached in zip(("z_track_1e-4", "u_total"), pair, strict=True)
         },
+        identification=identification,
         runs=runs,
     )
+
+
+def identification_at(
+    settings: Settings, values: Sequence[float], evaluate: Callable[[Sequence[tuple[Settings, Cell]]], np.ndarray]
+) -> Identification:
+    """Identification of yaw friction [N·m], height [m], wind about pitch and yaw [N·m] and dead zone [V] at `values`.
+
+    `evaluate` returns z_track and u_total of each experiment, shape (experiments, 2).
+    """
+    coulomb, height, *wind, dead_zone = values
+    parameters = [
+        Named("Coulomb friction about yaw", "N·m", coulomb, MEASURED_YAW_COULOMB),
+        Named("height of the centre of mass", "m", height, -TABLE_C1_HEIGHT),
+        Named("wind torque about pitch", "N·m", wind[0], hypot(*wind)),
+        Named("wind torque about yaw", "N·m", wind[1], hypot(*wind)),
+        Named("dead zone", "V", dead_zone, MEASURED_DEAD_ZONE),
+    ]
+    cells = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]
+    published = np.array([list(paper.WIND[case][air].values()) for case in CASES for air in ("calm", "wind")])
+    steps = PROBE * np.array([parameter.scale for parameter in parameters])
+    probes = [np.array(values), *(values + step for step in np.diag(steps))]
+    jobs = [(_with_all(settings, probe.tolist()), cell) for probe in probes for cell in cells]
+    reached, *moved = evaluate(jobs).reshape(len(probes), *published.shape)
+    columns = [((figures - reached) / published / paper.SCATTER / PROBE).ravel() for figures in moved]
+    return identify(parameters, np.column_stack(columns))
+
+
+def _with_all(settings: Settings, p: Sequence[float]) -> Settings:
+    changed = _with_wind(_with_body(settings, p[:2]), p[2:4])
+    rotor = changed.plant.rotor.model_copy(update={"dead_zone_v": p[4]})
+    return changed.model_copy(update={"plant": changed.plant.model_copy(update={"rotor": rotor})})
 
 
 def _with_body(settings: Settings, p: Sequence[float]) -> Settings:

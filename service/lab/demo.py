@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Self
 
@@ -21,7 +20,7 @@ from aeroloop.protocol.wire.attitude import angle
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
 from aeroloop.service.host.bandwidth import PayloadRate
-from aeroloop.service.recording.rolling import parts
+from aeroloop.service.recording.rolling import log_path, parts
 from aeroloop.service.review.report import FaultInterval
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.process_group import ProcessGroup, ProcessGroupError, standalone
@@ -109,9 +108,7 @@ def run_demo(
         ProcessGroupError: A process did not start, or failed, or the log exists.
         ReviewError: The log cannot be reviewed.
     """
-    path = log or settings.recorder.directory
-    if log is None or log.is_dir():
-        path /= datetime.now().strftime("demo-%Y%m%d-%H%M%S-%f.mcap")
+    path = log_path(log or settings.recorder.directory, "demo-%Y%m%d-%H%M%S-%f.mcap")
     settings = standalone(settings, path, duration_s=duration_s)
     progress = Progress(settings)
     interrupted = threading.Event()

@@ -170,12 +170,13 @@ def _at_rate(settings: Settings, rate_hz: float) -> Settings:
 
 def largest_ages(settings: Settings, disturbance: float = 0.0) -> Ages:
     """The largest ages of a command with a proven set. Arguments as of `measure_margins`."""
-    p = premises(settings, extremes(settings.reference), paper_body(settings), disturbance)
+    desired = extremes(settings.reference)
+    p = premises(settings, desired, paper_body(settings), disturbance)
 
     def failing(age: float) -> str | None:
         now = replace(p, age=age)
         at = reach(now)
-        return NO_SET if at is None else ", ".join(key for *_, key in beyond(settings, now, at)) or None
+        return NO_SET if at is None else ", ".join(key for *_, key in beyond(settings, desired, now, at)) or None
 
     proven, _ = _last(lambda age: failing(age) != NO_SET)
     in_range, larger = _last(lambda age: failing(age) is None)

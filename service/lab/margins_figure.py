@@ -24,7 +24,7 @@ _TICKS: Final = [digit * 10**power for power in range(4) for digit in (1, 2, 5)]
 
 
 def draw_margins(margins: Margins, path: Path) -> None:
-    """Draw the margins into a file. Raises ReviewError if its name is wrong, or it cannot be written."""
+    """Draw the margins into a file. Raises OutputError if its name is wrong, or it cannot be written."""
     with figure_style():
         save_as(_figure(margins), path)
 

@@ -59,12 +59,7 @@ class Computed(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """The controller's commands, a row per tick.
-
-    Attributes:
-        codes: Codes of each command, sent or not. Shape (n, actuators).
-        sent: Whether it is sent as a frame; otherwise it is silent. Shape (n,).
-    """
+    """Codes of the commands, shape (n, actuators), and whether each is sent as a frame or is silent, shape (n,)."""
 
     codes: Array
     sent: NDArray[np.bool_]
@@ -73,15 +68,8 @@ class Commands(NamedTuple):
 class BatchController:
     """Computes many measurements per call.
 
-    Args:
-        wire: Format of the frames.
-        law: Parameters and gains.
-        reference: Reference from tick 0 on.
-        period: Time between ticks [s].
-        rows: Ticks per CasADi call; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
-
-    Raises:
-        ValueError: The law's B cannot be inverted.
+    The reference holds from tick 0 on, the period is between ticks [s], `rows` is ticks per CasADi call, a multiple of
+    `aeroloop.protocol.wire.symbolic.UNROLLED`. Raises ValueError if the law's B cannot be inverted.
     """
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float, rows: int = ROWS) -> None:
@@ -121,12 +109,9 @@ class BatchController:
         self._motion.plan = other._motion.plan
 
     def compute_all(self, k: Integers, codes: Array, changes: deque[Change]) -> Computed:
-        """Results of `Controller.compute` for measurements in order.
+        """Results of `Controller.compute` for measurements at ascending ticks k. Shapes (n,) and (n, 6).
 
-        Args:
-            k: Ticks, ascending. Shape (n,).
-            codes: Codes of each measurement. Shape (n, 6).
-            changes: Changes of gains and reference in order of tick; those that take effect are removed.
+        Changes of gains and reference are in order of tick; those that take effect are removed.
         """
         if not len(k):
             return self._nothing(0)
@@ -145,11 +130,9 @@ class BatchController:
         return computed
 
     def commands(self, k: Integers, voltages: Array) -> Commands:
-        """Commands of `Controller.answer` for ticks in order.
+        """Commands of `Controller.answer` to the law's output [V] at ascending ticks k. Shapes (n,), (n, actuators).
 
-        Args:
-            k: Ticks, ascending. Shape (n,).
-            voltages: The law's output [V]; rows of NaN for no valid value. Shape (n, actuators).
+        Rows of NaN have no valid value.
         """
         pairs = zip(self._voltage, voltages.T, strict=True)
         codes = np.stack([encoded_by(quantizer, column) for quantizer, column in pairs], axis=1)

@@ -24,12 +24,7 @@ _LEAST: Final = 16
 
 
 class ClockOffset:
-    """Estimates the offset between both ends' clocks, block by block.
-
-    Attributes:
-        first_ns: The offset at the first tick [ns]; NaN before any.
-        last_ns: The same at the last.
-    """
+    """Estimates the offset between both ends' clocks, block by block; keeps that of the first and the last tick."""
 
     def __init__(self) -> None:
         self.first_ns = self.last_ns = nan

@@ -22,14 +22,9 @@ from aeroloop.service.logs.traces import Array
 
 
 def codes_in(kind: FrameFormat, frames: Sequence[bytes] | NDArray[Any]) -> Array:
-    """Codes of well-formed frames, as `unpack` returns them.
+    """Codes of well-formed frames, as `unpack` returns them, contiguous in memory per signal. Shape (n, codes).
 
-    Args:
-        kind: Their format.
-        frames: Bytes of each; or an array with a frame per element, dtype V, or per row, dtype uint8.
-
-    Returns:
-        Codes, contiguous in memory per signal. Shape (n, codes).
+    `frames` are bytes each; or an array with a frame per element, dtype V, or per row, dtype uint8.
     """
     octets = frames if isinstance(frames, np.ndarray) else np.frombuffer(b"".join(frames), dtype=np.uint8)
     octets = np.ascontiguousarray(octets).view(np.uint8).reshape(len(frames), kind.size)

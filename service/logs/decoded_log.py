@@ -6,56 +6,46 @@ recorder decoded, copies everything else, and merges the files of a rotated run 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.records import Message
 
 from aeroloop.protocol.messages import topics
-from aeroloop.service.logs.files import LogFiles
+from aeroloop.service.logs.files import LogFiles, Progress
 from aeroloop.service.logs.mcap_copy import Follow, McapCopy
 from aeroloop.service.logs.mcap_file import Damage
 from aeroloop.service.viewers.channels import Decoder
 
 
-class Written(NamedTuple):
-    """Messages and topics written, and what of the log could not be read, a line each."""
+def write_decoded(files: LogFiles, out: Path, progress: Progress) -> tuple[int, list[str], list[str]]:
+    """Write a run as one log with everything decoded; an existing file is overwritten. Raises OSError.
 
-    messages: int
-    topics: list[str]
-    damages: list[str]
-
-
-def write_decoded(files: LogFiles, out: Path, progress: Callable[[float], None]) -> Written:
-    """Write a run as one log with everything decoded; an existing file is overwritten.
-
-    Calls `progress` repeatedly with the share done, 0…1. Raises OSError if a file cannot be read or written.
+    Returns:
+        How many messages were written, their topics, and what of the log could not be read, a line each.
     """
     decoder = Decoder(rate_hz=None)
     for description in files.descriptions.values():
         decoder.configure(description)
     damages: list[str] = []
-    sizes = [path.stat().st_size for path in files.paths]
+    size, done = sum(path.stat().st_size for path in files.paths), 0
     with out.open("wb") as file:
         copy = McapCopy(file, "aeroloop log export")
-        done = 0
 
         def report(read: int) -> None:
-            progress((done + read) / sum(sizes))
+            progress((done + read) / size)
 
         def follow(topic: str) -> Follow | None:
             """None for topics that the recorder decoded: they begin with a slash, as no key can."""
             return None if topic.startswith("/") else partial(_decode, copy, decoder, topics.read_key(topic))
 
-        for path, size in zip(files.paths, sizes, strict=True):
+        for path in files.paths:
             found: list[Damage] = []
             copy.file(path, found, report, follow)
-            done += size
+            done += path.stat().st_size
             damages += [f"{path}: {damage.what}" for damage in found]
         copy.finish()
-    return Written(copy.messages, sorted(copy.topics), damages)
+    return copy.messages, sorted(copy.topics), damages
 
 
 def _decode(copy: McapCopy, decoder: Decoder, address: topics.Address | None, message: Message) -> None:

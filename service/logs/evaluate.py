@@ -23,13 +23,7 @@ from aeroloop.service.logs.traces import Array, Integers
 
 
 class Used(NamedTuple):
-    """Ticks that the controller computed.
-
-    Attributes:
-        rows: Indices of their rows in the block. Shape (n,).
-        k: The ticks. Shape (n,).
-        codes: Codes of the measurements that it used. Shape (n, 6).
-    """
+    """Ticks k that the controller computed, their rows in the block, shapes (n,), and their codes, shape (n, 6)."""
 
     rows: Integers
     k: Integers
@@ -91,9 +85,7 @@ class Evaluator:
     def beside(self, k: Integers, codes: Array) -> Computed:
         """What it would compute from other measurements; its own state stays. The θ̂ is meaningless.
 
-        Args:
-            k: Ticks, ascending. Shape (n,).
-            codes: Codes of the measurements. Shape (n, 6).
+        Ticks k ascend. Shapes (n,) and (n, 6).
         """
         self._beside = self._beside or self._new_controller()
         self._beside.follow(self._controller)
@@ -105,7 +97,7 @@ class Evaluator:
 
 
 def held_codes(framed: npt.NDArray[np.bool_], codes: Array, before: Codes | None) -> tuple[Array, Codes | None]:
-    """Codes that hold at each row: its frame's, or those of the last frame before it.
+    """Codes that hold at each row: its frame's, or those of the last frame before it; NaN before the first frame.
 
     Args:
         framed: Whether each row has a frame. Shape (n,).
@@ -113,7 +105,7 @@ def held_codes(framed: npt.NDArray[np.bool_], codes: Array, before: Codes | None
         before: Codes that hold before the first row; None if there are none.
 
     Returns:
-        Codes, NaN before the first frame, of shape (n, columns); and those that hold after the last row.
+        The codes, of shape (n, columns), and those that hold after the last row.
     """
     first = np.full((1, codes.shape[1]), np.nan) if before is None else np.array([before])
     held = np.vstack([first, codes])[np.cumsum(framed)]

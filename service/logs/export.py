@@ -61,8 +61,8 @@ def export(
         paths: Logs, folders of logs, or the files of a rotated run.
         to: Format.
         out: The file; the first log's name with another ending if None.
-        session: Name or number of a session, as of `Run.choose`; `all` of the vehicle; the longest if None.
-        vehicle: Its vehicle; that of the longest session if None.
+        session: As of `Run.choose`, or `all` of the vehicle.
+        vehicle: As of `Run.choose`.
         force: Replace an existing file, unless it is a log.
         progress: Called repeatedly with the share done, 0…1.
 
@@ -84,7 +84,7 @@ def export(
                     )
                 rows, columns, damages = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
             else:
-                sessions, rows, columns, damages = _table(paths, to, part, session, vehicle, progress)
+                sessions, rows, columns, damages = _table(Run(paths, progress), to, part, session, vehicle)
             size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
@@ -92,15 +92,9 @@ def export(
 
 
 def _table(
-    paths: Sequence[Path],
-    to: Format,
-    part: Path,
-    session: str | None,
-    vehicle: str | None,
-    progress: Progress | None,
+    run: Run, to: Format, part: Path, session: str | None, vehicle: str | None
 ) -> tuple[list[str], int, list[str], list[str]]:
     """Write a table; returns its sessions, number of rows and columns' names, and what could not be read."""
-    run = Run(paths, progress)
     first = run.choose(None if session == ALL else session, vehicle)
     chosen = run.sessions_of(first[0]) if session == ALL else [first]
     settings = run.settings(first)

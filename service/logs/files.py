@@ -19,6 +19,7 @@ from aeroloop.service.logs.traces import SessionKey, identified
 __all__ = ["LogFiles", "Progress", "ReviewError"]
 
 Progress = Callable[[float], None]
+"""Called repeatedly with the share done, 0…1."""
 
 T = TypeVar("T")
 
@@ -31,8 +32,7 @@ class LogFiles:
 
     Attributes:
         paths: The files, in the order of their first messages.
-        descriptions: Descriptions by vehicle and role; the last of each.
-        first_descriptions: The first of each.
+        descriptions: The last description of each vehicle and role; `first_descriptions` the first.
         changes: Changes in force when a file began, by vehicle and session.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
         metadata: Other metadata, by name without prefix (`aeroloop.recorder` is `recorder`); the last of each.
@@ -67,9 +67,7 @@ class LogFiles:
     ) -> Iterator[Logged[T]]:
         """Messages of the keys that `route` selects, in the order of recording.
 
-        Args:
-            route: Called once per key of a file; its result comes with each message of the key, None drops the key.
-            progress: Called repeatedly with the share done, 0…1.
+        `route` is called once per key of a file; its result comes with each message of the key, None drops the key.
         """
 
         def wanted(channel: Channel) -> T | None:
@@ -95,6 +93,7 @@ class LogFiles:
         found = prelude.descriptions()
         if prelude.unreadable and not found:
             raise ReviewError(f"{path} is not a log of this version: {prelude.unreadable[0]}")
+        prelude.damages += [Damage(0, f"a description: {text}") for text in dict.fromkeys(prelude.unreadable)]
         for which, copies in found.items():
             self.descriptions[which] = copies[-1]
             self.first_descriptions.setdefault(which, copies[0])
@@ -102,19 +101,13 @@ class LogFiles:
             known = self.changes.setdefault(which, [])
             known += [change for change in changes if change not in known]  # every file of a rotated run repeats it
         self.metadata |= prelude.metadata
-        if damages := [
-            *prelude.damages,
-            *(Damage(0, f"a description: {text}") for text in dict.fromkeys(prelude.unreadable)),
-        ]:
-            self.damages[path] = damages
+        if prelude.damages:
+            self.damages[path] = prelude.damages
 
     def _check_that_all_are_of_one_run(self, recordings: Mapping[Path, Hashable]) -> None:
-        """Check that files of different recordings have traces of the same processes or sessions.
+        """Raise ReviewError unless files of different recordings have traces of the same processes or sessions.
 
         Why: a recorder that was restarted goes on in a file of its own, but unrelated runs must not be mixed.
-
-        Raises:
-            ReviewError: They do not.
         """
         runs: list[tuple[set[Hashable], list[Path]]] = []
         for path in self.paths:

@@ -21,11 +21,9 @@ Follow = Callable[[Message], None]
 
 
 class McapCopy:
-    """Copies records into a new file, which is empty; `library` is the name of the writing program.
+    """Copies records into a new file, which is empty; counts its messages and collects its topics.
 
-    Attributes:
-        messages: Messages written.
-        topics: Topics of the channels written.
+    `library` is the name of the writing program.
     """
 
     def __init__(self, out: BinaryIO, library: str) -> None:
@@ -45,17 +43,9 @@ class McapCopy:
         progress: Callable[[int], None],
         follow: Callable[[str], Follow | None] = lambda _: lambda _: None,
     ) -> None:
-        """Copy what a file holds.
+        """Copy what a file holds. Arguments and errors are as of `records`; OSError also if it cannot be written.
 
-        Args:
-            path: The file.
-            damages: What could not be read is appended.
-            progress: Called after each chunk with the bytes read so far.
-            follow: Called with the topic of each channel; returns a callback for its messages, or None to drop them.
-
-        Raises:
-            NotMcapError: It is not an MCAP file.
-            OSError: It cannot be read, or the new one cannot be written.
+        `follow` is called with the topic of each channel; it returns a callback for its messages, or None to drop them.
         """
         schemas = {0: 0}  # of the new file, by the ids of this one
         channels: dict[int, tuple[int, Follow] | None] = {}

@@ -187,11 +187,7 @@ def skim(path: Path, wanted: Callable[[str], bool]) -> list[McapRecord] | None:
     The index is used if it matches its checksum, has everything that the statistics count, and points to the right
     records. A damaged chunk is skipped silently: `messages` reports it.
 
-    Returns:
-        The records, each kind in the file's order; None without a usable index.
-
-    Raises:
-        OSError: The file cannot be read.
+    Returns the records, each kind in the file's order; None without a usable index. Raises OSError.
     """
     with path.open("rb") as file, suppress(*_MALFORMED):
         index = [_parsed(record) for _, record in _index(file)]
@@ -338,14 +334,9 @@ def _at(file: BinaryIO, offset: int, opcode: int) -> bytes:
 
 
 def _plain(block: bytes, room: int) -> bytes:
-    """The records that a chunk holds, decompressed and checked.
+    """The records that a chunk holds, decompressed and checked. Raises one of `_MALFORMED` if it is damaged.
 
-    Args:
-        block: The chunk's record.
-        room: The most bytes that it may hold if they are more than `MAX_RATIO` times its own.
-
-    Raises:
-        Exception: One of `_MALFORMED`: it is damaged.
+    `room` is the most bytes that it may hold if they are more than `MAX_RATIO` times its own.
     """
     chunk = _parsed(block)
     assert isinstance(chunk, Chunk)

@@ -21,15 +21,9 @@ class OutputError(AeroloopError):
 
 
 def check_output(out: Path, inputs: Sequence[Path | None] = (), *, force: bool = False) -> None:
-    """Check that a file may be written.
+    """Raise OutputError if a file is a log, an input, no regular file, or exists and must not be replaced.
 
-    Args:
-        out: The file.
-        inputs: What the command reads: files and folders; None stands for an option that was not given.
-        force: Whether an existing file may be replaced.
-
-    Raises:
-        OutputError: It is a log, an input, no regular file, or exists and must not be replaced.
+    `inputs` are files and folders that the command reads; None stands for an option that was not given.
     """
     try:
         if not out.exists():
@@ -50,10 +44,9 @@ def check_output(out: Path, inputs: Sequence[Path | None] = (), *, force: bool =
 
 @contextmanager
 def writing(out: Path, inputs: Sequence[Path | None] = (), *, force: bool = False) -> Iterator[Path]:
-    """Path to write a new file to: becomes `out` on success, is removed on failure. Arguments as of `check_output`.
+    """Path to write a new file to: becomes `out` on success, is removed on failure.
 
-    Raises:
-        OutputError: `out` must not be written, or cannot.
+    Arguments are as of `check_output`. Raises OutputError if `out` must not be written, or cannot.
     """
     check_output(out, inputs, force=force)
     with _working_folder(out.resolve().parent, out) as folder:
@@ -65,10 +58,9 @@ def writing(out: Path, inputs: Sequence[Path | None] = (), *, force: bool = Fals
 
 @contextmanager
 def writing_into(folder: Path, inputs: Sequence[Path | None] = (), *, force: bool = False) -> Iterator[Path]:
-    """Folder to write new files into: they move into `folder` on success, all or none. Arguments as of `check_output`.
+    """Folder to write new files into: they move into `folder` on success, all or none.
 
-    Raises:
-        OutputError: One of them must not be written, or cannot.
+    Arguments are as of `check_output`. Raises OutputError if one of them must not be written, or cannot.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

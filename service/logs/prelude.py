@@ -15,10 +15,9 @@ from mcap.records import Channel, Message, Metadata
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Description
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.service.logs.described import read_description
 from aeroloop.service.logs.mcap_file import (
     CHANGE_METADATA,
     CHECKSUM,
@@ -36,11 +35,7 @@ class ReviewError(AeroloopError):
 
 
 class Prelude:
-    """What one file holds beside its traces.
-
-    Attributes:
-        begins_ns: When its first message was recorded.
-        unreadable: Why copies of descriptions cannot be used.
+    """What one file holds beside its traces, when its first message was recorded, and unreadable descriptions.
 
     Raises:
         ReviewError: It is no log, or cannot be read.
@@ -104,6 +99,29 @@ class Prelude:
             self.unreadable.append(str(error).splitlines()[0])
         else:
             copies.setdefault((description.vehicle, description.role), []).append(description)
+
+
+def read_description(text: bytes, address: Address | None) -> Description:
+    """Parse a description, recorded under a key.
+
+    Raises:
+        ValueError: It is malformed, of another role or vehicle than its key says, or of another protocol version.
+    """
+    try:
+        content = json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if not isinstance(content, dict):
+        raise ValueError("a description is no JSON object")
+    old = content.keys() <= Description.model_fields.keys() - {"protocol"}
+    version = 1 if old else content.get("protocol")
+    if version != PROTOCOL_VERSION:
+        written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
+        raise ValueError(f"it is of protocol version {version}; read it with {written_by} wrote it")
+    description = Description.model_validate(content)
+    if address is not None and (address.vehicle, address.role) != (description.vehicle, description.role):
+        raise ValueError(f"a description of {address.vehicle}'s {address.role} is of another role")
+    return description
 
 
 def address_of(key: str, topic: str) -> Address | None:

@@ -6,12 +6,12 @@ A log without its end, as a killed recorder leaves it, is read from the front. D
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.service.logs.files import Progress
 from aeroloop.service.logs.mcap_copy import McapCopy
 from aeroloop.service.logs.mcap_file import Damage, NotMcapError
 from aeroloop.service.logs.outputs import writing
@@ -30,16 +30,8 @@ class Recovery(BaseModel, frozen=True):
     lost: list[str] = Field(description="what could not be read, a line each; empty if the file was whole")
 
 
-def recover(
-    broken: Path, out: Path, progress: Callable[[float], None] | None = None, *, force: bool = False
-) -> Recovery:
-    """Write all that can be read of a log into a new file.
-
-    Args:
-        broken: The log; it is not changed.
-        out: The new file.
-        progress: Called repeatedly with the share done, 0…1.
-        force: Replace an existing file, unless it is a log.
+def recover(broken: Path, out: Path, progress: Progress | None = None, *, force: bool = False) -> Recovery:
+    """Write all that can be read of a log into a new file; `force` replaces an existing one that is no log.
 
     Raises:
         OutputError: The new file must not be written, or cannot.

@@ -77,7 +77,7 @@ class Replay(BaseModel, frozen=True):
 
 
 class Replayer:
-    """Replays one session's controller by an evaluator; the settings are the evaluator's."""
+    """Replays one session's controller by an evaluator, whose settings these are."""
 
     def __init__(self, which: SessionKey, evaluator: Evaluator, settings: Settings) -> None:
         self._which = which

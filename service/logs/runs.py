@@ -21,10 +21,19 @@ from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import NEVER, End, Header, Outcome, Received, join_columns
-from aeroloop.service.config import Settings
-from aeroloop.service.logs.described import merged, read_description
+from aeroloop.service.config import Settings, from_description
 from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
-from aeroloop.service.logs.traces import NO_TICK, Arrived, Extent, InOrder, Integers, Missing, SessionKey, TraceIndex
+from aeroloop.service.logs.prelude import read_description
+from aeroloop.service.logs.traces import (
+    NO_TICK,
+    Arrived,
+    Extent,
+    InOrder,
+    Integers,
+    SessionKey,
+    TraceIndex,
+    identified,
+)
 
 BLOCK: Final = 4096
 """Approximate ticks of a block: enough for numpy to be fast, few enough for the CPU cache."""
@@ -34,6 +43,9 @@ ANSWER_S: Final = 1.2
 
 _INDEXING: Final = 0.15
 """Share of reading that the first pass takes."""
+
+OWNED: Final = {"plant": ("plant", "can"), "recorder": ("recorder",)}
+"""Sections of the configuration by the role that owns them; the others are the controller's."""
 
 Taker = Callable[[bytes, int], None]
 """Callback for a JSON message: its content, and its time of publication [ns]."""
@@ -77,8 +89,7 @@ class Run:
         progress: Called repeatedly with the share done, 0…1.
 
     Attributes:
-        files: The files.
-        extents: Recorded extent of each session.
+        extents: Recorded extent of each session, in the order of recording.
         missing: Missing rows.
         reached: The last tick of each session that `read` has reached.
         open_sessions: The session of each vehicle that is open at that point of the files.
@@ -91,7 +102,6 @@ class Run:
         self.files = LogFiles(paths)
         self._progress = progress
         self._index = TraceIndex()
-
         self._described: dict[SessionKey, dict[str, Description]] = {}
 
         def of(address: Address) -> Address | None:
@@ -108,21 +118,17 @@ class Run:
                 now = {role: description for (whose, role), description in known.items() if whose == vehicle}
                 self._described[vehicle, header.session] = now
         self._index.finish()
-        self.extents: dict[SessionKey, Extent] = self._index.extents
-        self.missing: list[Missing] = self._index.missing
+        self.extents, self.missing = self._index.extents, self._index.missing
         self.reached: dict[SessionKey, int] = {}
         self.open_sessions: dict[str, str] = {}
 
     def choose(self, session: str | None = None, vehicle: str | None = None) -> SessionKey:
-        """A session.
+        """A session. Raises ReviewError if there is none.
 
         Args:
             session: Its name, alone or as `vehicle/session`, or its number, from 1 in the order of recording; the one
                 with the most ticks if None.
             vehicle: Its vehicle; any if None, and that of the longest session for a number.
-
-        Raises:
-            ReviewError: There is none.
         """
         known = self.extents if vehicle is None else self.sessions_of(vehicle)
         if not self.extents:
@@ -154,28 +160,31 @@ class Run:
         return found | self._described.get(which, {})
 
     def settings(self, which: SessionKey) -> Settings:
-        """The configuration of a session, each section from the role that owns it.
+        """The configuration of a session, each section from the role that owns it, as far as the log has the role.
+
+        Why: every process is configured by itself: the controller's copy of `plant.mass` may differ from the plant's.
 
         Raises:
             ReviewError: The logs have no description of its controller or plant.
             ConfigError: One is not of this version.
         """
-        try:
-            return merged(self.described(which))
-        except KeyError:
+        found = {role: described.config for role, described in self.described(which).items()}
+        if (config := found.get("controller", found.get("plant"))) is None:
             damaged = "".join(f"; not read, {line}" for line in self.files.unread[:1])
             raise ReviewError(
                 f"{self.files.name} has no description of {which[0]}'s controller or plant: its frames cannot be read"
                 f"{damaged}"
-            ) from None
+            )
+        owners = {role: from_description(found[role]) for role in OWNED if role in found}
+        owned = {section: getattr(its, section) for role, its in owners.items() for section in OWNED[role]}
+        return from_description(config).model_copy(update=owned)  # not validated again: each role ran by its own
 
     def batches(self, route: Callable[[Address], Taker | None] = lambda _: None) -> Iterator[Arrived]:
         """Batches of the traces, each end's in the order of its rows and none twice.
 
-        Args:
-            route: Called once per key that is not a trace's; returns a callback for its messages, or None.
+        `route` is called once per key that is not a trace's; it returns a callback for its messages, or None.
         """
-        order = InOrder(self._index)
+        order = {source: InOrder(source, batches) for source, batches in self._index.sources.items()}
 
         def of(address: Address) -> tuple[str, Taker | None] | None:
             if address.topic.name == "trace":
@@ -187,17 +196,15 @@ class Run:
             vehicle, taker = found.answer
             if taker is not None:
                 taker(found.data, found.publish_time)
-                continue
-            yield from order.take(vehicle, found.data)
+            elif known := identified(vehicle, found.data):
+                source, header = known
+                yield from order[source].take(header, found.data)
 
     def read(
-        self,
-        sessions: Collection[SessionKey],
-        route: Callable[[Address], Taker | None] = lambda _: None,
-        block: int = BLOCK,
+        self, sessions: Collection[SessionKey], route: Callable[[Address], Taker | None] = lambda _: None
     ) -> Iterator[Block]:
-        """Blocks of some sessions, of about `block` ticks; those of a session in order. `route` is as in `batches`."""
-        joins = {which: self.join(which, block) for which in sessions}
+        """Blocks of some sessions; those of a session in order. `route` is as in `batches`."""
+        joins = {which: self.join(which) for which in sessions}
         for arrived in self.batches(route):
             which = arrived.source.vehicle, arrived.header.session
             self._follow(which, arrived)
@@ -206,13 +213,13 @@ class Run:
         for join in joins.values():
             yield from join.blocks(finished=True)
 
-    def join(self, which: SessionKey, block: int = BLOCK, *, alone: bool = False) -> TraceJoin:
-        """The join of a session into blocks of about `block` ticks; if `alone`, without the plant's rows."""
+    def join(self, which: SessionKey, *, alone: bool = False) -> TraceJoin:
+        """The join of a session; if `alone`, without the plant's rows."""
         extent = self.extents[which]
         begins = extent.first["controller"]
         before = [change for change in self.files.changes.get(which, ()) if change.tick < begins]
         margin = self.settings(which).loop.ticks(ANSWER_S)
-        return TraceJoin(which, margin, extent.of("controller") if alone else extent, block, before)
+        return TraceJoin(which, margin, extent.of("controller") if alone else extent, before)
 
     def _follow(self, which: SessionKey, arrived: Arrived) -> None:
         """Track the last tick of the plant's trace; of the controller's, if the log has none of the plant."""
@@ -231,12 +238,7 @@ class Run:
 
 
 class _Segment:
-    """Waiting rows of one end, without a gap.
-
-    Args:
-        end: The end.
-        state: The controller's state before the first of them, where rows before that are missing.
-    """
+    """Waiting rows of one end, without a gap; `state` is the controller's before them, where rows are missing."""
 
     def __init__(self, end: End, state: dict[str, Any] | None = None) -> None:
         self.state = state
@@ -245,7 +247,6 @@ class _Segment:
         self._rows: Rows = {}
 
     def add(self, arrived: Arrived) -> None:
-        """Append a batch."""
         self._batches.append((arrived.header, arrived.payload))
 
     @property
@@ -265,32 +266,24 @@ class _Segment:
         return np.maximum.accumulate(rows[self._column]) if rows else np.empty(0, dtype=np.int64)
 
     def drop(self, n: int) -> None:
-        """Drop the first n rows."""
         self._rows = {name: column[n:] for name, column in self.rows.items()}
         if n:
             self.state = None
 
 
 class TraceJoin:
-    """Joins the rows of one session's two ends.
+    """Joins the rows of one session's two ends into blocks.
 
-    Args:
-        which: The session.
-        margin: Ticks of the plant to wait for after a tick, in which the command that answers it may act.
-        extent: Its recorded extent.
-        block: Approximate ticks of a block.
-        changes: Changes in force before its first row.
+    After a tick it waits for `margin` ticks of the plant, in which the command that answers it may act; `changes` are
+    in force before the first row.
     """
 
-    def __init__(
-        self, which: SessionKey, margin: int, extent: Extent, block: int, changes: Sequence[Change] = ()
-    ) -> None:
+    def __init__(self, which: SessionKey, margin: int, extent: Extent, changes: Sequence[Change] = ()) -> None:
         self._which = which
         self._margin = margin
-        self._block = block
         self._controller: deque[_Segment] = deque()
         self._plant = _Segment("plant")
-        self._changes: list[Change] = list(changes)
+        self._changes = list(changes)
         # Up to which tick each end has been read; infinity where nothing more comes.
         self._settled: dict[End, float] = {
             end: extent.first[end] - 1 if extent.rows[end] else inf for end in extent.rows
@@ -309,7 +302,7 @@ class TraceJoin:
         elif has_rows:
             self._plant.add(arrived)
         self._settled[end] = inf if arrived.next_tick == NO_TICK else arrived.next_tick - 1
-        return self._limit - self._yielded >= self._block
+        return self._limit - self._yielded >= BLOCK
 
     @property
     def _limit(self) -> float:
@@ -344,17 +337,16 @@ def _block(
     which: SessionKey, controller: Rows, plant: Rows, p: int, changes: list[Change], state: dict[str, Any] | None
 ) -> Block:
     """The block of these rows of the controller and the first p rows of the plant."""
-    none = np.empty(0, dtype=np.int64)
-    computed = measured = acting = answers = none
+    ticks = computed = measured = acting = answers = np.empty(0, dtype=np.int64)
     if controller:
         received_as = controller["received_as"]
         computed = np.flatnonzero((received_as == Received.FRAME) | (received_as == Received.SILENT))
+        ticks = controller["tick"][computed]
     if plant:
         measured = plant["session_tick"][:p]
         acting = np.flatnonzero((plant["outcome"] == Outcome.ACTED) & (plant["answered"] != NEVER))
         answers, first = np.unique(plant["answered"][acting], return_index=True)
         acting = acting[first]
-    ticks = controller["tick"][computed] if controller else none
     k = np.union1d(ticks, measured)
     at_controller, at_plant = _places(ticks, computed, k), _places(measured, np.arange(len(measured)), k)
     return Block(which, k, controller, plant, at_controller, at_plant, _places(answers, acting, k), changes, state)

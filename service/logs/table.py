@@ -33,12 +33,7 @@ class TruthColumns(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Some ticks of one session, in order.
-
-    Attributes:
-        ticks: The ticks.
-        truth: The latest truth at each tick; NaN before the first.
-    """
+    """Some ticks of one session, in order, with the latest truth at each; NaN before the first."""
 
     vehicle: str
     session: str
@@ -47,14 +42,7 @@ class Rows(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column.
-
-    Attributes:
-        name: With its unit at the end, if it has one.
-        unit: `1` for a number without one, empty for what is not a quantity.
-        description: What it is, in a sentence.
-        kind: Type of its values.
-    """
+    """A column. Its name ends in its unit; the unit is `1` for a number without, empty for what is no quantity."""
 
     name: str
     unit: str
@@ -63,11 +51,7 @@ class Column(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Columns that are computed together.
-
-    Attributes:
-        of: Their values in some rows; NaN where there is none, except for integers and text. Shape (n, columns).
-    """
+    """Columns that are computed together by `of`; NaN where there is no value of a double. Shape (n, columns)."""
 
     columns: Sequence[Column]
     of: Callable[[Rows], Array]
@@ -80,70 +64,43 @@ def groups(wire: WireSpec, period: float) -> list[Group]:
     return [
         _group("tick", "", "tick k of the law", lambda rows: rows.ticks.k, kind="int64"),
         _group("time_s", "s", "the law's time, k times the period", lambda rows: rows.ticks.k * period),
-        _group(
-            "published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970",
-            lambda rows: rows.ticks.wall_ns, kind="int64",
-        ),
+        _group("published_ns", "ns", "when the measurement was sent, on the plant's clock since 1970",
+               lambda rows: rows.ticks.wall_ns, kind="int64"),
         _group("vehicle", "", "name of the vehicle", lambda rows: _text(rows, rows.vehicle), kind="string"),
         _group("session", "", "name of the session", lambda rows: _text(rows, rows.session), kind="string"),
         *_attitude("", "as measured", lambda rows: rows.ticks.attitude),
         *_attitude("desired_", "as desired", lambda rows: rows.ticks.desired),
         _group("rate_{}_rad_s", "rad/s", "ω as measured, body frame, about {}", lambda rows: rows.ticks.rate, AXES),
-        _group(
-            "desired_rate_{}_rad_s", "rad/s", "ω as desired, body frame, about {}",
-            lambda rows: rows.ticks.desired_rate, AXES,
-        ),
-        _group(
-            "attitude_error_{}", "1", "ε̃ of the attitude as measured, {}",
-            lambda rows: rows.ticks.attitude_error, AXES,
-        ),
+        _group("desired_rate_{}_rad_s", "rad/s", "ω as desired, body frame, about {}",
+               lambda rows: rows.ticks.desired_rate, AXES),
+        _group("attitude_error_{}", "1", "ε̃ of the attitude as measured, {}",
+               lambda rows: rows.ticks.attitude_error, AXES),
         _group("rate_error_{}_rad_s", "rad/s", "ω_e, body frame, about {}", lambda rows: rows.ticks.rate_error, AXES),
         _group("error_angle_deg", "deg", "angle of the attitude error", _angle_deg),
-        _group(
-            "voltage_{}_V", "V", "u{} as commanded; none where no command answered",
-            lambda rows: rows.ticks.voltages, motors,
-        ),
-        _group(
-            "latency_us", "µs", "from the measurement to the command that answers it, on the plant's clock",
-            lambda rows: rows.ticks.latency_ns * 1e-3,
-        ),
-        _group(
-            "measurement_delay_us", "µs", "from the plant to the controller, if both ways are equally fast",
-            lambda rows: rows.ticks.measurement_delay_ns * 1e-3,
-        ),
-        _group(
-            "command_delay_us", "µs", "from the controller to the plant, likewise",
-            lambda rows: rows.ticks.command_delay_ns * 1e-3,
-        ),
-        _group(
-            "saturated_attitude_{}", "", "whether ε has the quantizer's outermost level, {}; unknown where η = 0",
-            lambda rows: _outermost(_sent(rows), outermost["attitude"]), AXES, "bool",
-        ),
-        _group(
-            "saturated_rate_{}", "", "whether ω has the quantizer's outermost level, {}",
-            lambda rows: _outermost(rows.ticks.rate, outermost["rate"]), AXES, "bool",
-        ),
-        _group(
-            "saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
-            lambda rows: _outermost(rows.ticks.voltages, outermost["voltage"]), motors, "bool",
-        ),
-        _group(
-            "damping_estimate_{}_Nms_rad", "N·m·s/rad", "θ̂ as the law used it, {}",
-            lambda rows: rows.ticks.damping_estimate, AXES,
-        ),
-        _group(
-            "unquantized_voltage_{}_V", "V", "u{} before quantization", lambda rows: rows.ticks.unquantized, motors
-        ),
+        _group("voltage_{}_V", "V", "u{} as commanded; none where no command answered",
+               lambda rows: rows.ticks.voltages, motors),
+        _group("latency_us", "µs", "from the measurement to the command that answers it, on the plant's clock",
+               lambda rows: rows.ticks.latency_ns * 1e-3),
+        _group("measurement_delay_us", "µs", "from the plant to the controller, if both ways are equally fast",
+               lambda rows: rows.ticks.measurement_delay_ns * 1e-3),
+        _group("command_delay_us", "µs", "from the controller to the plant, likewise",
+               lambda rows: rows.ticks.command_delay_ns * 1e-3),
+        _group("saturated_attitude_{}", "", "whether ε has the quantizer's outermost level, {}; unknown where η = 0",
+               lambda rows: _outermost(_sent(rows), outermost["attitude"]), AXES, "bool"),
+        _group("saturated_rate_{}", "", "whether ω has the quantizer's outermost level, {}",
+               lambda rows: _outermost(rows.ticks.rate, outermost["rate"]), AXES, "bool"),
+        _group("saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
+               lambda rows: _outermost(rows.ticks.voltages, outermost["voltage"]), motors, "bool"),
+        _group("damping_estimate_{}_Nms_rad", "N·m·s/rad", "θ̂ as the law used it, {}",
+               lambda rows: rows.ticks.damping_estimate, AXES),
+        _group("unquantized_voltage_{}_V", "V", "u{} before quantization", lambda rows: rows.ticks.unquantized, motors),
         _group("sign", "1", "the equilibrium approached, z₁₊ or z₁₋", lambda rows: rows.ticks.sign, kind="int8"),
         *_attitude("truth_", "as the emulator had it", lambda rows: rows.truth.attitude),
-        _group(
-            "truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}", lambda rows: rows.truth.rate, AXES
-        ),
+        _group("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}",
+               lambda rows: rows.truth.rate, AXES),
         _group("truth_voltage_{}_V", "V", "at the emulator's motor {}", lambda rows: rows.truth.voltages, motors),
-        _group(
-            "truth_age_s", "s", "from the tick of the truth to this one",
-            lambda rows: (rows.ticks.k - rows.truth.k) * period,
-        ),
+        _group("truth_age_s", "s", "from the tick of the truth to this one",
+               lambda rows: (rows.ticks.k - rows.truth.k) * period),
     ]  # fmt: skip
 
 
@@ -153,8 +110,7 @@ def euler_deg(q: Array) -> Array:
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    degrees: Array = np.degrees(np.stack((roll, pitch, yaw), axis=1))
-    return degrees
+    return np.asarray(np.degrees(np.column_stack((roll, pitch, yaw))))
 
 
 def _group(
@@ -187,5 +143,4 @@ def _outermost(values: Array, level: float) -> Array:
 
 def _angle_deg(rows: Rows) -> Array:
     lengths = np.sqrt(np.sum(np.square(rows.ticks.attitude_error), axis=1))
-    degrees: Array = np.degrees(2 * np.arcsin(np.minimum(1.0, lengths)))
-    return degrees
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(1.0, lengths))))

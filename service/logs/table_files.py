@@ -9,10 +9,10 @@ of a MATLAB file in memory.
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -33,50 +33,40 @@ class ExportError(AeroloopError):
     """A log cannot be exported; one line with the reason."""
 
 
-class TableFile(ABC):
-    """Writer of a table.
+class TableFile(Protocol):
+    """Writer of a table's rows, batch by batch."""
 
-    Args:
-        path: The file; an existing one is overwritten.
-        groups: Its columns.
-        facts: Metadata of the file, such as `config`; written as JSON.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-
-    @abstractmethod
-    def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None: ...
-
-    @abstractmethod
     def write(self, rows: Rows) -> None:
         """Append rows. Raises OSError."""
 
-    @abstractmethod
     def close(self) -> None:
         """Write the end. Raises OSError, or ExportError if the format cannot hold that much."""
 
 
-class ArrowFile(TableFile):
-    """Writer by Arrow, batch by batch; a batch is a row group of a Parquet file."""
+class ArrowFile:
+    """Parquet or CSV by Arrow; a batch is a row group of a Parquet file.
 
-    booleans: Kind = "bool"
+    CSV is as of RFC 4180. A number has enough digits to be read back exactly; a missing one is empty. Its booleans are
+    numbers: a reader that guesses types takes `true` beside an empty cell for text.
+    """
 
-    def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any]) -> None:
+    def __init__(self, path: Path, groups: Sequence[Group], facts: dict[str, Any], *, csv: bool = False) -> None:
         self._groups = groups
+        self._booleans: Kind = "int8" if csv else "bool"
         columns = [column for group in groups for column in group.columns]
         fields = [
             pa.field(c.name, self._type(c), metadata={"unit": c.unit, "description": c.description}) for c in columns
         ]
         self._schema = pa.schema(fields, {f"aeroloop.{name}": json.dumps(fact) for name, fact in facts.items()})
-        self._writer = self._open(path, self._schema)
+        if csv:
+            options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
+            self._writer: Any = pyarrow.csv.CSVWriter(path, self._schema, write_options=options)
+        else:  # a dictionary of doubles makes the file a third larger and its writing slower, quantized or not
+            texts = [field.name for field in fields if field.type == pa.string()]
+            self._writer = pyarrow.parquet.ParquetWriter(path, self._schema, compression="zstd", use_dictionary=texts)
 
     def _type(self, column: Column) -> pa.DataType:
-        return pa.type_for_alias(self.booleans if column.kind == "bool" else column.kind)
-
-    @abstractmethod
-    def _open(self, path: Path, schema: pa.Schema) -> Any:
-        """Arrow's writer."""
+        return pa.type_for_alias(self._booleans if column.kind == "bool" else column.kind)
 
     def write(self, rows: Rows) -> None:
         """See `TableFile.write`."""
@@ -97,29 +87,7 @@ class ArrowFile(TableFile):
         self._writer.close()
 
 
-class ParquetFile(ArrowFile):
-    """See the module's docstring."""
-
-    def _open(self, path: Path, schema: pa.Schema) -> Any:
-        # A dictionary of doubles makes the file a third larger and its writing slower, quantized or not.
-        texts = [field.name for field in schema if field.type == pa.string()]
-        return pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", use_dictionary=texts)
-
-
-class CsvFile(ArrowFile):
-    """CSV by RFC 4180. A number has enough digits to be read back exactly; a missing one is empty.
-
-    Booleans are numbers: a reader that guesses types takes `true` beside an empty cell for text.
-    """
-
-    booleans = "int8"
-
-    def _open(self, path: Path, schema: pa.Schema) -> Any:
-        options = pyarrow.csv.WriteOptions(eol="\r\n", quoting_header="none")
-        return pyarrow.csv.CSVWriter(path, schema, write_options=options)
-
-
-class MatFile(TableFile):
+class MatFile:
     """A struct `aeroloop`; each column is a column vector of doubles in it, with NaN for missing values.
 
     `published_ns` is int64, as a double does not hold it. `vehicle` and `session` are numbers, from 1, into the lists
@@ -167,4 +135,7 @@ class MatFile(TableFile):
             scipy.io.savemat(file, {"aeroloop": struct}, long_field_names=True, oned_as="column")
 
 
-FILES: Final[dict[str, type[TableFile]]] = {"parquet": ParquetFile, "csv": CsvFile, "mat": MatFile}
+FILES: Final[dict[str, Callable[[Path, Sequence[Group], dict[str, Any]], TableFile]]] = {
+    "parquet": ArrowFile, "csv": partial(ArrowFile, csv=True), "mat": MatFile
+}  # fmt: skip
+"""Opens a file by its path, columns, and facts to write as JSON; replaces an existing one, and raises OSError."""

@@ -47,11 +47,7 @@ class Judged(NamedTuple):
 
 
 class TickReader:
-    """Reads one session's ticks, by the configuration of its controller.
-
-    Attributes:
-        offset: Offset between both ends' clocks.
-    """
+    """Reads one session's ticks, by the configuration of its controller; `offset` is between both ends' clocks."""
 
     def __init__(self, settings: Settings) -> None:
         self.offset = ClockOffset()

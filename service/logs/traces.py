@@ -72,11 +72,7 @@ class Missing(BaseModel, frozen=True):
 
 
 class Batches:
-    """Batches of one source.
-
-    Attributes:
-        table: A row per batch, sorted and without duplicates, with the columns of `_FIELDS`; complete after `finish`.
-    """
+    """Batches of one source: after `finish`, `table` has a row each, sorted, and the columns of `_FIELDS`."""
 
     def __init__(self) -> None:
         self._values = array("q")
@@ -121,13 +117,7 @@ class Extent(NamedTuple):
 
 
 class TraceIndex:
-    """All batches of a run.
-
-    Attributes:
-        sources: Batches by source.
-        extents: Extent of each session, in the order of recording; complete after `finish`.
-        missing: Missing rows; likewise.
-    """
+    """All batches of a run by source; after `finish`, also sessions in the order of recording, and missing rows."""
 
     def __init__(self) -> None:
         self.sources: dict[Source, Batches] = {}
@@ -166,48 +156,42 @@ class TraceIndex:
             self._find_gaps(source, batches, names)
         for which, extent in self.extents.items():
             for end in ENDS:
-                self._find_end(which, end, extent.last[end], proofs.get((which, end), NO_TICK), (which, end) in ended)
+                proof = proofs.get((which, end), NO_TICK)
+                if any((m.vehicle, m.session, m.end, m.last_tick) == (*which, end, None) for m in self.missing):
+                    continue
+                if proof > extent.last[end]:  # the other end proves rows after the last one
+                    self._lacks(*which, end, extent.last[end] + 1, proof, proof - extent.last[end])
+                elif (which, end) not in ended:
+                    self._lacks(*which, end, extent.last[end] + 1, None, 0)
 
     def _find_gaps(self, source: Source, batches: Batches, names: list[str]) -> None:
         having = batches.table[batches.column("rows") > 0]
         if not len(having):
             return
+        vehicle, end, _ = source
         column = {name: having[:, i] for i, name in enumerate(_FIELDS)}
         first, session = column["first"], [names[number] for number in column["session"].tolist()]
         if column["first_row"][0] and first[0] > 0:
-            self._lacks(source, session[0], 0, int(first[0]) - 1, min(int(column["first_row"][0]), int(first[0])))
+            self._lacks(vehicle, session[0], end, 0, int(first[0]) - 1, min(int(column["first_row"][0]), int(first[0])))
         after = column["first_row"] + column["rows"]
         for i in np.flatnonzero(column["first_row"][1:] > after[:-1]).tolist():
             rows, begins, ends = int(column["first_row"][i + 1] - after[i]), int(first[i + 1]), int(column["last"][i])
             if session[i] == session[i + 1]:
-                self._lacks(source, session[i], ends + 1, begins - 1, rows)
+                self._lacks(vehicle, session[i], end, ends + 1, begins - 1, rows)
             elif begins > 0:
-                self._lacks(source, session[i + 1], 0, begins - 1, rows)
+                self._lacks(vehicle, session[i + 1], end, 0, begins - 1, rows)
             else:
-                self._lacks(source, session[i], ends + 1, None, rows)
+                self._lacks(vehicle, session[i], end, ends + 1, None, rows)
 
-    def _find_end(self, which: SessionKey, end: End, last: int, proof: int, ended: bool) -> None:
-        """Report rows after the last one, if the other end proves them, or a missing end of the session."""
-        if any((m.vehicle, m.session) == which and m.end == end and m.last_tick is None for m in self.missing):
-            return
-        if proof > last:
-            self._lacks(Source(which[0], end, 0), which[1], last + 1, proof, proof - last)
-        elif not ended:
-            self._lacks(Source(which[0], end, 0), which[1], last + 1, None, 0)
-
-    def _lacks(self, source: Source, session: str, first: int, last: int | None, rows: int) -> None:
-        vehicle, end, _ = source
+    def _lacks(self, vehicle: str, session: str, end: End, first: int, last: int | None, rows: int) -> None:
         lacks = Missing(vehicle=vehicle, session=session, end=end, first_tick=first, last_tick=last, rows=rows)
         self.missing.append(lacks)
 
 
 class Arrived(NamedTuple):
-    """A batch in order.
+    """A batch in order, and the process that published it.
 
     Attributes:
-        source: The process that published it.
-        header: Its header.
-        payload: Its bytes.
         after_gap: Whether rows before it are missing.
         last_tick: Tick of its last row; −1 without rows.
         next_tick: Lowest tick of all later rows of its session; −1 if there are none.
@@ -236,20 +220,7 @@ class Arrived(NamedTuple):
 
 
 class InOrder:
-    """Puts the batches of an index in the order of their rows as they are read again, and drops duplicates."""
-
-    def __init__(self, index: TraceIndex) -> None:
-        self._queues = {source: _Queue(source, batches) for source, batches in index.sources.items()}
-
-    def take(self, vehicle: str, payload: bytes) -> Iterator[Arrived]:
-        """Add a batch; yields every batch that is next in order."""
-        if found := identified(vehicle, payload):
-            source, header = found
-            yield from self._queues[source].take(header, payload)
-
-
-class _Queue:
-    """Batches of one source, waiting for those before them."""
+    """Puts the batches of one source in the order of their rows as they are read again, and drops duplicates."""
 
     def __init__(self, source: Source, batches: Batches) -> None:
         self._source = source

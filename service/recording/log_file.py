@@ -64,24 +64,16 @@ class _WholeChunks:
         self._pending.clear()
 
     def stands_at(self, path: Path) -> bool:
-        try:
+        with suppress(OSError):
             return os.path.samestat(path.stat(), os.fstat(self._file.fileno()))
-        except OSError:
-            return False
+        return False
 
     def close(self) -> None:
         self._file.close()
 
 
 class LogFile:
-    """An MCAP file that is being written; its path is a new file.
-
-    Attributes:
-        path: The same.
-
-    Raises:
-        OSError: It exists already, or cannot be created.
-    """
+    """An MCAP file that is being written to a new path. Raises OSError if it exists already or cannot be created."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -108,24 +100,15 @@ class LogFile:
         return not self._out.stands_at(self.path)
 
     def add(self, received: Delivery, at_ns: int, decoded: Iterable[Decoded] = ()) -> None:
-        """Add a message to the chunk, under its key and its publisher's number, and its decoded ones beside it.
+        """Add a message, received at `at_ns` [ns since 1970], to the chunk, and its decoded ones, each under its topic.
 
-        Args:
-            received: The message.
-            at_ns: When it was received [ns since 1970]; also its publish time where it carries none.
-            decoded: Each goes under its own topic; its log time is the raw message's publish time.
+        `at_ns` is also its publish time where it carries none; the log time of decoded ones is its publish time.
         """
-        channel = self._channels.get(received.key)
-        if channel is None:
-            channel = self._channels[received.key] = self._raw_channel(received.key)
+        channel = self._channel(received.key, None)
         published_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
         self._add(channel, at_ns, published_ns, received.payload, received.sequence)
         for one in decoded:
-            channel = self._channels.get(one.topic)
-            if channel is None:
-                encoding, schema = one.shape.message_encoding, self._schema(one.shape)
-                channel = self._channels[one.topic] = self._writer.register_channel(one.topic, encoding, schema)
-            self._add(channel, one.at_ns, one.at_ns, one.data, 0)
+            self._add(self._channel(one.topic, one.shape), one.at_ns, one.at_ns, one.data, 0)
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Add a metadata record, under a checksum."""
@@ -161,16 +144,17 @@ class LogFile:
         self._writer.add_message(channel, log_time, data, publish_time, sequence)
         self._gathered += MESSAGE_HEAD + len(data)
 
-    def _raw_channel(self, key: str) -> int:
-        address = topics.read_key(key)
-        shape = _raw_shape(address.topic) if address else None
-        encoding = shape.message_encoding if shape else "application/octet-stream"
-        return self._writer.register_channel(key, encoding, self._schema(shape) if shape else 0)
-
-    def _schema(self, shape: Shape) -> int:
-        if shape not in self._shapes:
+    def _channel(self, topic: str, shape: Shape | None) -> int:
+        """Id of a topic's channel; a key has the shape of its raw messages."""
+        if (known := self._channels.get(topic)) is not None:
+            return known
+        if shape is None and (address := topics.read_key(topic)):
+            shape = _raw_shape(address.topic)
+        if shape is not None and shape not in self._shapes:
             self._shapes[shape] = self._writer.register_schema(shape.name, shape.encoding, shape.schema)
-        return self._shapes[shape]
+        encoding, schema = (shape.message_encoding, self._shapes[shape]) if shape else ("application/octet-stream", 0)
+        channel = self._channels[topic] = self._writer.register_channel(topic, encoding, schema)
+        return channel
 
 
 def _raw_shape(topic: topics.Topic) -> Shape:

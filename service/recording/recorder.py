@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Loss, Status
+from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.publication import Delivery
@@ -59,14 +60,7 @@ _address = lru_cache(maxsize=4096)(topics.read_key)
 
 
 class Recorder:
-    """The recorder as a process.
-
-    Attributes:
-        log: The files.
-
-    Raises:
-        RecorderError: The log cannot be written.
-    """
+    """The recorder as a process. Raises RecorderError if the log cannot be written."""
 
     def __init__(self, role: Role, settings: RecorderSettings) -> None:
         self._role = role
@@ -103,10 +97,9 @@ class Recorder:
         finally:
             self._settle()
             self.log.try_again()
-            self._take_all()
-            self._publish_losses()
-            self._take_all()
-            self._publish_losses()  # and those of publishers without a known key in the first call
+            for _ in range(2):  # the second publishes losses of publishers without a known key in the first
+                self._take_all()
+                self._publish_losses()
             self._publish_status()
             self._take_all()
             self.log.close(len(self._backlog))
@@ -206,19 +199,11 @@ class Recorder:
         written, log = self.log.written, self.log
         notes = [f"{count} messages lost: {reason}" for reason, count in sorted(self._lost.items())]
         if log.trouble:
-            notes.append(f"{log.trouble}; {len(self._backlog)} messages wait")
-        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else "not recording"
-        self._role.status(
-            Status(
-                role=self._role.role,
-                state=state,
-                cause=log.trouble or None,
-                uptime_s=self._role.uptime_s,
-                ticks=0,
-                rate_hz=(written - self._status_written) / max(now - self._status_at, 1e-3),
-                skipped=0,
-                received=written,
-                notes=notes,
-            )
-        )
+            notes.append(f"{len(self._backlog)} messages wait in memory")
+        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else NOT_RECORDING
+        rate_hz = (written - self._status_written) / max(now - self._status_at, 1e-3)
+        self._role.status(Status(
+            role=self._role.role, state=state, cause=log.trouble or None, uptime_s=self._role.uptime_s, ticks=0,
+            rate_hz=rate_hz, skipped=0, received=written, notes=notes,
+        ))  # fmt: skip
         self._status_written, self._status_at, self._status_due = written, now, now + STATUS_EVERY_S

@@ -46,19 +46,21 @@ def parts(path: Path) -> list[Path]:
     return [path, *followed] if path.exists() else followed
 
 
+def log_path(place: Path, named: str) -> Path:
+    """The new log at a place: the place itself, or a file in it, named by the time, if it is a folder.
+
+    A folder exists as one, or its name has no ending.
+    """
+    if place.suffix and not place.is_dir():
+        return place
+    return place / datetime.now().strftime(named)
+
+
 class RollingLog:
-    """A log in files.
+    """A log in files. Raises RecorderError if the first cannot be created.
 
-    Args:
-        settings: Where, and the limits of files.
-        report: Called with one line on the state of the disk, and whether it is a fault.
-
-    Attributes:
-        written: Messages added so far.
-        trouble: Why nothing can be written now; empty if it can.
-
-    Raises:
-        RecorderError: The first file cannot be created.
+    `report` is called with one line on the state of the disk, and whether it is a fault. `written` counts messages,
+    `trouble` is why nothing can be written now; empty if it can.
     """
 
     def __init__(self, settings: RecorderSettings, report: Callable[[str, bool], None]) -> None:
@@ -68,8 +70,8 @@ class RollingLog:
         self._report = report
         self._id = uuid.uuid4().hex
         place = settings.path or settings.directory
-        self._named_by_time = place is settings.directory or place.is_dir()
-        self._base = place / datetime.now().strftime("aeroloop-%Y%m%d-%H%M%S.mcap") if self._named_by_time else place
+        self._base = log_path(place, "aeroloop-%Y%m%d-%H%M%S.mcap")
+        self._named_by_time = self._base != place
         self._descriptions: dict[str, bytes] = {}
         self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []
@@ -135,10 +137,7 @@ class RollingLog:
             self._retry()
 
     def close(self, waiting: int = 0) -> None:
-        """Write the rest and the index, and close the file.
-
-        Args:
-            waiting: Messages not added because the disk refused.
+        """Write the rest and the index, and close the file; `waiting` messages were not added: the disk refused.
 
         Raises:
             RecorderError: Not all could be written; all written before is whole.
@@ -179,10 +178,7 @@ class RollingLog:
     def _retry(self) -> None:
         """Write what is pending into the same file or, unless the disk is only full, into a new one."""
         try:
-            if self._file.replaced:
-                self._replace_file()
-            else:
-                self._commit_or_replace()
+            self._commit_or_replace()
         except OSError as error:
             self._refused(error)
             return
@@ -192,11 +188,13 @@ class RollingLog:
 
     def _commit_or_replace(self) -> None:
         try:
-            self._file.commit()
+            if not self._file.replaced:
+                self._file.commit()
+                return
         except OSError as error:
             if error.errno in FULL:
                 raise
-            self._replace_file()
+        self._replace_file()
 
     def _replace_file(self) -> None:
         """Begin a new file with what the last one has not written."""
@@ -253,12 +251,8 @@ class RollingLog:
         file = LogFile(path)
         try:
             started = datetime.now(UTC)
-            run = {
-                "run": self._base.stem,
-                "id": self._id,
-                "part": path.stem,
-                "started": started.isoformat(timespec="seconds"),
-            }
+            run = {"run": self._base.stem, "id": self._id, "part": path.stem}
+            run["started"] = started.isoformat(timespec="seconds")
             file.add_metadata(RECORDER_METADATA, {"json": json.dumps(run)})
             file.attach_specification(round(started.timestamp() * 1e9))
             for key, description in self._descriptions.items():

@@ -6,8 +6,7 @@ The same bytes come out for the same figure: files have no date, and SVG ids no 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.outputs import OutputError
 
 Columns = Literal[1, 2]
 
@@ -63,11 +62,9 @@ _STYLE: Final[dict[str, Any]] = {
 }
 
 
-@contextmanager
-def figure_style() -> Iterator[None]:
+def figure_style() -> AbstractContextManager[None]:
     """Every figure that is drawn and saved within has the style."""
-    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]  # its keys are literals in the stubs
-        yield
+    return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]  # its keys are literals in the stubs
 
 
 def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure, list[Axes]]:
@@ -83,32 +80,28 @@ def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure
 
 
 def check_path(path: Path) -> Path:
-    """The path of a single figure. Raises ReviewError if its suffix or folder is wrong."""
+    """The path of a single figure. Raises OutputError if its suffix or folder is wrong."""
     suffixes = [f".{name}" for name in FORMATS]
     if path.suffix not in suffixes:
-        raise ReviewError(f"a figure ends in {', '.join(suffixes)}, not {path.name!r}")
+        raise OutputError(f"a figure ends in {', '.join(suffixes)}, not {path.name!r}")
     if not path.absolute().parent.is_dir():
-        raise ReviewError(f"there is no folder {path.parent} for the figure")
+        raise OutputError(f"there is no folder {path.parent} for the figure")
     return path
 
 
 def save_as(figure: Figure, path: Path) -> None:
-    """Save a figure in the format of the path's suffix. Raises ReviewError if it cannot be written."""
+    """Save a figure in the format of the path's suffix. Raises OutputError if it cannot be written."""
     try:
         figure.savefig(check_path(path), **FORMATS[path.suffix[1:]])
     except OSError as error:
-        raise ReviewError(f"cannot write {path}: {error.strerror}") from None
+        raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Save a figure in every format, and return the paths. Raises ReviewError if it cannot be written."""
+    """Save a figure in every format, and return the paths. Raises OSError if it cannot be written."""
     paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # laid out once, not for each format
-        for path, options in zip(paths, FORMATS.values(), strict=True):
-            figure.savefig(path, **options)
-    except OSError as error:
-        raise ReviewError(f"cannot write figures into {folder}: {error.strerror}") from None
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # laid out once, not for each format
+    for path, options in zip(paths, FORMATS.values(), strict=True):
+        figure.savefig(path, **options)
     return paths

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +16,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, Columns, figure_style, save, stacked
 from aeroloop.service.review.panels import NUMBERS, case_of
-from aeroloop.service.review.report import Line, Panel, Report
+from aeroloop.service.review.report import Panel, Report
 
 FIGURES: Final[dict[str, Sequence[str]]] = {
     "angles": ["angles"],
@@ -40,14 +40,8 @@ _AXES: Final = {"₁": "1", "₂": "2", "₃": "3", "1": "1", "2": "2", "3": "3"
 def draw_figures(report: Report, settings: Settings, folder: Path, columns: Columns = 1) -> list[Path]:
     """Draw what a report has, each figure as PDF, SVG and PNG, and return the paths.
 
-    Args:
-        report: Its lines are drawn, every tick where it has them, and its bands.
-        settings: The configuration of its controller.
-        folder: Target folder; created if missing.
-        columns: How many of a journal's columns the figures are wide.
-
-    Raises:
-        ReviewError: The session has no ticks, or the folder cannot be written.
+    The settings are its controller's, `columns` is how many of a journal's columns the figures are wide. Raises
+    ReviewError if the session has no ticks, OSError if the folder cannot be written.
     """
     if not len(report.time):
         raise ReviewError("the log has no answered measurement to draw")
@@ -77,19 +71,9 @@ def _draw(axis: Axes, panel: Panel, report: Report) -> None:
     for line in sorted(panel.lines, key=lambda line: line.label != "measured"):
         known = np.isfinite(line.values) if not line.held else slice(None)
         steps = "steps-post" if line.held and report.thinned <= 2 else "default"
-        axis.plot(
-            report.time[known],
-            line.values[known],
-            label=line.label.replace("θ̃", r"$\tilde{\theta}$"),
-            drawstyle=steps,
-            **_stroke(line),
-        )
-
-
-def _stroke(line: Line) -> dict[str, Any]:
-    if line.desired:
-        return DESIRED
-    return MEASURED if line.held else TRUE
+        stroke = DESIRED if line.desired else MEASURED if line.held else TRUE
+        label = line.label.replace("θ̃", r"$\tilde{\theta}$")
+        axis.plot(report.time[known], line.values[known], label=label, drawstyle=steps, **stroke)
 
 
 def _label(panel: Panel, *, quantized: bool) -> str:

@@ -1,19 +1,10 @@
-"""Roll, pitch and yaw for drawing: in degrees, and without jumps of 360°."""
+"""Attitudes for drawing: without jumps of 360°, or of sign."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from aeroloop.service.logs.traces import Array
-
-
-def roll_pitch_yaw(q: Array) -> Array:
-    """`protocol.wire.attitude.to_euler` of many unit quaternions, in degrees. Shapes (n, 4) and (n, 3)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.asarray(np.degrees(np.column_stack([roll, pitch, yaw])))
 
 
 def without_jumps(angles: Array, last: Array) -> Array:

@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.theorem.certificate import Certificate, Evaluated, certify, evaluate
@@ -38,7 +36,7 @@ class CertifiedBounds(NamedTuple):
     verdict: str
 
     @property
-    def radius(self) -> float | None:
+    def pointwise_radius(self) -> float | None:
         """Within which ‖z‖ stays in the end; None where no such bound is proven of the plant."""
         return None if self.certificate is None or not self.certificate.holds else self.certificate.plant_radius
 
@@ -67,15 +65,3 @@ def certified_bounds(
             certificate = Certificate.model_validate(promised)
     certificate = certificate or certify(begun)
     return CertifiedBounds(law, certificate, bounds, certificate.verdict)
-
-
-def damping_of(plant: PlantSettings) -> Vector | None:
-    """θ of an emulated plant [N·m·s/rad]; None if it has other friction, or is not emulated."""
-    if plant.via == "quanser":
-        return None
-    if plant.kind == "rigid_body":
-        theta: Vector | None = plant.rigid_body.damping
-    else:
-        theta = IDEAL_AERO.damping if plant.ideal else plant.aero.damping
-    friction = (*plant.friction.viscous, *plant.friction.coulomb)
-    return theta if plant.ideal or not any(friction) else None

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, Field
 
+from aeroloop.service.logs.files import Progress
 from aeroloop.service.review.downsample import MAX_POINTS
 from aeroloop.service.review.observe import DrawnPart
 from aeroloop.service.review.report import Findings, Report, differences
@@ -35,46 +36,41 @@ class Comparison(BaseModel, frozen=True):
     @classmethod
     def of(cls, reports: Sequence[Report]) -> Comparison:
         """Comparison of runs whose names differ."""
-        names = [run.name for run in reports]
-        return cls(
-            runs={run.name: run.findings for run in reports},
-            differences=[
-                SettingDifference(key=key, values=dict(zip(names, values, strict=True)))
-                for key, values in differences(reports)
-            ],
-        )
+        runs = {run.name: run.findings for run in reports}
+        rows = [(key, dict(zip(runs, values, strict=True))) for key, values in differences(reports)]
+        return cls(runs=runs, differences=[SettingDifference(key=key, values=values) for key, values in rows])
 
 
-def read_runs(
-    logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Callable[[float], None] | None = None
-) -> list[Report]:
-    """A report of every log or folder, each a run of its own, with names that differ. Raises as `report` does.
+def read_runs(logs: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None) -> list[Report]:
+    """A report of every log or folder, each a run of its own, with names that differ, checked against limits.
 
-    Args:
-        logs: A file or a folder each.
-        limits: Limits that the figures of each must keep.
-        progress: Called repeatedly with the share done, 0…1.
+    Logs of one name are named with their folders. Raises as `report` does.
     """
 
-    def share(done: int) -> Callable[[float], None] | None:
+    def share(done: int) -> Progress | None:
         return None if progress is None else lambda part: progress((done + part) / len(logs))
 
     part = DrawnPart(points=MAX_POINTS // len(logs))  # one page holds them all
-    return named_apart([report([log], limits, share(i), part) for i, log in enumerate(logs)])
+    reports = [report([log], limits, share(i), part) for i, log in enumerate(logs)]
+    names = [run.name for run in reports]
+    return named_apart(
+        [
+            replace(run, name=f"{log.resolve().parent.name}/{run.name}") if names.count(run.name) > 1 else run
+            for log, run in zip(logs, reports, strict=True)
+        ]
+    )
 
 
 def named_apart(reports: Sequence[Report]) -> list[Report]:
     """Runs whose names differ: of several with one name, the second is `name (2)`."""
-    taken: set[str] = set()
-    apart = []
+    apart: dict[str, Report] = {}
     for run in reports:
         name, n = run.name, 1
-        while name in taken:
+        while name in apart:
             n += 1
             name = f"{run.name} ({n})"
-        taken.add(name)
-        apart.append(replace(run, name=name))
-    return apart
+        apart[name] = replace(run, name=name)
+    return list(apart.values())
 
 
 def broken_limits(reports: Sequence[Report]) -> list[str]:

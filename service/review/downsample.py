@@ -51,34 +51,25 @@ class Buckets(NamedTuple):
         high = low if exact else np.concatenate([part.high for part in filled])
         return cls(low, high, *map(np.concatenate, zip(*(part[2:] for part in filled), strict=True)))
 
-    def followed_by(self, other: Self) -> Self:
-        """These buckets, followed by others."""
-        return self.joined([self, other])
-
     def part(self, cut: slice) -> Self:
         """A slice of the buckets."""
         return type(self)(self.low[cut], self.high[cut], self.rising[cut], self.rows[cut])
 
-    def paired(self, since: int = 0) -> Self:
-        """Neighbours merged, from bucket `since` on; if their number is odd, the last stays as it is."""
-        end = since + (len(self.rows) - since) // 2 * 2
-        first, then = self.part(slice(since, end, 2)), self.part(slice(since + 1, end, 2))
+    def paired(self) -> Self:
+        """Neighbours merged; if their number is odd, the last stays as it is."""
+        end = len(self.rows) // 2 * 2
+        first, then = self.part(slice(0, end, 2)), self.part(slice(1, end, 2))
         low, high = np.fmin(first.low, then.low), np.fmax(first.high, then.high)
         later_low, later_high = low != first.low, high != first.high
         among = np.where(later_low, then.rising, first.rising)
         merged = type(self)(low, high, np.where(later_low == later_high, among, later_high), first.rows + then.rows)
-        return self.part(slice(since)).followed_by(merged).followed_by(self.part(slice(end, None)))
+        return self.joined([merged, self.part(slice(end, None))])
 
 
 class DownsampledLines:
-    """Columns over a position that rises, in bounded memory.
+    """Columns over a position that rises, the first of them, in bounded memory: with at most `max_points` points.
 
-    Args:
-        columns: How many; the first is the position.
-        max_points: The most points that a line may have.
-
-    Attributes:
-        per_bucket: Rows behind two points of a line; 1 as long as nothing was thinned out.
+    `per_bucket` is rows behind two points of a line; 1 as long as nothing was thinned out.
     """
 
     def __init__(self, columns: int, max_points: int = MAX_POINTS) -> None:
@@ -95,7 +86,7 @@ class DownsampledLines:
         last = self._parts[-1]
         if len(part.rows) == len(last.rows) == 1 and part.rows[0] + last.rows[0] <= self.per_bucket:
             # A bucket may hold more rows than one call adds: the last one is filled up.
-            part = self._parts.pop().followed_by(part).paired()
+            part = Buckets.joined([self._parts.pop(), part]).paired()
             self._count -= 1
         self._parts.append(part)
         self._count += len(part.rows)

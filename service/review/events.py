@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -58,13 +57,13 @@ class _Kind:
 
 
 class EventLog:
-    """Messages beside the traces, of one session and its vehicle.
+    """Messages beside the traces, of the session that is judged and its vehicle.
 
     Args:
-        which: The session that is judged.
+        which: The session.
         period: Time between its ticks [s].
-        reached: The last tick of each session that the traces have reached in the files so far.
-        open_sessions: The session of each vehicle that is open at that point of the files.
+        reached: As of `Run`.
+        open_sessions: As of `Run`.
         alone: Leave out the trips of other sessions.
 
     Attributes:
@@ -101,21 +100,14 @@ class EventLog:
 
     def route(self, address: Address) -> Taker | None:
         """Callback for the messages of a key; None if they are not used."""
-        vehicle, role = address.vehicle, address.role
-        take: Taker
-        match name := address.topic.name:
-            case "event":
-                take = partial(self._event, vehicle)
-            case "loss":
-                take = partial(self._loss, vehicle)
-            case "status" if role is not None:
-                take = partial(self._status, vehicle, role)
-            case _:
-                return None
+        name = address.topic.name
+        take = {"event": self._event, "loss": self._loss, "status": self._status}.get(name)
+        if take is None:
+            return None
 
         def checked(payload: bytes, at_ns: int) -> None:
             try:
-                take(payload, at_ns)
+                take(address, payload, at_ns)
             except ValidationError:  # a stranger may publish anything
                 self.unreadable[name] += 1
 
@@ -137,30 +129,31 @@ class EventLog:
         found = [placed for kind in self._kinds.values() for placed in kind.all()]
         return [mark for _, mark in sorted(found, key=lambda placed: placed[0])]
 
-    def _event(self, vehicle: str, payload: bytes, at_ns: int) -> None:
-        if self._is_duplicate(vehicle, payload, at_ns):
+    def _event(self, address: Address, payload: bytes, at_ns: int) -> None:
+        if self._is_duplicate(address.vehicle, payload, at_ns):
             return
         event = Event.model_validate_json(payload)
         of_session = event.session == self._which[1]
         repeats_a_change = event.kind == "changed" and event.role == "controller" and of_session
-        if vehicle != self._which[0] or repeats_a_change:
+        if address.vehicle != self._which[0] or repeats_a_change:
             return
         if event.kind == "tripped" and (of_session or not self._alone):
             self.trips.append(event.text)
         tick = event.tick if of_session else None
         self._add(event.kind, event.role, event.text, tick, event.session)
 
-    def _loss(self, vehicle: str, payload: bytes, at_ns: int) -> None:
-        if vehicle != self._which[0] or self._is_duplicate(vehicle, payload, at_ns):
+    def _loss(self, address: Address, payload: bytes, at_ns: int) -> None:
+        if address.vehicle != self._which[0] or self._is_duplicate(address.vehicle, payload, at_ns):
             return
         loss = Loss.model_validate_json(payload)
-        address = topics.read_key(loss.key)
-        name = address.topic.name if address else loss.key
+        lost = topics.read_key(loss.key)
+        name = lost.topic.name if lost else loss.key
         self.losses[name] = self.losses.get(name, 0) + loss.count
         self._add("lost", "recorder", f"{loss.count} of {name} lost: {_WHERE[loss.reason]}")
 
-    def _status(self, vehicle: str, role: str, payload: bytes, at_ns: int) -> None:
-        if at_ns <= self._status_ns.get((vehicle, role), 0):
+    def _status(self, address: Address, payload: bytes, at_ns: int) -> None:
+        vehicle, role = address.vehicle, address.role
+        if role is None or at_ns <= self._status_ns.get((vehicle, role), 0):
             return  # a duplicate
         self._status_ns[vehicle, role] = at_ns
         status = self.statuses[vehicle, role] = Status.model_validate_json(payload)

@@ -7,20 +7,13 @@ began.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from aeroloop.protocol.messages.models import FaultStatus, Status
 from aeroloop.service.logs.runs import Block
-from aeroloop.service.review.report import Band, FaultInterval
+from aeroloop.service.review.report import FaultInterval
 
 
 class FaultLog:
-    """Faults of one session.
-
-    Args:
-        session: Its name.
-        period: Time between its ticks [s].
-    """
+    """Faults of one session, by its name and the time between its ticks [s]."""
 
     def __init__(self, session: str, period: float) -> None:
         self._session = session
@@ -49,17 +42,13 @@ class FaultLog:
 
     def intervals(self) -> list[FaultInterval]:
         """Faults that acted in the session, in order of time."""
-        found = [interval for fault in self._faults() if (interval := self._interval(*fault)) is not None]
-        return sorted(found, key=lambda interval: interval.begin_s)
-
-    def _faults(self) -> list[tuple[FaultStatus, int]]:
-        """Faults, each with what it had changed before the session."""
         if self._last is None:
             return []
         before = self._before
         same_process = before is not None and before.uptime_s <= self._last.uptime_s
         changed = {_key(fault): fault.changed for fault in before.faults} if before and same_process else {}
-        return [(fault, changed.get(_key(fault), 0)) for fault in self._last.faults]
+        found = [self._interval(fault, changed.get(_key(fault), 0)) for fault in self._last.faults]
+        return sorted((interval for interval in found if interval), key=lambda interval: interval.begin_s)
 
     def _interval(self, fault: FaultStatus, changed_before: int) -> FaultInterval | None:
         if fault.begin_tick is None or self._first is None:
@@ -77,11 +66,6 @@ class FaultLog:
             changed=fault.changed - changed_before,
             effect=fault.effect,
         )
-
-
-def bands(faults: Sequence[FaultInterval]) -> list[Band]:
-    """The intervals as bands across every drawing over time."""
-    return [Band(fault.begin_s, fault.end_s, fault.fault) for fault in faults]
 
 
 def _key(fault: FaultStatus) -> tuple[str, str, int | None]:

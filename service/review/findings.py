@@ -18,14 +18,8 @@ LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration 
 """Why a session in lockstep has no durations."""
 
 OWN_AFFAIRS: Final = (
-    "loop.realtime",
-    "loop.priority",
-    "loop.cpus",
-    "loop.trace_s",
-    "plant.via",
-    "plant.faults",
-    "plant.fault_seed",
-)
+    "loop.realtime", "loop.priority", "loop.cpus", "loop.trace_s", "plant.via", "plant.faults", "plant.fault_seed"
+)  # fmt: skip
 """Keys that each end has for itself, or that a command sets at the plant alone."""
 
 FrameCounts = dict[str, dict[str, int]] | None
@@ -51,7 +45,8 @@ def findings_of(
     if not known:
         few = "too few ticks have all four times of sending and receiving"
         reasons["clock_offset_us"] = LOCKSTEP if lockstep else few
-    theorem, unknown = observer.check.findings()
+    faults = events.faults.intervals()
+    theorem, unknown = observer.check.findings(faults=bool(faults))
     gaps = [gap for gap in run.missing if gap.vehicle == which[0]]
     return Findings(
         **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},
@@ -79,7 +74,7 @@ def findings_of(
         frames=frames,
         theorem=theorem,
         marks=[mark for mark in events.marks() if not _repeats(mark, theorem.verdict)],
-        faults=events.faults.intervals(),
+        faults=faults,
     )
 
 

@@ -11,28 +11,29 @@ from math import inf, nan
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeroloop.protocol.messages.models import Percentiles
+from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import Settings
+from aeroloop.service.logs.table import euler_deg
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
-from aeroloop.service.review.accumulators import Durations, SaturationCount
-from aeroloop.service.review.angles import beside, of_nearer_sign, roll_pitch_yaw, without_jumps
+from aeroloop.service.review.angles import beside, of_nearer_sign, without_jumps
 from aeroloop.service.review.downsample import MAX_POINTS, DownsampledLines
 from aeroloop.service.review.panels import columns_of, panels_of, with_level
 from aeroloop.service.review.report import Gap, Panel, Spread
 from aeroloop.service.review.theorem_check import TheoremCheck
 
 LONGEST_GAPS: Final = 100
+_BINS_PER_OCTAVE: Final = 16
+_BINS: Final = 32 * _BINS_PER_OCTAVE  # 1 µs … 2^32 µs, as protocol/runtime/timing.py
 
 
 class DrawnPart(NamedTuple):
-    """What of a session is drawn; its figures are of all of it.
+    """What of a session is drawn, from and to a time on the law's clock [s]; its figures are of all of it.
 
-    Attributes:
-        since_s: From this time on, on the law's clock [s].
-        until_s: To this time [s].
-        points: The most points of a line: so many ticks are drawn each by itself, more in buckets.
+    `points` is the most points of a line: so many ticks are drawn each by itself, more in buckets.
     """
 
     since_s: float = -inf
@@ -43,17 +44,61 @@ class DrawnPart(NamedTuple):
 WHOLE: Final = DrawnPart()
 
 
+class Durations:
+    """Histogram of durations with the bins of `protocol/runtime/timing.py`; takes many at once."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BINS, dtype=np.int64)
+        self._max_us = 0.0
+
+    def add(self, nanoseconds: Array | Integers) -> None:
+        """Count durations [ns]; under 1 µs counts as 1 µs, over an hour as an hour. Shape (n,)."""
+        if len(nanoseconds):
+            us = np.maximum(1.0, nanoseconds * 1e-3)
+            bins = np.minimum((np.log2(us) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
+            self._counts += np.bincount(bins, minlength=_BINS)
+            self._max_us = max(self._max_us, float(us.max()))
+
+    def spread(self) -> Spread | None:
+        """Their distribution; None if there were none."""
+        if not (total := int(self._counts.sum())):
+            return None
+        reached = np.cumsum(self._counts)
+
+        def percentile(percent: float) -> float:
+            i = int(np.searchsorted(reached, total * percent / 100))
+            return float(round(min(2 ** ((i + 0.5) / _BINS_PER_OCTAVE), self._max_us), 1))
+
+        points = {"p50": 50, "p90": 90, "p99": 99, "p999": 99.9}
+        filled = np.flatnonzero(self._counts).tolist()
+        bins = [(round(2 ** (i / _BINS_PER_OCTAVE), 3), int(self._counts[i])) for i in filled]
+        found = {name: percentile(percent) for name, percent in points.items()}
+        return Spread(count=total, **found, max=round(self._max_us, 1), bins=bins)
+
+
+class SaturationCount:
+    """Counts values of a signal at the quantizer's outermost level."""
+
+    def __init__(self, signal: SignalSpec) -> None:
+        quantizer = signal.quantizer()
+        self._top, self._invalid = quantizer.encode(quantizer.limit), quantizer.invalid
+        self._values = self._saturated = 0
+
+    def add(self, codes: Array) -> NDArray[np.bool_]:
+        """Count codes, and return which frames have one without a valid value. Shapes (n, values) and (n,)."""
+        invalid = np.isnan(codes) | (codes == self._invalid)
+        self._values += codes.size - int(invalid.sum())
+        self._saturated += int(((np.abs(codes) >= self._top) & ~invalid).sum())
+        return np.asarray(invalid.any(axis=1))
+
+    @property
+    def share(self) -> float | None:
+        """Share of the valid values; None if there were none."""
+        return self._saturated / self._values if self._values else None
+
+
 class Observer:
-    """Observes one session.
-
-    Args:
-        settings: The configuration of its controller.
-        check: Checks it against the theorem.
-        part: What of it is drawn.
-
-    Attributes:
-        check: The same check.
-    """
+    """Observes one session; `check` checks it against the theorem, `part` of it is drawn."""
 
     def __init__(self, settings: Settings, check: TheoremCheck, part: DrawnPart = WHOLE) -> None:
         wire = settings.wire
@@ -71,8 +116,6 @@ class Observer:
         self._start_ns: int | None = None
         self.gap_count = 0
         self.invalid = {"measurement": 0, "command": 0}
-
-    # ── input ──
 
     def frames(self, measurements: Array, commands: Array) -> None:
         """Add codes of frames that were sent, answered or not. Shapes (n, 6) and (m, actuators)."""
@@ -106,9 +149,9 @@ class Observer:
         for histogram, values in zip(self._timing.values(), durations, strict=True):
             histogram.add(values[~np.isnan(values)])
         desired, error, drawn = ticks.desired, ticks.attitude_error, self.check.ticks(ticks)
-        angles = without_jumps(roll_pitch_yaw(desired), self._last_angles)
+        angles = without_jumps(euler_deg(desired), self._last_angles)
         self._last_angles = angles[-1]
-        seen, true = (beside(roll_pitch_yaw(q), angles) for q in (ticks.attitude, drawn.true_attitude))
+        seen, true = (beside(euler_deg(q), angles) for q in (ticks.attitude, drawn.true_attitude))
         t = ticks.k * self._period
         self._lines.add(
             np.column_stack(
@@ -129,8 +172,6 @@ class Observer:
                 ]
             )[(t >= self._part.since_s) & (t <= self._part.until_s)]
         )
-
-    # ── results ──
 
     @property
     def started(self) -> str:
@@ -172,7 +213,10 @@ class Observer:
         panels, time = panels_of(self._columns, points[:, 1:]), points[:, 0] * self._period
         since_s, until_s = self.check.judged_s
         judged = (time >= since_s) & (time < until_s)
-        return time, with_level(panels, "z_norm", "guaranteed in the end", self.check.radius, judged)
+        label, level = "bound, once within it", self.check.pointwise_radius
+        if level is None:
+            label, level = "bound of the root mean square", self.check.radius
+        return time, with_level(panels, "z_norm", label, level, judged)
 
 
 def _alternating(*tables: Array) -> Array:

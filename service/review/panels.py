@@ -70,9 +70,7 @@ class PanelColumn(NamedTuple):
 def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
     """Columns kept of every tick, in the order of drawing, as `Observer` fills them.
 
-    Args:
-        settings: The configuration of the controller.
-        theta: Whether the plant's damping is known, so that V has all its terms.
+    `theta` is whether the plant's damping is known, so that V has all its terms.
     """
     case, beside = case_of(settings), ("measured", "desired")
     true_V = "true, with θ̃" if theta else "true, without θ̃"
@@ -102,9 +100,7 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
 def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
     """Panels of columns; lines that share an axis share a panel, and a line without any value is left out.
 
-    Args:
-        columns: Their descriptions.
-        values: Shape (n, columns).
+    The values have shape (n, columns).
     """
     drawn = [(column, values[:, i]) for i, column in enumerate(columns) if not np.isnan(values[:, i]).all()]
     return [
@@ -116,14 +112,9 @@ def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:
 def with_level(
     panels: list[Panel], group: str, label: str, level: float | None, where: npt.NDArray[np.bool_]
 ) -> list[Panel]:
-    """Panels, with a horizontal line at a level in those of a group; unchanged if there is none, or nowhere to draw it.
+    """Panels, with a horizontal line at a level in those of a group, at the times `where` it holds. Shape (n,).
 
-    Args:
-        panels: The panels.
-        group: That of the panels that get the line.
-        label: The line's.
-        level: Its value.
-        where: The times at which it holds. Shape (n,).
+    Unchanged if there is no level, or nowhere to draw it.
     """
     if level is None or not where.any():
         return panels

@@ -93,15 +93,37 @@ class LemmaCheck(BaseModel, frozen=True):
 
 
 class TheoremFindings(BaseModel, frozen=True):
-    """What Theorem 1 guarantees for a session, and what the session did.
+    """What is proven of a session, and whether the session kept to it.
 
     The transient lasts three times the law's slower time constant: of 2/λ_min(C₁) and λ_max(J)/λ_min(C₂).
     """
 
     verdict: str = Field(description="what the theorem promises, in a sentence, or why it promises nothing")
     holds: bool | None = Field(description="null where nothing can be promised")
-    radius: float | None = Field(description="√(δ_Q/k), where ‖z‖ ends [1, rad/s]")
-    radius_deg: float | None = Field(description="the attitude error that this allows [deg]")
+    held: bool | None = Field(
+        description="whether the run kept to all that could be judged: Lemma 1, the mean square, the invariant set"
+    )
+    radius: float | None = Field(
+        description="√(δ_Q/k), the root of the mean of ‖z‖² in the long run, of the configured plant while ‖z‖ is as "
+        "at the run's end [1, rad/s]"
+    )
+    pointwise_radius: float | None = Field(
+        description="bound of ‖z‖ at every instant, in the end [1, rad/s]; null where the certificate does not hold"
+    )
+    pointwise_deg: float | None = Field(description="the attitude error within that bound [deg]")
+    mean_square_share: float | None = Field(
+        description="largest ∫ k ‖z‖² dt as a share of V(t₀) + ∫ δ_Q dt, of true states; it never exceeds 1"
+    )
+    mean_square_at_s: float | None = Field(description="when that was, on the law's clock [s]")
+    mean_square_judged: int = Field(description="true states that judged it")
+    spacing_s: float | None = Field(description="longest time between two of them; the integral is by trapezoids [s]")
+    pointwise_share: float | None = Field(
+        description="largest true ‖z‖ as a share of the bound that holds once ‖z‖ has been so small; it never exceeds 1"
+    )
+    pointwise_at_s: float | None = Field(description="when that was, on the law's clock [s]")
+    pointwise_judged: int = Field(description="true states that judged it")
+    pointwise_since_s: float | None = Field(description="from when on, on the law's clock [s]")
+    pointwise_bound: float | None = Field(description="the least bound that judged [1, rad/s]")
     transient_s: float = Field(description="how long the transient is taken to last [s]")
     since_s: float = Field(
         description="judged from then on, on the law's clock: a session that begins far from its reference first goes "
@@ -111,7 +133,6 @@ class TheoremFindings(BaseModel, frozen=True):
         description="judged until gains or reference first changed, on the law's clock [s]; null: to the end"
     )
     z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the quantized signals [1, rad/s]")
-    z_norm_share: float | None = Field(description="that as a share of the radius")
     error_deg: float | None = Field(description="largest attitude error after the transient, as the controller saw it")
     true_z_norm: float | None = Field(description="largest ‖z‖ after the transient, of the published true states")
     true_error_deg: float | None = Field(description="likewise of the attitude error [deg]")
@@ -119,7 +140,7 @@ class TheoremFindings(BaseModel, frozen=True):
     samples: int = Field(description="true states that belong to a tick that is judged")
     outside: dict[str, int] = Field(
         description="how many of them do not satisfy a premise: (C.28) and (C.29), that sensors err by no more than "
-        "the quantizers, and Assumption 3, the attitude error that the certificate assumes"
+        "the quantizers, (C.30), that the command is not saturated, and Assumption 3, the assumed attitude error"
     )
     judged: int = Field(description="how many satisfy all of them; the inequalities are judged by these alone")
     lemma: list[LemmaCheck]
@@ -211,12 +232,9 @@ class Panel:
 
 @dataclass(frozen=True)
 class Band:
-    """A span of time that is shaded on every drawing over time, with a label: such as an injected fault.
+    """A span of the law's clock [s] that is shaded on every drawing over time, with a label: such as a fault.
 
-    Attributes:
-        start_s: On the law's clock [s].
-        end_s: None if it did not end within the session.
-        label: In a few words.
+    `end_s` is None if it did not end within the session.
     """
 
     start_s: float
@@ -264,22 +282,16 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 ADDRESSES: Final = (
-    "network.",
-    "recorder.path",
-    "recorder.directory",
-    "can.channel",
-    "can.node",
-    "can.options.",
+    "network.", "recorder.path", "recorder.directory", "can.channel", "can.node", "can.options.",
     "plant.quanser.card_identifier",
-)
+)  # fmt: skip
 """Keys that only say where something is."""
 
 
 def differences(reports: Sequence[Report]) -> list[tuple[str, list[Any]]]:
-    """What differs in the configurations of several runs, but addresses and paths.
+    """Dotted keys that differ in the configurations of several runs, but addresses and paths; and each run's value.
 
-    Returns:
-        Dotted keys, and each run's value (None if it has none).
+    A run that has none has None.
     """
     tables = [flat(report.settings) for report in reports]
     keys = sorted(key for key in set().union(*tables) if not key.startswith(ADDRESSES))

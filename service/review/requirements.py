@@ -1,4 +1,4 @@
-"""Limits of figures: `z_track=50e-4` holds if the figure is at most that."""
+"""Limits of figures: `z_track=50e-4` holds if the figure is at most that, `theorem=1` if it is at least that."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.review.report import Check, Findings
 
 _SPREADS: Final = ("latency", "period", "measurement_delay", "command_delay")
+_THEOREM: Final = ("z_norm", "true_z_norm", "radius", "pointwise_radius", "mean_square_share", "pointwise_share")
 _PERCENTILES: Final = ("p50", "p90", "p99", "p999", "max")
 
 UNITS: Final[dict[str, str]] = {
@@ -17,15 +18,14 @@ UNITS: Final[dict[str, str]] = {
     "u_total": "V²·s",
     "max_error_deg": "°",
     "final_error_deg": "°",
-    **dict.fromkeys(
-        ("skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks", "invalid", "damages"), ""
-    ),
+    **dict.fromkeys(["skipped_ticks", "trips", "gap_count", "losses", "lapses", "missing_ticks"], ""),
+    **dict.fromkeys(["invalid", "damages"], ""),
     **{f"latency_us.{name}": "µs" for name in ("p50", "p99", "p999", "max")},
     **{f"timing.{spread}.{name}": "µs" for spread in _SPREADS for name in _PERCENTILES},
     **{f"age_us.{name}": "µs" for name in ("p50", "p99", "max")},
     **{f"saturated.{name}": "" for name in ("attitude", "rate", "voltage")},
-    **{f"theorem.{name}": "" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "broken")},
-    **{f"theorem.{name}": "°" for name in ("error_deg", "true_error_deg", "radius_deg")},
+    **{f"theorem.{name}": "" for name in (*_THEOREM, "held", "broken")},
+    **{f"theorem.{name}": "°" for name in ("error_deg", "true_error_deg", "pointwise_deg")},
 }
 """Figures that can have a limit, by their names in the findings, and their units."""
 
@@ -33,13 +33,17 @@ SHORT: Final[dict[str, str]] = {
     "skipped": "skipped_ticks",
     "gaps": "gap_count",
     **{f"{name}.{p}": f"timing.{name}.{p}" for name in _SPREADS for p in _PERCENTILES},
-    **{name: f"theorem.{name}" for name in ("z_norm", "z_norm_share", "true_z_norm", "radius", "radius_deg")},
+    "theorem": "theorem.held",
+    **{name: f"theorem.{name}" for name in (*_THEOREM, "pointwise_deg")},
     "settled_error_deg": "theorem.error_deg",
     "true_settled_error_deg": "theorem.true_error_deg",
     "lemma_broken": "theorem.broken",
     **{f"age.{name}": f"age_us.{name}" for name in ("p50", "p99", "max")},
 }
 """Other names for some of them."""
+
+AT_LEAST: Final = ("theorem.held",)
+"""Figures of which more is better."""
 
 NAMES: Final = (*(name for name in UNITS if not name.startswith(("timing.", "age_us.", "theorem."))), *SHORT)
 
@@ -61,10 +65,10 @@ def value_of(figures: Figures, path: str) -> float | None:
 
 
 class Limit(NamedTuple):
-    """Upper limit of a figure, as `value_of` finds it."""
+    """Upper limit of a figure, as `value_of` finds it; of those in AT_LEAST a lower limit."""
 
     figure: str
-    most: float
+    bound: float
 
     @classmethod
     def parse(cls, text: str) -> Limit:
@@ -81,12 +85,17 @@ class Limit(NamedTuple):
         """The figure's value; None if it is unavailable."""
         return value_of(figures, SHORT.get(self.figure, self.figure))
 
+    @property
+    def _lower(self) -> bool:
+        return SHORT.get(self.figure, self.figure) in AT_LEAST
+
     def broken(self, figures: Figures) -> str | None:
         """Why it does not hold, in a line; None if it does. It does not hold for an unavailable figure."""
-        value = self.value(figures)
+        value, words = self.value(figures), ("at least", "less than") if self._lower else ("at most", "more than")
         if value is None:
-            return f"{self.figure} is not known, so it is not at most {self.most:g}"
-        return None if value <= self.most else f"{self.figure} is {value:.6g}, more than {self.most:g}"
+            return f"{self.figure} is not known, so it is not {words[0]} {self.bound:g}"
+        kept = value >= self.bound if self._lower else value <= self.bound
+        return None if kept else f"{self.figure} is {value:.6g}, {words[1]} {self.bound:g}"
 
     def check(self, findings: Findings) -> Check:
         """Whether it holds, and what was found."""
@@ -95,5 +104,5 @@ class Limit(NamedTuple):
         space = "" if unit in ("", "°") else " "
         reasons = (why for key, why in findings.reasons.items() if name == key or name.startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
-        text = f"{self.figure} ≤ {self.most:g}{space}{unit}"
+        text = f"{self.figure} {'≥' if self._lower else '≤'} {self.bound:g}{space}{unit}"
         return Check(text=text, holds=self.broken(findings) is None, found=found)

@@ -21,28 +21,18 @@ from aeroloop.service.logs.runs import Run, Taker
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.logs.wire_check import WireCheck
-from aeroloop.service.review.certified_bounds import certified_bounds, damping_of
+from aeroloop.service.review.certified_bounds import certified_bounds
 from aeroloop.service.review.events import EventLog
-from aeroloop.service.review.faults import bands
 from aeroloop.service.review.findings import facts_of, findings_of, latency_of, name_of
 from aeroloop.service.review.observe import WHOLE, DrawnPart
-from aeroloop.service.review.report import Findings, Report
+from aeroloop.service.review.report import Band, Findings, Report
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.session import Session
 from aeroloop.service.review.theorem_check import TheoremCheck
 
 
 class Review(NamedTuple):
-    """Review of a session.
-
-    Attributes:
-        figures: The figures of merit alone.
-        findings: The same figures and everything else.
-        session: The session.
-        which: Its vehicle and name.
-        name: Name of the run.
-        facts: Facts about software and host, by role.
-    """
+    """Review of a session of the run `name`: the figures of merit alone, and with everything else the findings."""
 
     figures: Figures
     findings: Findings
@@ -69,7 +59,7 @@ class Review(NamedTuple):
             settings=self.session.settings.description(),
             facts=self.facts,
             part=None if part[:2] == WHOLE[:2] else part[:2],
-            bands=bands(self.findings.faults),
+            bands=[Band(fault.begin_s, fault.end_s, fault.fault) for fault in self.findings.faults],
         )
 
 
@@ -79,19 +69,9 @@ def review(*paths: Path) -> Figures:
 
 
 def report(
-    paths: Sequence[Path],
-    limits: Sequence[Limit] = (),
-    progress: Progress | None = None,
-    part: DrawnPart = WHOLE,
+    paths: Sequence[Path], limits: Sequence[Limit] = (), progress: Progress | None = None, part: DrawnPart = WHOLE
 ) -> Report:
-    """Report of a run's longest session. Raises as `read` does.
-
-    Args:
-        paths: Logs, folders of logs, or the files of a rotated run.
-        limits: Limits that its figures must keep.
-        progress: Called repeatedly with the share done, 0…1.
-        part: What of it is drawn.
-    """
+    """Report of a run's longest session, checked against limits; `part` of it is drawn. Raises as `read` does."""
     return read(*paths, progress=progress, part=part).report(limits)
 
 
@@ -107,8 +87,8 @@ def read(
 
     Args:
         paths: Logs, folders of logs, or the files of a rotated run.
-        session: Its name or number, as of `Run.choose`; the longest if None.
-        vehicle: Its vehicle; that of the longest session if None.
+        session: As of `Run.choose`.
+        vehicle: As of `Run.choose`.
         watch: Called with every block of the session's ticks.
         progress: Called repeatedly with the share done, 0…1.
         part: What of it is drawn.
@@ -123,7 +103,7 @@ def read(
 
         def check(changes: Sequence[Change]) -> TheoremCheck:
             certified = certified_bounds(settings, changes, description.certificate if description else None)
-            return TheoremCheck(certified, settings.loop.period, damping_of(settings.plant))
+            return TheoremCheck(certified, settings)
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
         judged = Session(settings, check, missing, watch, part)

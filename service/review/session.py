@@ -44,7 +44,6 @@ class Session:
         part: What of it is drawn.
 
     Attributes:
-        part: What of it is drawn.
         score: Its figures of merit.
         lapses: How many ticks were late, missed and so on; see `Findings`.
         reader: Reads its ticks.
@@ -112,9 +111,8 @@ class Session:
         try:
             truths = _TRUTHS.validate_json(b"[" + b",".join(self._truths) + b"]")
         except ValidationError:  # a stranger may publish anything
-            readable = [truth for text in self._truths if (truth := _truth(text)) is not None]
-            self.unreadable += len(self._truths) - len(readable)
-            truths = readable
+            truths = [truth for text in self._truths if (truth := _truth(text)) is not None]
+            self.unreadable += len(self._truths) - len(truths)
         for truth in truths:
             if truth.session == self._session:
                 check.truth(truth.session_tick, truth.attitude, truth.rate)

@@ -1,8 +1,10 @@
-"""Check of a session against Theorem 1 and Lemma 1: guarantees, what the run did, each inequality at true states.
+"""Check of a session against Theorem 1 and Lemma 1: what the run did, and every inequality at true states.
 
 ‖z‖ and V are computed from the controller's quantized signals at every tick, and from the true states at the ticks for
 which an emulator published one. A truth has the tick of its measurement, so nothing that is judged is interpolated. The
-transient lasts three times the law's slower time constant, after which an error has fallen to 5 %. Judging begins when
+transient lasts three times the law's slower time constant, after which an error has fallen to 5 %; the largest error
+after it is reported, and judged by nothing, since θ̃ may take much longer. `guarantees` judges what holds at any length;
+Lemma 1 is judged at each true state that satisfies its premises, (C.30) for its command among them. Judging begins when
 the reference is followed, since a session that begins far from it approaches it first, and ends when an operator first
 changes gains or reference. Why: before and after, another certificate holds.
 """
@@ -19,11 +21,13 @@ import numpy.typing as npt
 
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
 from aeroloop.service.review.angles import of_nearer_sign
 from aeroloop.service.review.certified_bounds import CertifiedBounds
+from aeroloop.service.review.guarantees import Conditions, Guarantees
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem.lemma import (
     Inequality,
@@ -38,6 +42,8 @@ from aeroloop.service.theorem.lemma import (
 Flags = npt.NDArray[np.bool_]
 
 PREMISES: Final = ("C.28", "C.29")
+COMMAND_PREMISE: Final = "C.30"
+"""Premise: the command is within its quantization error of what the law computed, so not saturated."""
 ERROR_PREMISE: Final = "Assumption 3"
 """Premise: the attitude error is within the certificate's assumption."""
 
@@ -108,29 +114,27 @@ class TheoremCheck:
 
     Args:
         certified: Certificate and bounds to check against.
-        period: Time between ticks [s].
-        damping: θ of the plant; None if not known [N·m·s/rad].
+        settings: Configuration of the session's controller.
 
     Attributes:
         damping_known: Whether θ is known.
-        radius: Where ‖z‖ is guaranteed to end; None without a guarantee.
     """
 
-    def __init__(self, certified: CertifiedBounds, period: float, damping: Vector | None) -> None:
+    def __init__(self, certified: CertifiedBounds, settings: Settings) -> None:
         self._certified = certified
-        self._period = period
-        self._damping = damping
-        self.damping_known = damping is not None
-        self.radius = certified.radius
+        self._period = settings.loop.period
+        self._damping = None if certified.bounds is None else certified.bounds.bounds.theta
+        self.damping_known = self._damping is not None
+        self._guarantees = Guarantees(certified, settings.loop, settings.plant)
         self._changes: list[Change] = []  # the first few
         self._since, self._until = 0, inf
         self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
-        self._before: Ticks | None = None  # the last block, for late truths
+        self._before: tuple[Ticks, Conditions] | None = None  # the last block, for late truths
         self._drawn = np.empty((0, 8))  # the last true state, as of `_judge_truths`
         self._counts: dict[str, InequalityCount] = {}
-        self._outside = dict.fromkeys((*PREMISES, ERROR_PREMISE), 0)
+        self._outside = dict.fromkeys((*PREMISES, COMMAND_PREMISE, ERROR_PREMISE), 0)
         self._samples = self._judged = 0
-        self._settled = transient(certified.law) / period  # tick from which the transient is over
+        self._settled = transient(certified.law) / self._period  # tick from which the transient is over
         self._seen: tuple[float, float] | None = None  # largest ‖z‖ and largest attitude error [rad] from then on
         self._true: tuple[float, float] | None = None  # the same of the true state
 
@@ -162,10 +166,13 @@ class TheoremCheck:
             square = (ticks.attitude_error[after] ** 2).sum(axis=1)
             self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
         true = np.full((7, len(z)), nan)
-        before, self._before = self._before, ticks
+        conditions = self._guarantees.conditions(ticks, z, self._since)
+        before, self._before = self._before, (ticks, conditions)
         if self._truths and self._truths[0][0] <= ticks.k[-1]:
-            late = [] if before is None or before.k[-1] < self._truths[0][0] else [before]
-            if (found := self._judge_truths(Ticks.joined([*late, ticks]))) is not None:
+            whole = self._before
+            if before is not None and before[0].k[-1] >= self._truths[0][0]:
+                whole = Ticks.joined([before[0], ticks]), before[1].joined(conditions)
+            if (found := self._judge_truths(*whole)) is not None:
                 known = np.vstack([self._drawn, found])
                 self._drawn = known[-1:]
                 # Interpolated for drawing only.
@@ -175,9 +182,9 @@ class TheoremCheck:
     def finish(self) -> None:
         """Judge true states of the last block that were received after it."""
         if self._truths and self._before is not None:
-            self._judge_truths(self._before)
+            self._judge_truths(*self._before)
 
-    def _judge_truths(self, ticks: Ticks) -> Array | None:
+    def _judge_truths(self, ticks: Ticks, conditions: Conditions) -> Array | None:
         """Judge the true states of these ticks: tick, ‖z‖, V, error [deg] and q of each, (n, 8); None without one."""
         truths = self._take_truths(int(ticks.k[0]), int(ticks.k[-1]))
         place = np.searchsorted(ticks.k, truths.k)
@@ -185,7 +192,8 @@ class TheoremCheck:
         if not there.any():
             return None
         at, truths = ticks.where(place[there]), Truths(*(column[there] for column in truths))
-        return np.column_stack([at.k, *self._judge_lemma(at, truths), of_nearer_sign(truths.attitude, at.desired)])
+        judged = self._judge_states(at, conditions.where(place[there]), truths)
+        return np.column_stack([at.k, *judged, of_nearer_sign(truths.attitude, at.desired)])
 
     def _take_truths(self, first: int, last: int) -> Truths:
         """Truths of these ticks; earlier ones are dropped, later ones wait."""
@@ -196,13 +204,12 @@ class TheoremCheck:
         k, attitude, rate = zip(*taken, strict=True) if taken else ((), (), ())
         return Truths(np.array(k, np.int64), np.array(attitude).reshape(-1, 4), np.array(rate).reshape(-1, 3))
 
-    def _judge_lemma(self, at: Ticks, truths: Truths) -> tuple[Array, Array, Array]:
-        """Judge the lemma at ticks with a truth. Returns true ‖z‖, V and error [deg]. Shapes (n,)."""
-        certified = self._certified
-        law = certified.law
+    def _judge_states(self, at: Ticks, conditions: Conditions, truths: Truths) -> tuple[Array, Array, Array]:
+        """Judge the true states of ticks. Returns true ‖z‖, V and error [deg]. Shapes (n,)."""
+        certified, law = self._certified, self._certified.law
         inertial = times(rotation(at.attitude), at.desired_rate)
-        samples = Samples(truths.attitude, truths.rate, at.attitude, at.rate, at.desired, inertial, at.sign)
-        q = samples.q * np.where((samples.q * samples.q_Q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        q = truths.attitude * np.where((truths.attitude * at.attitude).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        samples = Samples(q, truths.rate, at.attitude, at.rate, at.desired, inertial, at.sign)
         b = coordinates(q, samples.omega, samples.q_d, inertial, at.sign, at.gain)
         theta_error = np.zeros((1, 3)) if self._damping is None else self._damping - at.damping_estimate
         within = (at.k >= self._since) & (at.k < self._until)
@@ -213,17 +220,20 @@ class TheoremCheck:
         if (bounds := certified.bounds) is not None and within.any():
             small = half_angle <= bounds.known.half_angle_e * (1 + 1e-9)
             time: Array = np.asarray(at.k * self._period, dtype=np.float64)
-            self._judge(lemma_inequalities(samples, law, bounds.known, bounds.lemma), within, small, time)
+            inequalities = lemma_inequalities(samples, law, bounds.known, bounds.lemma)
+            self._judge_lemma(inequalities, within, {ERROR_PREMISE: ~small, COMMAND_PREMISE: conditions.refused}, time)
+            self._guarantees.judge(at, conditions, samples, b, within & small)
         return b.norm, lyapunov(b, theta_error, law), np.degrees(2 * half_angle)
 
-    def _judge(self, inequalities: Sequence[Inequality], within: Flags, small: Flags, time: Array) -> None:
+    def _judge_lemma(
+        self, inequalities: Sequence[Inequality], within: Flags, unmet: dict[str, Flags], time: Array
+    ) -> None:
         """Count each inequality at samples within the judged span that meet every premise."""
-        self._outside[ERROR_PREMISE] += int((within & ~small).sum())
-        judged = within & small
-        for inequality in inequalities:
-            if inequality.equation in PREMISES:
-                self._outside[inequality.equation] += int((within & inequality.broken).sum())
-                judged &= ~inequality.broken
+        unmet |= {one.equation: one.broken for one in inequalities if one.equation in PREMISES}
+        judged = within.copy()
+        for name, where in unmet.items():
+            self._outside[name] += int((within & where).sum())
+            judged &= ~where
         self._judged += int(judged.sum())
         for inequality in inequalities:
             if inequality.equation not in PREMISES:
@@ -231,21 +241,52 @@ class TheoremCheck:
 
     # ── results ──
 
-    def findings(self) -> tuple[TheoremFindings, dict[str, str]]:
-        """Findings, and the reason of each that is null, by name."""
-        certified, radius, seen, true = self._certified, self.radius, self._seen, self._true
+    @property
+    def pointwise_radius(self) -> float | None:
+        """Within which ‖z‖ stays in the end; None where no such bound is proven of the plant."""
+        return self._certified.pointwise_radius
+
+    @property
+    def radius(self) -> float | None:
+        """√(δ_Q/k) at the last true state judged: the root of the mean of ‖z‖² in the long run; None before."""
+        return self._guarantees.radius
+
+    def findings(self, *, faults: bool = False) -> tuple[TheoremFindings, dict[str, str]]:
+        """Findings, and the reason of each that is null, by name.
+
+        Args:
+            faults: Whether faults acted at the plant, with which nothing but Lemma 1 can be judged.
+        """
+        certified, seen, true, run = self._certified, self._seen, self._true, self._guarantees
         certificate = certified.certificate
+        if faults:
+            run.forget("faults acted at the plant")
+        square, point = run.mean_square, run.pointwise
         checks = [count.check() for count in self._counts.values()]
+        broken = sum(check.broken for check in checks) if self._judged else None
+        shares = (broken, square.share, point.share)
         found = TheoremFindings(
             verdict=certified.verdict,
             holds=None if certificate is None else certificate.holds,
-            radius=radius,
-            radius_deg=None if radius is None or certificate is None else certificate.plant_deg,
+            held=None
+            if shares == (None, None, None)
+            else not broken and all((share or 0) <= 1 for share in shares[1:]),
+            radius=self.radius,
+            pointwise_radius=self.pointwise_radius,
+            pointwise_deg=certificate.plant_deg if certificate and self.pointwise_radius is not None else None,
+            mean_square_share=square.share,
+            mean_square_at_s=square.at_s,
+            mean_square_judged=square.samples,
+            spacing_s=run.spacing_s,
+            pointwise_share=point.share,
+            pointwise_at_s=point.at_s,
+            pointwise_judged=point.samples,
+            pointwise_since_s=run.entered_s,
+            pointwise_bound=run.bound,
             transient_s=transient(certified.law),
             since_s=round(self._since * self._period, 9),
             until_s=None if self._until == inf else round(self._until * self._period, 9),
             z_norm=seen and seen[0],
-            z_norm_share=seen[0] / radius if seen and radius else None,
             error_deg=seen and degrees(seen[1]),
             true_z_norm=true and true[0],
             true_error_deg=true and degrees(true[1]),
@@ -254,28 +295,42 @@ class TheoremCheck:
             outside=self._outside if self._samples else {},
             judged=self._judged,
             lemma=checks,
-            broken=sum(check.broken for check in checks) if self._judged else None,
+            broken=broken,
         )
         return found, {f"theorem.{name}": why for name, why in self._reasons(found).items()}
 
     def _reasons(self, found: TheoremFindings) -> dict[str, str]:
-        reasons = dict[str, str]()
+        reasons, unjudged = dict[str, str](), self._guarantees.unjudged
         no_truth = "the log has no true state of a tick that is judged"
         changed = f"gains or reference changed at {found.until_s} s"
         end = "the session ended before" if found.until_s is None else changed
         short = f"the transient lasts {found.transient_s:.3g} s, and {end}"
         if found.z_norm is None:
-            reasons |= dict.fromkeys(("z_norm", "z_norm_share", "error_deg"), short)
+            reasons |= dict.fromkeys(("z_norm", "error_deg"), short)
         if found.true_z_norm is None:
             why = short if found.z_norm is None and found.samples else no_truth
             reasons |= dict.fromkeys(("true_z_norm", "true_error_deg"), why)
         if found.broken is None:
             reasons["broken"] = "no true state satisfies the lemma's premises" if found.samples else no_truth
-        if found.radius is None:
-            nothing = found.verdict.rstrip(".") if found.holds is None else "the theorem does not hold"
-            reasons |= dict.fromkeys(("radius", "radius_deg", "z_norm_share"), nothing)
             if self._certified.bounds is None:
-                reasons["broken"] = nothing
+                reasons["broken"] = found.verdict.rstrip(".")
+        if found.mean_square_share is None:
+            few = "no two true states in a row satisfy the premises, with every command between them within (C.30)"
+            why = unjudged or (self._guarantees.undecided if found.samples else no_truth) or few
+            reasons |= dict.fromkeys(("radius", "mean_square_share", "mean_square_at_s", "spacing_s"), why)
+        if found.pointwise_radius is None:
+            why = found.verdict.rstrip(".") if found.holds is None else "the certificate does not hold"
+            reasons |= dict.fromkeys(("pointwise_radius", "pointwise_deg"), why)
+        if found.pointwise_share is None:
+            none = "no invariant set is proven of the configured plant"
+            far = "no true state is near enough to the invariant set"
+            bounds = self._certified.bounds
+            why = unjudged or (
+                none if bounds is None or bounds.plant_reach is None else far if found.samples else no_truth
+            )
+            reasons |= dict.fromkeys(("pointwise_share", "pointwise_at_s", "pointwise_since_s", "pointwise_bound"), why)
+        if found.held is None:
+            reasons["held"] = reasons["broken"]
         return reasons
 
 

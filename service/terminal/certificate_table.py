@@ -1,4 +1,4 @@
-"""Terminal table of a certificate: verdict, remedies, the terms that decide, or every term."""
+"""Terminal table of a certificate: verdict, remedies, bounds, assumptions, the terms that decide, or every term."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aeroloop.service.terminal.console import Console
 from aeroloop.service.theorem.certificate import Certificate
 
 DECIDING: Final = (
-    "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ∡e/2", "δ_V1", "c₀/2 − δ_V1", "k", "√(δ_Q/k)", "4 asin(√(δ_Q/k)/2)"
+    "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "τ_h of the plant"
 )  # fmt: skip
 """Symbols of the terms that are shown unless all are asked for: what goes in, what decides, what comes out."""
 
@@ -22,15 +22,34 @@ def certificate_table(certificate: Certificate, *, verbose: bool = False) -> Non
     """Print a certificate, with all of its terms if verbose."""
     console = Console()
     console.print(Text(certificate.verdict, style="bold green" if certificate.holds else "bold red"))
+    for reason in certificate.violated[1:]:
+        console.print(Text(f"  {reason}"))
     for remedy in certificate.remedies:
         console.print(Text(f"  {remedy.text}{':' if remedy.overrides else ''}"))
         if remedy.overrides:  # left whole, to be copied
             how = " ".join(f"--set {change!r}" for change in remedy.overrides)
             console.print(Text(f"    {how}"), soft_wrap=True)
     console.print()
+    console.print(_bounds(certificate))
+    console.print(Text("\nAssumed:"))
+    for assumption in certificate.assumptions:
+        console.print(Text(f"  {assumption}"))
+    console.print()
     console.print(_terms(certificate, None if verbose else DECIDING))
     if not verbose:
         console.print(Text(f"\n--verbose prints all {len(certificate.terms)} terms, with their equations."))
+
+
+def _bounds(certificate: Certificate) -> Table:
+    table = Table("proven, in the end", "‖z‖", "attitude", box=None, pad_edge=False)
+    for what, radius, angle in (
+        ("paper's body, root of the mean square", certificate.rms_radius, None),
+        ("paper's body, at every instant", certificate.pointwise_radius, certificate.pointwise_deg),
+        ("configured plant, at every instant", certificate.plant_radius, certificate.plant_deg),
+    ):
+        shown = "not proven" if radius is None else f"{radius:.4g}"
+        table.add_row(what, shown, "" if angle is None else f"{angle:.2f}°")
+    return table
 
 
 def _terms(certificate: Certificate, symbols: Container[str] | None) -> Table:

@@ -5,7 +5,7 @@ Tables go to stdout, bars to stderr. A bar is drawn only on a terminal and erase
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from math import degrees
@@ -115,6 +115,8 @@ def share_bar(title: str, *, hidden: bool = False) -> Iterator[Callable[[float],
 
 def paper_tables(tables: Tables) -> None:
     """Print the predicted tables beside the published ones."""
+    from aeroloop.service.lab.tables import ERRORS, NOT_IDENTIFIED, comparison  # it imports the closed loop
+
     console = Console()
     for title, table, digits in (
         ("z_track [1e-4 s], Table C.2", tables.C2, 1),
@@ -128,7 +130,7 @@ def paper_tables(tables: Tables) -> None:
             cells = zip(table.ours[i], table.paper[i], spread, strict=True)
             grid.add_row("cont" if inp is None else f"{inp} bits", *(_beside(*cell, digits) for cell in cells))
         console.print(grid)
-        console.print(f"mean absolute relative error of the 23 predicted cells: {table.mare:.1%}\n")
+        console.print()
     grid = Table("", title="with and without wind, Table C.4: ours (paper's)", title_justify="left", box=None)
     for air in ("calm", "wind"):
         grid.add_column(f"z_track, {air}", justify="right")
@@ -142,12 +144,24 @@ def paper_tables(tables: Tables) -> None:
         ]
         grid.add_row(case, *shown)
     console.print(grid)
-    console.print(f"mean absolute relative error of the predicted windy cell: {tables.C4.mare:.1%}")
+    rows_table(comparison(tables), f"\n{ERRORS}")
+    console.print(f"\n{NOT_IDENTIFIED}")
 
 
 def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> str:
     plus_minus = "" if spread is None else f" ±{spread:.{digits}f}"
     return f"{mine:.{digits}f}{plus_minus} ({theirs})"
+
+
+def rows_table(rows: Sequence[Sequence[str]], title: str | None = None) -> None:
+    """Print rows of text, a header first; all columns but the first hold numbers."""
+    header, *rest = rows
+    table = Table(header[0], title=title, title_justify="left", box=None)
+    for column in header[1:]:
+        table.add_column(column, justify="right")
+    for row in rest:
+        table.add_row(*row)
+    Console().print(table)
 
 
 def calibration_table(fit: Calibration) -> None:
@@ -162,6 +176,14 @@ def calibration_table(fit: Calibration) -> None:
     Console().print(table)
     for name, residual in fit.residuals.items():
         Console().print(f"residual {name}: {residual:+.2%}")
+    found = fit.identification
+    rows = [["parameter", "value", "± if others known", "± jointly"]]
+    for p in found.parameters:
+        jointly = f"{p.jointly:.2g} {p.unit}{'' if p.identified else ': not identified'}"
+        rows.append([p.name, f"{p.value:.3g} {p.unit}", f"{p.alone:.2g} {p.unit}", jointly])
+    rows_table(rows, "\nidentified by the figures of Table C.4, given the published cells' scatter")
+    values = ", ".join(f"{value:.3g}" for value in found.singular_values)
+    Console().print(f"singular values {values}; weakest together: {found.weakest}")
     Console().print(f"{fit.runs} experiments")
 
 

@@ -183,18 +183,19 @@ def watch(
     def receive(sample: zenoh.Sample) -> None:
         top.receive(str(sample.key_expr), sample.payload.to_bytes())
 
-    def described(reply: zenoh.Reply) -> None:
+    def answered(reply: zenoh.Reply) -> None:
         if reply.ok is not None:
             receive(reply.ok)
 
     with join(network, listen=False) as session:
+        session.get(topics.key("status", "*"), answered, timeout=1.0)  # the next ones come within a second
         for name in ("status", "telemetry", "truth", "event"):
             session.declare_subscriber(topics.key(name, "*"), receive)
         queried = -inf
         while not stop.is_set():
             if time.monotonic() - queried > 2.0:  # for roles that have joined since
                 queried = time.monotonic()
-                session.get(topics.key("description", "*"), described, timeout=1.0)
+                session.get(topics.key("description", "*"), answered, timeout=1.0)
             show(top.draw, footer.draw() if read else Text())
             if read is None:
                 stop.wait(REFRESH_S)

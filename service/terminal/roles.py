@@ -13,6 +13,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.protocol.messages.models import Percentiles, Status
+from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.terminal.console import Console
@@ -20,7 +21,14 @@ from aeroloop.service.terminal.console import Console
 WIDE: Final = 90
 """Columns of the terminal from which on all columns of the table are drawn."""
 GOOD, BAD, WAITING, STALE = "green", "bold red", "yellow", "dim"
-_STYLES: Final = {"running": GOOD, "driven": GOOD, "recording": GOOD, "tripped": BAD, "faulted": BAD}
+_STYLES: Final = {
+    "running": GOOD,
+    "driven": GOOD,
+    "recording": GOOD,
+    "tripped": BAD,
+    "faulted": BAD,
+    NOT_RECORDING: BAD,
+}
 
 
 def roles_view(statuses: Mapping[str, tuple[float, Status]], width: int) -> Group:

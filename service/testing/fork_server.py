@@ -46,12 +46,7 @@ _PRELOADED: Final = (
 
 
 class ForkedProcess:
-    """A child of the fork server, used like `subprocess.Popen`.
-
-    Attributes:
-        pid: Process id.
-        returncode: Exit code, negative for a signal; None if it ran at the last poll.
-    """
+    """A child of the fork server, used like `subprocess.Popen`; `returncode` is None if it ran at the last poll."""
 
     def __init__(self, pid: int, result: int) -> None:
         self.pid = pid

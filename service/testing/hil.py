@@ -38,16 +38,13 @@ PATIENCE_PER_STEP_S: Final = 0.02
 
 
 class Hil:
-    """A closed loop of real processes.
+    """A closed loop of real processes, with the events received so far.
 
     Args:
         folder: Folder of the logs.
         lockstep: Whether `run` counts steps instead of seconds.
         plant: The plant end: a value of `plant.via`, or can-node for an emulated node on a private bus.
         config: TOML file to start from, unless `start` names another.
-
-    Attributes:
-        events: Events received so far.
     """
 
     def __init__(
@@ -152,10 +149,7 @@ class Hil:
     def inject(self, fault: str | None) -> None:
         """Inject a fault into the emulated plant, its times in seconds from now: `signal:kind[=value][@start[..end]]`.
 
-        None clears all faults.
-
-        Raises:
-            HilError: The fault is malformed, or the plant is not emulated.
+        None clears all faults. Raises HilError if the fault is malformed, or the plant is not emulated.
         """
         self._query("inject", Inject(clear=True) if fault is None else Inject(faults=[fault]))
 
@@ -255,8 +249,7 @@ class Hil:
     def evidence(self) -> list[str]:
         """Stop all processes and write what explains a failure beside each log: page and events.
 
-        Returns:
-            A line for each file: its path and what it is. Configuration and output of the daemons are there already.
+        Returns a line for each file: its path and what it is. Configuration and output of daemons are there already.
         """
         self.finish()
         lines = [line for log in self._logs for line in log.evidence(self.events if log is self._logs[-1] else [])]

@@ -57,18 +57,13 @@ class RunFigures(_Present, Figures):
     @classmethod
     def of(cls, figures: Figures) -> RunFigures:
         """The same figures."""
-        streams = {
-            name: RunStream.model_construct(**dict(getattr(figures, name))) for name in ("measurement", "command")
-        }
-        return cls.model_construct(**{**dict(figures), **streams})
+        found = dict(figures)
+        streams = {name: RunStream.model_construct(**dict(found[name])) for name in ("measurement", "command")}
+        return cls.model_construct(**{**found, **streams})
 
 
 class HilLog:
-    """The log of a run.
-
-    Attributes:
-        path: The MCAP file.
-    """
+    """The log of a run, an MCAP file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -130,7 +125,7 @@ class HilLog:
             yield f"{self.path}: no log was written"
             return
         yield f"{self.path}: the log"
-        events, page = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
+        events, shown = self.path.with_name(f"{self.path.stem}-events.txt"), self.path.with_suffix(".html")
         try:
             timed = [(at, event) for at, event in self.messages("event") if isinstance(event, Event)]
             lines = [f"{(at - timed[0][0]) * 1e-9:9.3f} s  {_line(event)}" for at, event in timed]
@@ -139,13 +134,13 @@ class HilLog:
         events.write_text("\n".join(lines) + "\n", encoding="utf-8")
         yield f"{events}: {len(lines)} events"
         try:
-            from aeroloop.service.report.page.page import write_page
+            from aeroloop.service.report.page.page import page
 
-            write_page([report([self.path])], page)
+            shown.write_text(page([report([self.path])]), encoding="utf-8")
         except Exception as error:  # the same; and without the extra `review` there is no page
             yield f"no page: {type(error).__name__}: {error}".splitlines()[0]
         else:
-            yield f"{page}: the review as a page"
+            yield f"{shown}: the review as a page"
 
     def _existing(self) -> Path:
         if not self.path.exists():

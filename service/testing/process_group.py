@@ -96,12 +96,8 @@ def standalone(settings: Settings, log: Path, **controller: Any) -> Settings:
 class ProcessGroup:
     """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
-    Args:
-        settings: The configuration.
-        folder: Folder to keep their configuration and output in, a text file each; None: they are not kept.
-
-    Attributes:
-        zenoh: A session on their network.
+    Their configuration and output, a text file each, are kept in the folder if one is given; `zenoh` is a session on
+    their network.
     """
 
     def __init__(self, settings: Settings, folder: Path | None = None) -> None:

@@ -81,6 +81,9 @@ class Known:
     hold: Annotated[
         float, Term("τ_h", "sampling", "N·m", "torque by which a command is out of date, within the invariant set")
     ]
+    power: Annotated[
+        float, Term("P_h", "sampling", "W", "power by which the adaptation is out of date, within the set")
+    ]
     omega_limit: Annotated[
         float,
         Term("max |ω_k|", "C.29", "rad/s", "assumed of Lemma 1: within wire.rate.limit"),
@@ -200,7 +203,7 @@ def theorem_1(p: Known, d: Lemma) -> Theorem:
         + d.delta_Bu
     )  # (C.71)
     delta_Q = delta_theta1 + delta_V2**2 / (2 * c0)  # (C.69)
-    delta_Qdist = delta_theta1 + (delta_V2 + p.k_tau_d + p.hold) ** 2 / (2 * c0)  # (C.80)
+    delta_Qdist = delta_theta1 + p.power + (delta_V2 + p.k_tau_d + p.hold) ** 2 / (2 * c0)  # (C.80)
     margin = c0 / 2 - delta_V1  # (C.66)
     holds = margin > 0
     radius = sqrt(delta_Qdist / margin) if holds else None  # (C.68), (C.79)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from math import asin, ceil, degrees, hypot, inf, pi, radians, sin, sqrt
 from typing import Any, Final, get_type_hints
 
@@ -18,15 +18,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.service.control.law import ESTIMATE_REACH
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.configured import Configured
 from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
 from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
 from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
-from aeroloop.service.theorem.remedies import Remedy, remedies
-
-PROJECTION: Final = 0.95
-"""The projection keeps ‖θ̂‖ within k_θ divided by this."""
+from aeroloop.service.theorem.remedies import Holds, Remedy, remedies
 
 
 class CertificateTerm(BaseModel):
@@ -81,12 +79,12 @@ class Certificate(BaseModel):
         """The certificate in a sentence."""
         if self.violated:
             more = len(self.violated) - 1
-            return f"Does not hold: {self.violated[0]}{f' (and {more} more)' if more else ''}."
+            return f"The certificate does not hold: {self.violated[0]}{f' (and {more} more)' if more else ''}."
         assert self.plant_radius is not None
         assert self.plant_deg is not None
         return (
-            f"Holds: once there, ‖z‖ stays within {self.plant_radius:.4g}, the attitude within {self.plant_deg:.2f}°; "
-            f"in the long run the root of the mean of ‖z‖² is at most {self.rms_radius:.4g}."
+            f"The certificate holds: once there, ‖z‖ stays within {self.plant_radius:.4g}, the attitude within "
+            f"{self.plant_deg:.2f}°."
         )
 
     def value(self, symbol: str) -> float | None:
@@ -99,6 +97,7 @@ class Evaluated:
     """The quantities of a certificate.
 
     Attributes:
+        desired: The reference's extremes.
         known: Inputs.
         lemma: The bounds of Lemma 1.
         theorem: The bounds of Theorem 1.
@@ -109,6 +108,7 @@ class Evaluated:
         bounds: What the plant does beyond the paper's equations.
     """
 
+    desired: Extremes
     known: Known
     lemma: Lemma
     theorem: Theorem
@@ -143,7 +143,12 @@ def certify(
     t = e.theorem
     violated, ways = _violated(settings, e), list[Remedy]()
     if violated:
-        ways = _range_remedies(settings, e) + remedies(settings, lambda tried: not _violated(tried, evaluated(tried)))
+
+        def holds(tried: Configured) -> bool:
+            now = evaluated(tried, only_plant=True, desired=e.desired)  # the reference stays
+            return now.plant_reach is not None and not _violated(tried, now)
+
+        ways = [*_range_remedies(settings, e, holds), *remedies(settings, holds)]
     return Certificate(
         holds=not violated,
         margin=t.margin,
@@ -171,21 +176,30 @@ def evaluate(
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
     late_s: float = 0.0,
+    only_plant: bool = False,
+    desired: Extremes | None = None,
 ) -> Evaluated:
-    """The quantities of a certificate, to check a run against; arguments and errors as of `certify`."""
+    """The quantities of a certificate, to check a run against; arguments and errors as of `certify`.
+
+    With `only_plant` the paper's body is left out, which does not decide whether a certificate holds; `desired` are the
+    reference's extremes if they are known.
+    """
     stated = disturbance or 0.0
     if not 0 <= stated < inf:
         raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
-    desired = extremes(settings.reference)
+    desired = desired or extremes(settings.reference)
     bounds = plant_bounds(settings, disturbance is not None)
     body = premises(settings, desired, paper_body(settings), stated, late_s)
     plant = premises(settings, desired, bounds, stated, late_s)
-    body_reach = reach(body)
+    body_reach = None if only_plant else reach(body)
     plant_reach = reach(plant)
     start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
     p = _known(settings, desired, body, body_reach, radians(min(180.0, start_deg)))
     lemma = lemma_1(p)
-    return Evaluated(p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
+    if body_reach is not None:  # the noise, too, is of a state that has changed since
+        noise = theorem_1(p, lemma).delta_V1 * body.age * body_reach.z_dot
+        p = replace(p, hold=p.hold + noise)
+    return Evaluated(desired, p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
 
 
 def premises(
@@ -208,7 +222,7 @@ def premises(
         Gamma=law.Gamma,
         J=law.inertia,
         k_theta=law.damping_bound,
-        k_theta_hat=law.damping_bound / PROJECTION,
+        k_theta_hat=law.damping_bound * ESTIMATE_REACH,
         weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
         weight_roll=abs(law.centre_of_mass[1]) * gravity,
         norm_B=_norm_B(settings),
@@ -219,7 +233,7 @@ def premises(
         k_omega_d_ddot=desired.jerk,
         axis_rate=desired.axis_rate,
         half_angle_d=desired.half_angle,
-        delta_q=chords(settings.reference, wire.attitude.quantizer().bound + plant.delta_eps),
+        delta_q=chords(desired.samples, _error(wire.attitude, 1) + plant.delta_eps),
         age=plant.age + late_s,
         rate_lag=plant.rate_lag,
         k_tau_d=plant.torque + disturbance,
@@ -248,6 +262,7 @@ def _known(settings: Configured, desired: Extremes, body: Premises, within: Reac
         k_theta_hat=body.k_theta_hat,
         k_tau_d=body.k_tau_d,
         hold=within.hold if within else 0.0,
+        power=within.power if within else 0.0,
         omega_limit=wire.rate.limit,
         u_limit=wire.voltage.limit,
     )
@@ -259,16 +274,17 @@ def _norm_B(settings: Configured) -> float:  # noqa: N802  # the paper's letter
     return float(np.linalg.norm(np.array(settings.law.allocation)[first:, first:], 2))
 
 
+@lru_cache(maxsize=64)
 def _error(signal: SignalSpec, elements: int) -> float:
     """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
     return sqrt(elements) * signal.quantizer().bound
 
 
-def largest_voltage(settings: Configured, at: Reach) -> float:
+def largest_voltage(settings: Configured, desired: Extremes, at: Reach) -> float:
     """The largest |u_k| that the law commands within a set [V]."""
     first = 3 - settings.wire.actuators
     inverse = np.linalg.inv(np.array(settings.law.allocation)[first:, first:])
-    along = np.abs(feedforward(settings.reference, settings.law)[:, first:] @ inverse.T).max(axis=0)
+    along = np.abs(feedforward(desired.samples, settings.law)[:, first:] @ inverse.T).max(axis=0)
     return float((along + np.linalg.norm(inverse, axis=1) * at.deviation).max())
 
 
@@ -286,10 +302,10 @@ def _violated(settings: Configured, e: Evaluated) -> list[str]:
     return found
 
 
-def beyond(settings: Configured, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
+def beyond(settings: Configured, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
     """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
     wire = settings.wire
-    volts, limit = largest_voltage(settings, at), min(wire.voltage.limit, settings.plant.voltage_limit)
+    volts, limit = largest_voltage(settings, desired, at), min(wire.voltage.limit, settings.plant.voltage_limit)
     ranges = (
         ("|ω_k|", at.axis_rate + p.delta_omega, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
         ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
@@ -302,7 +318,7 @@ def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
     where = "the set" if e.plant_reach else "what the quantizers alone do along the reference"
     return [
         f"{name} = {most:g} {unit}".rstrip() + f", and {symbol} may reach {value:.3g} {unit}".rstrip() + f" by {where}"
-        for symbol, value, unit, most, name in beyond(settings, e.plant, at)
+        for symbol, value, unit, most, name in beyond(settings, e.desired, e.plant, at)
     ]
 
 
@@ -310,15 +326,12 @@ def _unproven(e: Evaluated) -> str:
     """Which properties of the plant, removed one after the other, leave a set that is proven."""
     p, body = e.plant, e.body
     without: tuple[tuple[str, dict[str, Any]], ...] = (
-        (f"its age of {p.age * 1e3:.3g} ms (rotor lag, period, transport)", {"age": 0.0}),
-        ("the held roll: u₁ is never applied", {"tilt": None}),
-        (f"the rate sensor's error of {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
+        (f"commands {p.age * 1e3:.3g} ms old (rotor lag, period, transport)", {"age": 0.0}),
+        ("the held roll (u₁ is never applied)", {"tilt": None}),
+        (f"a rate sensor that errs by {p.delta_omega:.2g} rad/s", {"delta_omega": body.delta_omega, "rate_lag": 0.0}),
         (f"a torque of {p.k_tau_d:.2g} N·m", {"k_tau_d": body.k_tau_d}),
-        ("the attitude sensor's error", {"delta_q": body.delta_q}),
-        (
-            f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)",
-            {"k_theta": 0.0, "k_theta_hat": 0.0},
-        ),
+        ("the attitude sensor's error", {"delta_q": body.delta_q} if e.bounds.delta_eps else {}),
+        (f"‖θ̃‖ up to {p.theta_error:.3g} N·m·s/rad (law.damping_bound)", {"k_theta": 0.0, "k_theta_hat": 0.0}),
         ("quantization", {"delta_q": lambda _: 0.0, "delta_omega": 0.0, "delta_u": 0.0}),
     )
     names = list[str]()
@@ -329,7 +342,7 @@ def _unproven(e: Evaluated) -> str:
             names.append(name)
             if reach(p) is not None:
                 break
-    return f"pointwise: no invariant set is proven; without {', and '.join(names)} there is one"
+    return f"pointwise: no invariant set is proven with {'; with '.join(names)}"
 
 
 def _condition(d: Lemma, t: Theorem) -> str:
@@ -387,16 +400,18 @@ def _degrees(at: Reach | None) -> float | None:
     return None if at is None else degrees(2 * asin(at.eps_e))
 
 
-def _range_remedies(settings: Configured, e: Evaluated) -> list[Remedy]:
-    """Limits of the wire that hold the set, or the reference where no set is proven."""
-    at = e.plant_reach or without_error(e.plant)
-    wire = settings.wire
-    ways = list[Remedy]()
-    for name, reached, limit in (
-        ("wire.rate", at.axis_rate + e.plant.delta_omega, wire.rate.limit),
-        ("wire.attitude", sin(min(pi / 2, at.half_angle)), wire.attitude.limit),
+def _range_remedies(settings: Configured, e: Evaluated, holds: Holds) -> Iterator[Remedy]:
+    """Limits of the wire that hold the set, or the reference where no set is proven, and satisfy all else."""
+    at, wire = e.plant_reach or without_error(e.plant), settings.wire
+    for name, reached in (
+        ("rate", at.axis_rate + e.plant.delta_omega),
+        ("attitude", sin(min(pi / 2, at.half_angle))),
+        ("voltage", largest_voltage(settings, e.desired, at)),
     ):
-        if reached > limit:
-            enough = f"{name}.limit={ceil(100 * reached) / 100:g}"
-            ways.append(Remedy(text=f"a range that holds it, {name}", overrides=[enough]))
-    return ways
+        signal = getattr(wire, name)
+        if reached > signal.limit:
+            enough = ceil(110 * reached) / 100  # a wider range has wider steps, and those need some of it
+            wider = wire.model_copy(update={name: signal.model_copy(update={"limit": enough})})
+            if holds(settings.model_copy(update={"wire": wider})):
+                override = f"wire.{name}.limit={enough:g}"
+                yield Remedy(text=f"a range that holds it, wire.{name}", overrides=[override])

@@ -36,6 +36,7 @@ class Extremes(NamedTuple):
         axis_rate: Largest element of ω_d in the desired body frame [rad/s].
         half_angle: Half the largest angle of q_d from [1, 0], at most π/2 [rad].
         tilt: Largest pitch, at most π/2 [rad].
+        samples: The samples that these are the maxima of.
     """
 
     rate: float
@@ -44,6 +45,7 @@ class Extremes(NamedTuple):
     axis_rate: float
     half_angle: float
     tilt: float
+    samples: Angles
 
 
 def extremes(reference: Reference) -> Extremes:
@@ -72,6 +74,7 @@ def extremes(reference: Reference) -> Extremes:
         _SLACK * axis_rate,
         min(pi / 2, _SLACK * half_angle),
         min(pi / 2, _SLACK * float(np.abs(samples.angle[:, 1]).max())),
+        samples,
     )
 
 
@@ -110,9 +113,8 @@ def body_rates(angles: Angles) -> tuple[Floats, Floats]:
     return rate, acceleration
 
 
-def feedforward(reference: Reference, law: LawSettings) -> Floats:
+def feedforward(angles: Angles, law: LawSettings) -> Floats:
     """The torque that the law commands without error and with θ̂ = 0, −Ψ + J R ω̇_d of (C.22) [N·m]. Shape (n, 3)."""
-    angles = Plan.of(reference).samples()
     omega, omega_dot = body_rates(angles)
     roll, pitch, _ = angles.angle.T
     up = np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=1)
@@ -146,13 +148,12 @@ def half_angles(angles: Angles) -> Floats:
     return nearest
 
 
-def chords(reference: Reference, delta: float) -> Callable[[float], float]:
+def chords(angles: Angles, delta: float) -> Callable[[float], float]:
     """‖q^Q − q‖ as a function of half the attitude error [rad], for |ε_k^Q − ε_k| ≤ delta.
 
     The difference of η is at most δ ‖ε‖₁/η on the way from ε to ε^Q, and ‖ε − ε_d‖ at most twice the sine of half the
     half angle. Where η may vanish on the way, it is the bound of `attitude_error`, as for every attitude.
     """
-    angles = Plan.of(reference).samples()
     half = _SLACK * half_angles(angles)
     eps = _SLACK * np.abs(vectors(angles)).sum(axis=1)
     length = sqrt(3) * delta

@@ -31,11 +31,12 @@ import numpy as np
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.control.reference import Floats
 
-_SAMPLES: Final = 4000
+_SAMPLES: Final = 1000
 """Times of e^{As} until it has fallen by e^{-20}; the quadrature is rounded up by `_SLACK`."""
 _SLACK: Final = 1.002
-_MOST_ITERATIONS: Final = 1000
-_AGREED: Final = 1e-9
+_MOST_ITERATIONS: Final = 300
+_INFLATED: Final = 1.001
+"""Each guess of the fixed point is raised by this, so that one that holds is found soon; the bound is as much wider."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,8 @@ class Reach:
         slow: Largest ‖w_s‖ [N·m].
         fast: Largest torque of quantization, hold, lag, sensors and disturbance [N·m].
         hold: The part of it that comes from the age of the command [N·m].
+        power: Power by which the adaptation, held for a period, is out of date [W].
+        z_dot: Largest ‖ż‖ [1/s, rad/s²].
         D1: Bound of d₁ [1/s].
         D2: Bound of d₂ [N·m].
         deviation: Largest torque of the command beyond that of the reference [N·m].
@@ -158,6 +161,8 @@ class Reach:
     slow: float
     fast: float
     hold: float
+    power: float
+    z_dot: float
     D1: float
     D2: float
     deviation: float
@@ -167,7 +172,7 @@ def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
     c1, c2 = max(p.C1), max(p.C2)
     torque = p.delta_q(0.0) * (1 + c1 * c2) + c2 * p.delta_omega
-    return Reach(0, 0, 0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, torque)
+    return Reach(0, 0, 0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, 0, 0, torque)
 
 
 def reach(p: Premises, start: float = 0.0) -> Reach | None:
@@ -182,9 +187,9 @@ def reach(p: Premises, start: float = 0.0) -> Reach | None:
         if found is None:
             return None
         now = found.D1, found.D2, found.eps_e
-        if all(new <= old * (1 + _AGREED) for new, old in zip(now, (D1, D2, eps_e), strict=True)):
+        if all(new <= old for new, old in zip(now, (D1, D2, eps_e), strict=True)):
             return found
-        D1, D2, eps_e = now
+        D1, D2, eps_e = (_INFLATED * value for value in now)
     return None
 
 
@@ -222,7 +227,8 @@ def _disturbances(
     roll = (p.k_theta_hat * p.k_omega_d + j * p.k_omega_d_dot + p.weight_roll) if held else 0.0
     push = theta * p.axis_rate + sine * roll
     slow = push / phi
-    eps_e = max(eps_e, eps_bar + kappa1 * slow)
+    needed = eps_bar + kappa1 * slow
+    eps_e = max(eps_e, needed)
     if not eps_e < sin(pi / 4):
         return None
     turned = 2 * eps_e * p.k_omega_d  # ‖R ω_d − R_d ω_d‖
@@ -251,28 +257,23 @@ def _disturbances(
             + p.norm_B * p.delta_u
         )  # fmt: skip
         theta_dot = max(p.Gamma) * sqrt(max(p.Gamma) / min(p.Gamma)) * axis_omega * (z2 + delta_z2)
-        hold = p.age * (
-            omega_e / 2
-            + c2 * z2_dot
-            + p.k_theta_hat * omega_dot + theta_dot * axis_omega
-            + p.weight * omega + 2 * spread * omega * omega_dot
-            + j * (omega_e_dot * p.k_omega_d + omega_e * (p.k_omega_d_dot + omega_e * p.k_omega_d))
-            + j * (p.k_omega_d_ddot + omega * p.k_omega_d_dot)
-            + j * c1 / 2 * (omega_e_dot + omega_e**2 / 2)
-        )  # fmt: skip
+        hold = stale_torque(p, omega, axis_omega, omega_e, z2_dot, theta_dot)
         fast = noise + hold + theta * turned + p.k_tau_d
         if held:  # what u₁ should have added to the yaw, beyond the slow part and the feedback that φ counts
             rest = p.k_theta_hat * omega_e + j * (omega_e * p.k_omega_d + c1 * omega_e / 2) + spread * omega**2
             fast += sine * rest
         next_dot = (torque + theta * omega_e + fast) / jmin
-        if next_dot <= z2_dot * (1 + 1e-9) + 1e-15:
+        if next_dot <= z2_dot:
             break
-        z2_dot = next_dot
+        z2_dot = _INFLATED * next_dot
         if not isfinite(z2_dot) or z2_dot > 1e6:
             return None
     else:
         return None
 
+    # θ̂ steps by Γ Φ^Q z₂^Q with the values at a tick, while z₂ᵀ Φ θ̃ acts all the while; the last term is its square.
+    omega_Q, z2_Q = omega + delta_omega, z2 + delta_z2  # the paper's letters
+    power = p.age * theta * (z2_dot * omega_Q + delta_z2 * omega_dot) + p.age / 2 * max(p.Gamma) * (omega_Q * z2_Q) ** 2
     push_dot = theta * p.k_omega_d_dot + p.axis_rate * theta_dot
     D2 = fast + theta * omega_e + max(1 - p.share, p.share - phi) * torque  # θ̃ acts on ω_e; φ beside its mean
     if held:
@@ -309,7 +310,7 @@ def _disturbances(
         radius=sqrt(largest**2 + zeta**2 - eps_e**2),
         eps_bar=eps_bar,
         torque=torque,
-        eps_e=eps_e,
+        eps_e=needed,
         z2=z2,
         omega_e=omega_e,
         axis_rate=axis_omega,
@@ -317,10 +318,42 @@ def _disturbances(
         slow=slow,
         fast=fast,
         hold=hold,
+        power=power,
+        z_dot=hypot(omega_e / 2, z2_dot),
         D1=D1,
         D2=D2,
         deviation=deviation,
     )
+
+
+def stale_torque(
+    p: Premises, omega: float, axis_omega: float, omega_e: float, z2_dot: float, theta_dot: float
+) -> float:
+    """The torque by which a command is out of date: its age times the largest rate at which the law's torque changes.
+
+    Args:
+        p: Premises.
+        omega: Largest ‖ω‖ [rad/s].
+        axis_omega: Largest |ω_k| [rad/s].
+        omega_e: Largest ‖ω_e‖ [rad/s].
+        z2_dot: Largest ‖ż₂‖ [rad/s²].
+        theta_dot: Largest rate of θ̂ [N·m/rad].
+
+    Returns:
+        [N·m].
+    """
+    j, c1, spread = max(p.J), max(p.C1), max(p.J) - min(p.J)
+    omega_e_dot = z2_dot + c1 * omega_e / 2
+    omega_dot = omega_e_dot + p.k_omega_d_dot + omega_e * p.k_omega_d
+    return p.age * (
+        omega_e / 2
+        + max(p.C2) * z2_dot
+        + p.k_theta_hat * omega_dot + theta_dot * axis_omega
+        + p.weight * omega + 2 * spread * omega * omega_dot
+        + j * (omega_e_dot * p.k_omega_d + omega_e * (p.k_omega_d_dot + omega_e * p.k_omega_d))
+        + j * (p.k_omega_d_ddot + omega * p.k_omega_d_dot)
+        + j * c1 / 2 * (omega_e_dot + omega_e**2 / 2)
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=256)

@@ -24,7 +24,7 @@ GAINS: Final = ("C1", "C2")
 _STEP: Final = 1.5
 """Gains are tried in steps of this factor; then the step that satisfies the condition is bisected."""
 _MOST_STEPS: Final = 10
-_HALVINGS: Final = 12
+_HALVINGS: Final = 8
 
 
 class Remedy(BaseModel):

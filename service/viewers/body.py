@@ -55,35 +55,28 @@ def scene(vehicle: str, kind: str, at_ns: int) -> SceneUpdate:
 
     `kind` is `plant.kind`: `aero`, or anything else for a box. `at_ns` is since 1970 [ns].
     """
-    at = timestamp(at_ns)
-    entities = [
-        _body(kind, at, frame_of(vehicle), "body", 1.0),
-        _body(kind, at, desired_frame_of(vehicle), "desired", 0.25),
-    ]
+    at, body, desired = timestamp(at_ns), frame_of(vehicle), desired_frame_of(vehicle)
+    parts = [(body, f"{body} body", *_body(kind, 1.0)), (desired, f"{desired} desired", *_body(kind, 0.25))]
     if kind == "aero":
         column = _cylinder((0.0, 0.0, -0.17), (0.04, 0.04, 0.3), UPRIGHT, _color(BEAM, 1.0))
         foot = _cylinder((0.0, 0.0, -0.33), (0.3, 0.3, 0.02), UPRIGHT, _color(BEAM, 1.0))
-        stand = f"{vehicle} stand"
-        entities.append(
-            SceneEntity(timestamp=at, frame_id=WORLD, id=stand, frame_locked=True, cylinders=[column, foot])
-        )
-    return SceneUpdate(entities=entities)
-
-
-def _body(kind: str, at: Timestamp, frame: str, name: str, alpha: float) -> SceneEntity:
-    beam, nose, tail = (_color(rgb, alpha) for rgb in (BEAM, NOSE, TAIL))
-    if kind == "aero":
-        cubes = [_box((0.0, 0.0, 0.0), (0.36, 0.03, 0.03), beam)]
-        cylinders = [
-            _cylinder((0.18, 0.0, 0.0), (0.14, 0.14, 0.02), UPRIGHT, nose),
-            _cylinder((-0.18, 0.0, 0.0), (0.14, 0.14, 0.02), SIDEWAYS, tail),
+        parts.append((WORLD, f"{vehicle} stand", [], [column, foot]))
+    return SceneUpdate(
+        entities=[
+            SceneEntity(timestamp=at, frame_id=frame, id=name, frame_locked=True, cubes=cubes, cylinders=cylinders)
+            for frame, name, cubes, cylinders in parts
         ]
-    else:
-        cubes = [_box((0.0, 0.0, 0.0), (0.3, 0.2, 0.1), beam), _box((0.17, 0.0, 0.0), (0.04, 0.1, 0.05), nose)]
-        cylinders = []
-    return SceneEntity(
-        timestamp=at, frame_id=frame, id=f"{frame} {name}", frame_locked=True, cubes=cubes, cylinders=cylinders
     )
+
+
+def _body(kind: str, alpha: float) -> tuple[list[CubePrimitive], list[CylinderPrimitive]]:
+    beam, nose, tail = (_color(rgb, alpha) for rgb in (BEAM, NOSE, TAIL))
+    if kind != "aero":
+        return [_box((0.0, 0.0, 0.0), (0.3, 0.2, 0.1), beam), _box((0.17, 0.0, 0.0), (0.04, 0.1, 0.05), nose)], []
+    return [_box((0.0, 0.0, 0.0), (0.36, 0.03, 0.03), beam)], [
+        _cylinder((0.18, 0.0, 0.0), (0.14, 0.14, 0.02), UPRIGHT, nose),
+        _cylinder((-0.18, 0.0, 0.0), (0.14, 0.14, 0.02), SIDEWAYS, tail),
+    ]
 
 
 def _box(where: Vector, size: Vector, color: Color) -> CubePrimitive:

@@ -44,12 +44,8 @@ _STATUS: Final = json_shape("aeroloop.RoleStatus", views.RoleStatus)
 _ATTITUDE: Final = json_shape("aeroloop.Attitude", views.Attitude)
 _HERE: Final = Vector3()
 
-_LEVELS: Final = {
-    "tripped": LogLevel.Error,
-    "fault": LogLevel.Error,
-    "lost": LogLevel.Warning,
-    "refused": LogLevel.Warning,
-}
+_ERROR, _WARNING = LogLevel.Error, LogLevel.Warning
+_LEVELS: Final = {"tripped": _ERROR, "fault": _ERROR, "lost": _WARNING, "refused": _WARNING}
 """Log level by kind of event; Info for all others."""
 
 SHAPES: Final = {
@@ -92,13 +88,9 @@ class _Wire:
 
 
 class Decoder:
-    """Decodes published messages.
+    """Decodes published messages; counts messages, rows and descriptions that are malformed.
 
-    Args:
-        rate_hz: Most messages per second of each streaming topic, by time of publication; None: all.
-
-    Attributes:
-        malformed: Messages, rows and descriptions so far that could not be read.
+    `rate_hz` is the most messages per second of each streaming topic, by time of publication; None: all.
     """
 
     def __init__(self, rate_hz: float | None) -> None:
@@ -123,9 +115,8 @@ class Decoder:
         ignored: a recorder's configuration need not match the wire.
         """
         known = self._wires.get(description.vehicle)
-        if description.role == "plant" or (
-            description.role == "controller" and (known is None or known.role != "plant")
-        ):
+        of_plant = known is not None and known.role == "plant"
+        if description.role == "plant" or (description.role == "controller" and not of_plant):
             try:
                 self._wires[description.vehicle] = _Wire(description)
             except (ValidationError, KeyError, TypeError):
@@ -150,7 +141,7 @@ class Decoder:
     def frame(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         """Decode a frame from the network, without a limit of rate; silence in lockstep gives nothing."""
         wire, name = self._wires.get(address.vehicle), address.topic.name
-        if wire is None or name not in wire.unpack or (payload == SILENCE and name in wire.silent):
+        if wire is None or (payload == SILENCE and name in wire.silent):
             return []
         return self._framed(address.vehicle, name, wire, payload, at_ns)
 
@@ -175,15 +166,12 @@ class Decoder:
         """Whether it is the first of its topic and vehicle in its slot of time."""
         if not self._slot_ns:
             return True
-        source, slot = (name, vehicle), at_ns // self._slot_ns
-        if self._slots.get(source) == slot:
-            return False
-        self._slots[source] = slot
-        return True
+        slot, before = at_ns // self._slot_ns, self._slots.get((name, vehicle))
+        self._slots[name, vehicle] = slot
+        return slot != before
 
-    def _trace(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
-        del at_ns  # its rows have their own times
-        batch = read_batch(payload)
+    def _trace(self, address: topics.Address, payload: bytes, _: int) -> list[Decoded]:
+        batch = read_batch(payload)  # its rows have their own times
         if batch is None:
             self.malformed += 1
             return []

@@ -76,13 +76,7 @@ class LiveDecoder:
 class FoxgloveServer:
     """A WebSocket server with a channel per topic. A context: leaving it stops the server and frees its port.
 
-    Args:
-        vehicle: Vehicle whose topics exist from the start.
-        address: Address to listen on.
-        port: Its port; 0 for any free one.
-
-    Attributes:
-        url: URL for clients.
+    Topics of the vehicle exist from the start; port 0 is any free one; clients connect to `url`.
 
     Raises:
         FoxgloveServerError: It cannot listen there.
@@ -126,15 +120,9 @@ class FoxgloveServer:
 
 
 def serve(
-    network: NetworkSettings,
-    vehicle: str,
-    stop: Event,
-    *,
-    address: str,
-    port: int,
-    rate_hz: float,
-    ready: Callable[[str], None],
-) -> None:
+    network: NetworkSettings, vehicle: str, stop: Event, *,
+    address: str, port: int, rate_hz: float, ready: Callable[[str], None],
+) -> None:  # fmt: skip
     """Show a vehicle until `stop` is set.
 
     Messages are taken, decoded and sent at `rate_hz` [Hz]. `ready` is called with the URL once clients can connect;

@@ -8,22 +8,18 @@ and a field that cannot be described is left out of the schema, not of the messa
 from __future__ import annotations
 
 import json
-from typing import Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pydantic import BaseModel
+
+if TYPE_CHECKING:  # recorder and reader of logs do without
+    import foxglove
 
 _KEPT: Final[tuple[str, ...]] = ("description", "minimum", "exclusiveMinimum")
 
 
 class Shape(NamedTuple):
-    """Schema and encoding of a topic's messages.
-
-    Attributes:
-        name: Such as `foxglove.PoseInFrame` or `aeroloop.Tracking`.
-        encoding: Of the schema: `protobuf` or `jsonschema`.
-        schema: The schema itself.
-        message_encoding: `protobuf` or `json`.
-    """
+    """Schema of a topic's messages, by name and encoding (`protobuf` or `jsonschema`), and the messages' encoding."""
 
     name: str
     encoding: str
@@ -32,14 +28,7 @@ class Shape(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """A message to show.
-
-    Attributes:
-        topic: Such as `/aero/pose`.
-        shape: Its schema; the same for every message of a topic.
-        data: The message itself.
-        at_ns: When its source was published, ns since 1970.
-    """
+    """A message to show on a topic, with the topic's schema and when its source was published [ns since 1970]."""
 
     topic: str
     shape: Shape
@@ -47,15 +36,7 @@ class Decoded(NamedTuple):
     at_ns: int
 
 
-class Described(Protocol):
-    """A schema of foxglove-sdk."""
-
-    name: str
-    encoding: str
-    data: bytes
-
-
-def protobuf_shape(schema: Described) -> Shape:
+def protobuf_shape(schema: foxglove.Schema) -> Shape:
     """The shape of one of Foxglove's own messages, from its `get_schema()`."""
     return Shape(schema.name, schema.encoding, schema.data, "protobuf")
 

@@ -12,7 +12,7 @@ from typing import Final, Self
 
 from pydantic import BaseModel, Field
 
-from aeroloop.protocol.messages.models import Percentiles, Status, Telemetry
+from aeroloop.protocol.messages.models import Status, Telemetry
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, angle, to_euler
 
 ANGLES: Final = "Z–Y–X, body relative to inertial"
@@ -141,26 +141,12 @@ class RoleStatus(View, frozen=True):
     @classmethod
     def of(cls, status: Status) -> Self:
         """Of what a role published."""
-        latency_p50, latency_p99 = _percentiles(status.recent_latency_us)
-        age_p50, age_p99 = _percentiles(status.age_us)
-        wake_p50, wake_p99 = _percentiles(status.timing.recent_wake if status.timing else None)
-        return cls(
-            state=status.state,
-            cause=status.cause,
-            session=status.session,
-            rate_hz=round(status.rate_hz, 3),
-            skipped=status.skipped,
-            refused=status.refused,
-            stale=status.stale,
-            saturated=status.saturated,
-            latency_p50_us=latency_p50,
-            latency_p99_us=latency_p99,
-            age_p50_us=age_p50,
-            age_p99_us=age_p99,
-            wake_p50_us=wake_p50,
-            wake_p99_us=wake_p99,
-            uptime_s=round(status.uptime_s, 1),
-        )
+        wake = status.timing.recent_wake if status.timing else None
+        shown = status.model_dump(include=set(cls.model_fields))
+        for name, durations in {"latency": status.recent_latency_us, "age": status.age_us, "wake": wake}.items():
+            shown[f"{name}_p50_us"] = durations.p50 if durations else None
+            shown[f"{name}_p99_us"] = durations.p99 if durations else None
+        return cls(**{**shown, "rate_hz": round(status.rate_hz, 3), "uptime_s": round(status.uptime_s, 1)})
 
 
 def _degree(radians: float) -> float:
@@ -169,10 +155,6 @@ def _degree(radians: float) -> float:
 
 def _degrees(radians: Vector) -> Vector:
     return _degree(radians[0]), _degree(radians[1]), _degree(radians[2])
-
-
-def _percentiles(durations: Percentiles | None) -> tuple[float | None, float | None]:
-    return (durations.p50, durations.p99) if durations else (None, None)
 
 
 def _product(p: Quaternion, q: Quaternion) -> Quaternion:

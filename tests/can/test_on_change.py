@@ -20,9 +20,10 @@ from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil
-from tests.can.test_relay import FIRST_MEASUREMENT_NS, NOW, PERIOD_NS, WATCHDOG_NS, Still, command, measurement
+from tests.can.test_relay import FIRST_MEASUREMENT_NS, NOW, WATCHDOG_NS
 from tests.support.can_closed_loop import PATIENCE_S, run_on_bus
 from tests.support.can_in_process import Stranger, virtual
+from tests.support.can_stage import PERIOD_NS, Still, command, measurement
 
 POLICIES: list[tuple[Policy, Policy]] = [
     ("on_change", "on_change"),

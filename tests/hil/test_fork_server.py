@@ -49,9 +49,9 @@ def test_a_signal_ends_it_with_the_code_that_a_child_of_this_process_would_have(
     tmp_path: Path, signals: tuple[int, ...], code: int
 ) -> None:
     child = start(
-        tmp_path, "recorder", "--set", f"network.rendezvous={free_rendezvous()}", "--log", str(tmp_path / "l")
+        tmp_path, "recorder", "--set", f"network.rendezvous={free_rendezvous()}", "--log", str(tmp_path / "l.mcap")
     )
-    eventually(lambda: (tmp_path / "l").exists() or child.poll() is not None)
+    eventually(lambda: (tmp_path / "l.mcap").exists() or child.poll() is not None)
     assert child.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
         child.wait(0.01)

@@ -18,10 +18,12 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Telemetry, Truth
 from aeroloop.protocol.messages.operator import Setpoint
 from aeroloop.protocol.wire.attitude import to_euler
+from aeroloop.service.config import Settings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil import Hil
 from tests.hil.test_faults import PATIENT
+from tests.support.certified import certified_settings
 
 AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 
@@ -151,22 +153,27 @@ def test_a_controller_that_must_be_certified_claims_once_it_is_and_refuses_what_
     hil: Hil, tmp_path: Path
 ) -> None:
     config = tmp_path / "a.toml"
-    gains = "[law]\nC1 = [{0}, {0}, {0}]\n[controller]\nrequire_certificate = true\nstale_s = 2\n"
-    gains += "[wire]\ncounter_bits = 11\n"
-    config.write_text(gains.format(3.0))
-    hil.start(settings=PATIENT, drive=False)
+
+    def configured(C2: float) -> Settings:  # the paper's letter
+        patient = [f"{key}={value}" for key, value in PATIENT.items()]
+        required = ["controller.require_certificate=true", "controller.after_restart=configured"]
+        return certified_settings(12, 12, f"law.C2=[{C2}, {C2}, {C2}]", *patient, *required)
+
+    failing = configured(0.03)
+    config.write_text(failing.toml())
+    hil.start(settings={name: failing.description()[name] for name in ("wire", "plant")}, drive=False)
     network = f"network.rendezvous={hil.settings.network.rendezvous}"
     controller = subprocess.Popen([*AEROLOOP, "controller", "--config", str(config), "--set", network])
     try:
         hil.eventually("the verdict", lambda: hil.happened("fault", "claims no vehicle"))
         hil.run(0.6)  # it claims four times a second where it may
         assert hil.state("plant") == "idle"
-        assert "Theorem 1 does not hold" in (hil.status("controller").cause or "")
-        config.write_text(gains.format(0.4))
+        assert "the certificate does not hold" in (hil.status("controller").cause or "")
+        config.write_text(configured(0.2).toml())
         os.kill(controller.pid, signal.SIGHUP)
         hil.eventually("driving", lambda: hil.state("plant") == "driven")
-        assert "Theorem 1 does not hold" in refused(hil, "set-gains", "--C1", "3", "3", "3")
-        config.write_text(gains.format(3.5))
+        assert "the certificate does not hold" in refused(hil, "set-gains", "--C2", "0.02", "0.02", "0.02")
+        config.write_text(configured(0.025).toml())
         os.kill(controller.pid, signal.SIGHUP)
         hil.eventually("its refusal", lambda: hil.happened("fault", "not reloaded: controller.require_certificate"))
         assert hil.state("plant") == "driven"
@@ -174,12 +181,12 @@ def test_a_controller_that_must_be_certified_claims_once_it_is_and_refuses_what_
         controller.terminate()
         assert controller.wait(30) == 0
     log = hil.log
-    said = [event for event in log.events if event.role == "controller" and "Theorem 1" in event.text]
+    said = [event for event in log.events if event.role == "controller" and "the certificate" in event.text]
     # It fails, it holds, and what is asked for beside that changes nothing.
     assert [event.kind for event in said] == ["fault", "changed", "fault"]
-    assert "Theorem 1 holds" in said[1].text
-    gains_set = [change.gains.C1 for change in log.changes if change.gains]
-    assert set(gains_set) == {(0.4, 0.4, 0.4)}
+    assert "the certificate holds" in said[1].text
+    gains_set = [change.gains.C2 for change in log.changes if change.gains]
+    assert set(gains_set) == {(0.2, 0.2, 0.2)}
     judged = read(log.path).findings.theorem
     assert judged is not None
     assert judged.holds

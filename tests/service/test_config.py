@@ -209,3 +209,9 @@ def test_a_log_of_a_run_along_a_file_is_replayed_byte_for_byte_without_the_file(
     (tmp_path / "ref.csv").unlink()
     both = replay([tmp_path / "a.mcap"])
     assert both.controller == both.plant == EndReplay(ticks=600, differ=0)
+
+
+def test_a_vehicle_counts_as_configured_only_if_it_is() -> None:
+    """`op stop` stops all plants if none is."""
+    assert "vehicle" not in load(overrides=["loop.rate_hz=100"]).model_fields_set
+    assert "vehicle" in load(overrides=["vehicle=aero"]).model_fields_set

@@ -19,6 +19,7 @@ from aeroloop.service.logs.replay import SessionReplay, replay
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.review import read, review
 from aeroloop.service.theorem.certificate import Certificate, certify
+from tests.support.certified import certified_settings
 from tests.support.made_log import AN_OPERATORS_WORDS, lockstep, make_log
 
 SIGNALS = ("attitude", "rate", "voltage")
@@ -35,7 +36,7 @@ def throughout(kind: str, *more: str) -> Settings:
 
 
 def certificate(settings: Settings) -> Certificate:
-    return certify(settings.wire, settings.law, settings.reference, settings.controller)
+    return certify(settings)
 
 
 def replayed(path: Path) -> SessionReplay:
@@ -153,10 +154,10 @@ def test_an_export_has_the_levels_that_were_sent_and_which_saturated(kind: str, 
 
 @every_kind
 def test_the_certificate_takes_the_bound_of_each_kind(kind: str) -> None:
-    settings = throughout(kind, *(f"wire.{signal}.bits=12" for signal in SIGNALS))
+    settings = certified_settings(12, 12, *(f"wire.{signal}.kind={kind}" for signal in SIGNALS))
     found, wire = certificate(settings), settings.wire
     assert found.holds
-    for symbol, signal, elements in (("‖δ_ε‖", wire.attitude, 3), ("‖δ_ω‖", wire.rate, 3), ("‖δ_u‖", wire.voltage, 2)):
+    for symbol, signal, elements in (("‖δ_ε‖", wire.attitude, 3), ("‖δ_ω‖", wire.rate, 3), ("‖δ_u‖", wire.voltage, 3)):
         assert found.value(symbol) == sqrt(elements) * signal.quantizer().bound
 
 
@@ -168,7 +169,7 @@ def test_what_errs_by_more_promises_less() -> None:
 
 @other_kinds
 def test_where_it_fails_the_remedies_are_bits_that_the_kind_can_have_and_cure_it(kind: str) -> None:
-    settings = throughout(kind, "wire.rate.limit=20", "wire.rate.bits=4")
+    settings = certified_settings(6, 6, *(f"wire.{signal}.kind={kind}" for signal in SIGNALS))
     found = certificate(settings)
     assert not found.holds
     bits = [remedy for remedy in found.remedies if any(".bits=" in change for change in remedy.overrides)]

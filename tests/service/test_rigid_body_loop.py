@@ -200,7 +200,7 @@ class _Slopes:
         rate_error = C2 + J * C1 / 2  # ω_e in −C₂ z₂ and J ᾱ
         return cls(
             q=error + 2 * W * rate_error + 2 * weight + J * (2 * Omega * W + 2 * W_dot),
-            omega=rate_error + p.damping_bound + 2 * J * Omega + J * W,  # …, Φ θ̂, ω × J ω, J S(ω) R ω_d
+            omega=rate_error + p.damping_bound / 0.95 + 2 * J * Omega + J * W,  # …, Φ θ̂, ω × J ω, J S(ω) R ω_d
             q_d=error,
             omega_d=rate_error + J * Omega,
             omega_d_dot=J,

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import itertools
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -17,7 +19,25 @@ from can.interfaces.virtual import VirtualBus
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import CONTROLLER_HEARTBEAT_ID, PLANT_HEARTBEAT_ID, CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
+from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.zenoh_network import PATIENCE_S, eventually
+
+PAPER = WireSpec()
+
+
+def wire_of(
+    attitude: int | None, rate: int | None, voltage: int | None, actuators: int = 2, counter_bits: int = 8
+) -> WireSpec:
+    """A spec of these bits."""
+    return WireSpec.model_validate(
+        {
+            "attitude": {"bits": attitude, "limit": 1.0},
+            "rate": {"bits": rate, "limit": 1.0},
+            "voltage": {"bits": voltage, "limit": 24.0},
+            "actuators": actuators,
+            "counter_bits": counter_bits,
+        }
+    )
 
 
 def virtual(*, fd: bool = False, node: int = 1, channel: str | None = None) -> CanSettings:
@@ -135,3 +155,15 @@ class FlawedBus(VirtualBus):
         if self._flaws.lost:
             raise can.CanOperationError("adapter was unplugged")
         return super()._recv_internal(0.005 if timeout is None else min(timeout, 0.005))
+
+
+@contextmanager
+def both_ends(settings: CanSettings, wire: WireSpec = PAPER) -> Iterator[tuple[CanLink, CanLink, Stranger]]:
+    """The plant's link, the controller's, and a stranger that reads the bus as it is."""
+    plant, controller = CanLink(settings, wire, "plant"), CanLink(settings, wire, "controller")
+    try:
+        with Stranger(settings) as stranger:
+            yield plant, controller, stranger
+    finally:
+        with ThreadPoolExecutor() as both:  # each waits for its receiver, up to 0.1 s
+            list(both.map(CanLink.close, (plant, controller)))

@@ -112,7 +112,7 @@ def edited(end: End, edit: Callable[[Any], None]) -> Callable[[Said], Said]:
 def observer_of(*overrides: str, part: DrawnPart = WHOLE) -> Observer:
     """An observer of the default configuration."""
     settings = load(overrides=overrides)
-    return Observer(settings, TheoremCheck(certified_bounds(settings, ()), settings.loop.period, None), part)
+    return Observer(settings, TheoremCheck(certified_bounds(settings, ()), settings), part)
 
 
 def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDENTITY) -> Ticks:

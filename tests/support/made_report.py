@@ -23,6 +23,8 @@ from aeroloop.service.review.report import (
 )
 
 BINS = [(2 ** (i / 16), count) for i, count in ((148, 90), (149, 400), (150, 300), (151, 60), (180, 3), (200, 1))]
+HELD = Check(text="z_track ≤ 0.005 s", holds=True, found="0.00458 s")
+HOSTILE = """</script><script>window.hit = 1</script><img src=x onerror="window.hit = 1">&amp;<!--"""
 MARKS = (
     Mark(time_s=None, kind="started", role="controller", text="controller aero-1 on host h"),
     Mark(time_s=3.0, kind="changed", role="controller", text="gains: C2 = 0.2 0.2 0.2"),
@@ -125,21 +127,31 @@ def made_report(
 def made_theorem(*, broken: int = 0) -> TheoremFindings:
     """A theorem that holds of a run, two of whose inequalities were judged; the second was broken so often."""
     return TheoremFindings(
-        verdict="Theorem 1 holds: in the end ‖z‖ ≤ 0.2004.",
+        verdict="Holds: once there, ‖z‖ stays within 0.2004.",
+        held=not broken,
         holds=True,
-        radius=0.2004,
-        radius_deg=23.01,
+        radius=0.1803,
+        pointwise_radius=0.2004,
+        pointwise_deg=23.01,
+        mean_square_share=0.31,
+        mean_square_at_s=2.5,
+        mean_square_judged=499,
+        spacing_s=0.02,
+        pointwise_share=0.52,
+        pointwise_at_s=1.5,
+        pointwise_judged=450,
+        pointwise_since_s=1.0,
+        pointwise_bound=0.21,
         transient_s=2.0,
         since_s=0.0,
         until_s=8.5,
         z_norm=0.0638,
-        z_norm_share=0.0638 / 0.2004,
         error_deg=1.89,
         true_z_norm=None,
         true_error_deg=None,
         damping_known=False,
         samples=500,
-        outside={"C.28": 0, "C.29": 120, "Assumption 3": 0},
+        outside={"C.28": 0, "C.29": 120, "C.30": 0, "Assumption 3": 0},
         judged=380,
         lemma=[
             LemmaCheck(equation="C.52", what="‖d₁‖", samples=380, broken=0, closest=0.58, closest_s=7.5, broken_s=None),

@@ -103,13 +103,12 @@ def law(
 def projected(p: Body, theta: Array, tau: Array) -> Array:
     """Proj{τ} of (C.38): (I − c Γ ∇P ∇Pᵀ / ∇PᵀΓ∇P) τ where P > 0 and ∇Pᵀτ > 0, else τ.
 
-    P = ‖θ̂‖² − (0.95 k_θ)², and c grows from 0 at P = 0 to 1 at ‖θ̂‖ = k_θ.
+    P = ‖θ̂‖² − k_θ², and c grows from 0 at P = 0 to 1 at ‖θ̂‖ = k_θ/0.95.
     """
-    inner = (0.95 * p.bound) ** 2
-    P, slope = theta @ theta - inner, 2 * theta
+    P, slope = theta @ theta - p.bound**2, 2 * theta
     if P <= 0 or slope @ tau <= 0:
         return tau
-    c = min(1.0, float(P) / (p.bound**2 - inner))
+    c = min(1.0, float(P) / ((p.bound / 0.95) ** 2 - p.bound**2))
     removed: Array = c * (p.Gamma @ np.outer(slope, slope)) / (slope @ p.Gamma @ slope) @ tau
     return tau - removed
 

@@ -42,7 +42,9 @@ Json = dict[str, Any]
 
 def page_data(reports: Sequence[Report]) -> str:
     """Everything that is drawn, as JSON that may stand in a script element."""
-    spreads = [{"id": name, "runs": [_spread(report, name) for report in reports]} for name in spread_names(reports)]
+    kept = {"p50", "p99", "p999", "max", "bins"}
+    timings = [{name: spread.model_dump(include=kept) for name, spread in r.findings.timing.items()} for r in reports]
+    spreads = [{"id": name, "runs": [timing.get(name) for timing in timings]} for name in spread_names(reports)]
     runs, groups = [_run(report) for report in reports], list(_groups(reports))
     data = {"span": _span(reports), "runs": runs, "groups": groups, "spreads": spreads, "bands": _bands(reports)}
     # These occur inside JSON strings only; without them, no text can end the script or start a comment.
@@ -157,10 +159,7 @@ def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]
 
 
 def _agree(visible: float, time: Array, values: Array, other_time: Array, other_values: Array) -> bool:
-    """Whether two lines are nowhere further apart than what is visible, for as long as both last.
-
-    They need not be the same to the last bit: each was sampled, and perhaps thinned out, in its own way.
-    """
+    """Whether two lines, each sampled in its own way, are nowhere visibly apart, for as long as both last."""
     if not (len(time) and len(other_time)):
         return False
     both = (time >= other_time[0]) & (time <= other_time[-1]) & np.isfinite(values)
@@ -184,17 +183,10 @@ def _decimals(largest: float) -> int:
     return min(9, max(0, 3 - floor(log10(largest)))) if largest > 0 and isfinite(largest) else 3
 
 
-def _spread(report: Report, name: str) -> Json | None:
-    spread = report.findings.timing.get(name)
-    return None if spread is None else spread.model_dump(include={"p50", "p99", "p999", "max", "bins"})
-
-
 def packed(values: Array, levels: int = LEVELS) -> Json:
     """Values as data.js unpacks them: `least` + `step` · the sum of all `deltas` so far, NaN where the sum is negative.
 
-    Args:
-        values: What to pack; what is not finite becomes NaN. Shape (n,).
-        levels: How many steps their extent has.
+    What is not finite becomes NaN. Their extent has so many levels. Shape (n,).
     """
     known = np.isfinite(values)
     least, most = _extent([values])

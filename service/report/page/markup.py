@@ -22,12 +22,9 @@ Child = str | Iterable["Html | str"] | None
 
 
 def tag(name: str, *children: Child, **attributes: str | float | bool | None) -> Html:
-    """An element.
+    """An element, of children that are markup, text to be escaped, or several of them; None is nothing.
 
-    Args:
-        name: Such as `td`.
-        children: Markup, text to be escaped, or several of them; None is nothing.
-        attributes: `class_="number"`, `data_time=1.5`; True gives a bare attribute, False and None none.
+    Attributes are such as `class_="number"` or `data_time=1.5`; True gives a bare one, False and None none.
     """
     inside = "".join(_markup(child) for child in children)
     start = "".join([name, *(_attribute(key, value) for key, value in attributes.items())])

@@ -10,11 +10,9 @@ from base64 import b64encode
 from collections.abc import Sequence
 from hashlib import sha256
 from importlib.resources import files
-from pathlib import Path
 from string import Template
 from typing import Final
 
-from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.report.page import setup, tables, theorem, verdict
 from aeroloop.service.report.page.data import SPREADS, group_titles, page_data, period_s, spread_names
 from aeroloop.service.report.page.markup import Html, joined, tag
@@ -52,18 +50,6 @@ def page(reports: Sequence[Report]) -> str:
         library=library,
         scripts=ours,
     )
-
-
-def write_page(reports: Sequence[Report], out: Path) -> None:
-    """Write the page into a file, in one step. Raises ReviewError if that fails."""
-    text = page(reports)
-    partial = out.with_name(f".{out.name}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(out)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise ReviewError(f"cannot write {out}: {error.strerror}") from None
 
 
 def _sections(reports: Sequence[Report]) -> list[tuple[str, str, Html]]:

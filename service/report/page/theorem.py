@@ -1,4 +1,4 @@
-"""Section on the theorem: its guarantee, what the run did, whether each inequality of Lemma 1 held at true states."""
+"""Section on the theorem: what is proven, whether the run kept to it, and each inequality of Lemma 1 at true states."""
 
 from __future__ import annotations
 
@@ -12,18 +12,14 @@ from aeroloop.service.report.rows import THEOREM, figure_rows, percent
 from aeroloop.service.review.report import Report, TheoremFindings
 
 COLUMNS: Sequence[Column] = (
-    ("Equation", False),
-    ("Left-hand side", False),
-    ("Samples", True),
-    ("Broken", True),
-    ("First at [s]", True),
-    ("Closest to its bound [%]", True),
-    ("At [s]", True),
-)
+    ("Equation", False), ("Left-hand side", False), ("Samples", True), ("Broken", True), ("First at [s]", True),
+    ("Closest to its bound [%]", True), ("At [s]", True),
+)  # fmt: skip
 
 UNMET: Final = {
     "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
     "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
+    "C.30": "the command is saturated or missing, against (C.30)",
     "Assumption 3": "the attitude error is larger than the certificate assumes",
 }
 """Premises that a true state may violate, and what that means."""
@@ -58,9 +54,17 @@ def _verdict(reports: Sequence[Report], index: int) -> Html:
         tag("p", run_name(reports[index], index, len(reports))) if len(reports) > 1 else None,
         tag("p", tag("span", "✓" if found.holds else "✗", class_="sign", aria_hidden="true"), " ", found.verdict,
             class_=mood),
+        tag("p", *_kept(found), class_="" if found.held is None else "good" if found.held else "bad"),
         tag("p", f"The transient is taken to last {found.transient_s:.3g} s, three times the law's slower "
             f"time constant.{since}{until} {judged(found)}", class_="quiet"),
     )  # fmt: skip
+
+
+def _kept(found: TheoremFindings) -> tuple[Html, str]:
+    """Whether the run kept to all that could be judged."""
+    words = {True: ("✓", " The run kept to all of it that could be judged."), None: ("●", " Nothing could be judged.")}
+    sign, text = words.get(found.held, ("✗", " The run did not keep to it."))
+    return tag("span", sign, class_="sign", aria_hidden="true"), text
 
 
 def _lemma(reports: Sequence[Report]) -> Html:

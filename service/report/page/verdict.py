@@ -104,9 +104,9 @@ def _moments(report: Report, index: int) -> list[Html]:
     grave_marks = [mark for mark in report.findings.marks if grave(mark)]
     moments = []
     for mark in grave_marks[:MOMENTS]:
-        what = f"{mark.kind}, {mark.role}: {mark.text}"
-        outside = " outside of the session that is judged"
-        at = joined([" at ", jump(mark.time_s, index, what), " s"]) if mark.time_s is not None else Html(outside)
+        at = Html(" outside of the session that is judged")
+        if mark.time_s is not None:
+            at = joined([" at ", jump(mark.time_s, index, f"{mark.kind}, {mark.role}: {mark.text}"), " s"])
         moments.append(joined([tag("b", mark.kind), at, f" ({mark.role}): {mark.text}"]))
     if len(grave_marks) > MOMENTS:
         more = tag("a", "all events", href="#events")

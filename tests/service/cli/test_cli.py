@@ -47,6 +47,13 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         (("lab", "replay"), "did you mean `aeroloop log replay`?"),
         (("emulatr",), "did you mean `aeroloop emulator`?"),
         (("demo", "--set", "vehicle=a/b"), "vehicle"),
+        (("demo", "--duration", "x"), "--duration must be a number, not 'x' ("),
+        (("demo", "--duration", "0"), "--duration must be at least 0.01, not '0' ("),
+        (("op", "set-gains", "--C1", "1", "2", "--json"), "--C1 must be a number, not '--json' ("),
+        (("log", "export", "a.mcap", "--to", "foo"), "--to: 'foo' is not one of 'parquet', "),
+        (("demo", "--durat", "3"), "did you mean --duration? ("),
+        (("log", "review", "a.mcap", "--session"), "see `aeroloop log review --help`"),
+        (("demo", "--set", 'plant.faults=["rate:x"]'), "drop and garble\n"),
     ],
 )
 def test_wrong_usage_and_configuration_exit_with_2_and_name_the_culprit(
@@ -54,7 +61,7 @@ def test_wrong_usage_and_configuration_exit_with_2_and_name_the_culprit(
 ) -> None:
     code, line = refusal(capfd, *arguments)
     assert code == 2
-    assert names in line
+    assert names in f"{line}\n"
     if hint := re.search(r"see `aeroloop(.*)`", line):
         assert run(hint[1].split()) == 0
 

@@ -7,14 +7,13 @@ import threading
 import pytest
 
 from aeroloop.protocol.messages.operator import Gains, Hold, Reference, Sinusoid, Stream, Track
-from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.daemon.certificate_gate import UncertifiedError, gains_of
 from aeroloop.service.settings import ControllerSettings
-from tests.service.daemon.test_operator_changes import LAW, Loop
+from tests.support.certified import certified_settings
+from tests.support.operated_loop import LAW, Loop
 
-WIRE = WireSpec()
-FAILING = Gains(C1=(3.0, 3.0, 3.0))
+FAILING = Gains(C2=(0.03, 0.03, 0.03))
 BETTER = Gains(C2=(0.2, 0.2, 0.2))
 
 
@@ -27,12 +26,13 @@ class Certified(Loop):
 
     def __init__(self, *, required: bool, reference: Reference | None = None) -> None:
         settings = ControllerSettings(require_certificate=required, after_restart="configured")
-        super().__init__(reference or Sinusoid(), settings, wire=WIRE)
+        certified = certified_settings().model_copy(update={"controller": settings})
+        super().__init__(reference or Sinusoid(), settings, certified=certified)
 
     @property
     def verdicts(self) -> list[tuple[str, str]]:
         """What was reported of the theorem: kind, text."""
-        words = ("Theorem 1", "nothing is certified")
+        words = ("the certificate ", "nothing is certified")
         kinds = ("started", "changed", "fault")
         return [(kind, text) for kind in kinds for text in self.events(kind) if any(word in text for word in words)]
 
@@ -41,7 +41,7 @@ class Certified(Loop):
 def certified() -> Certified:
     """A session of a controller that must be certified, and is."""
     loop = Certified(required=True)
-    loop.assurance.publish()
+    loop.gate.publish()
     loop.begin()
     loop.tick()
     return loop
@@ -55,10 +55,10 @@ def wait_for_threads() -> None:
 
 
 def test_the_verdict_is_reported_once_and_again_when_it_changes(certified: Certified) -> None:
-    certified.assurance.publish()
+    certified.gate.publish()
     ((kind, text),) = certified.verdicts
     assert kind == "started"
-    assert text.startswith("Theorem 1 holds: c₀/2 = 0.075")
+    assert text.startswith("the certificate holds: once there, ‖z‖ stays within 0.02")
     asked = certified.ask("set_gains", Gains(C1=LAW.C1))  # which they are already
     certified.tick()
     assert asked.answers[0].done
@@ -67,7 +67,7 @@ def test_the_verdict_is_reported_once_and_again_when_it_changes(certified: Certi
     certified.tick()
     assert asked.answers[0].done
     kind, text = certified.verdicts[-1]
-    assert (kind, "c₀/2 = 0.1 " in text) == ("changed", True)
+    assert (kind, "stays within 0.021" in text) == ("changed", True)
 
 
 def test_gains_of_which_it_would_not_hold_are_refused_with_the_reason_and_a_remedy(certified: Certified) -> None:
@@ -76,10 +76,11 @@ def test_gains_of_which_it_would_not_hold_are_refused_with_the_reason_and_a_reme
     (answer,) = asked.answers
     assert not answer.done
     assert len(answer.text.splitlines()) == 1
-    assert "Theorem 1 does not hold: c₀/2 = 0.075 does not exceed" in answer.text
-    assert "what would do: law.C1 = [1.355, 1.355, 1.355], or law.C2" in answer.text
+    assert "the certificate does not hold: pointwise: no invariant set is proven with" in answer.text
+    assert "what would do: " in answer.text
+    assert "law.C2 = [0.0" in answer.text
     assert certified.controller.gains.C1 == LAW.C1
-    assert certified.assurance.blocks is None
+    assert certified.gate.blocks is None
     assert len(certified.verdicts) == 1
 
 
@@ -95,9 +96,9 @@ def test_a_stream_is_refused_and_what_can_be_certified_is_followed(certified: Ce
 
 
 def test_two_changes_that_hold_by_themselves_are_not_both_taken_if_together_they_do_not(certified: Certified) -> None:
-    less, more = Gains(C1=(1.2, 1.2, 1.2)), Gains(C2=(0.06, 0.06, 0.06))
+    less, more = Gains(C1=(0.1, 0.1, 0.1)), Gains(C2=(0.048, 0.048, 0.048))
     for alone in (less, more):
-        assert certified.assurance.verdict_of(gains_of(of(alone)), Sinusoid()).holds
+        assert certified.gate.verdict_of(gains_of(of(alone)), Sinusoid()).holds
     asked = [certified.ask("set_gains", gains) for gains in (less, more)]
     certified.tick()
     assert [one.answers[0].done for one in asked] == [True, False]
@@ -113,7 +114,7 @@ def test_where_nothing_is_required_all_is_accepted_and_reported() -> None:
     loop.tick()
     assert all(one.answers[0].done for one in asked)
     assert "nothing is certified" in loop.verdicts[-1][1]
-    assert loop.assurance.blocks is None
+    assert loop.gate.blocks is None
     assert not loop.events("fault")
 
 
@@ -124,22 +125,22 @@ def test_where_it_comes_to_rest_is_certified_beside_the_loop(certified: Certifie
     wait_for_threads()
     certified.tick()
     assert certified.verdicts[-1][0] == "changed"
-    assert certified.assurance.blocks is None
+    assert certified.gate.blocks is None
 
 
 def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
     loop = Certified(required=True)
-    loop.assurance.publish()
+    loop.gate.publish()
     for gains in (FAILING, BETTER):
-        loop.assurance.verdict_of(*loop.live.prospect(of(gains), Sinusoid()))
+        loop.gate.verdict_of(*loop.live.prospect(of(gains), Sinusoid()))
         loop.live.adopt(of(gains), Sinusoid())
-        blocks = loop.assurance.blocks
+        blocks = loop.gate.blocks
         if gains is FAILING:
             assert blocks is not None
-            assert blocks.startswith("claims no vehicle, as controller.require_certificate is set: Theorem 1 does not")
+            assert blocks.startswith("claims no vehicle, as controller.require_certificate is set: the certificate ")
             (fault,) = loop.events("fault")
             assert fault.startswith(blocks)
-            assert "law.C1 = [1.355, 1.355, 1.355]" in fault
+            assert "law.C2 = [0.0" in fault
         else:
             assert blocks is None
     assert [kind for kind, _ in loop.verdicts] == ["started", "changed", "fault"]
@@ -148,15 +149,15 @@ def test_what_is_read_again_blocks_and_unblocks_the_next_claim() -> None:
 def test_what_was_not_weighed_beforehand_counts_as_failing_until_it_is() -> None:
     loop = Certified(required=True)
     loop.live.adopt(of(BETTER), Sinusoid())
-    assert "not known yet" in (loop.assurance.blocks or "")
+    assert "not known yet" in (loop.gate.blocks or "")
     wait_for_threads()
     loop.role.take_inbox()
-    assert loop.assurance.blocks is None
+    assert loop.gate.blocks is None
 
 
 def test_what_must_hold_and_does_not_is_not_admitted(certified: Certified) -> None:
     with pytest.raises(UncertifiedError, match="does not hold"):
-        certified.assurance.admit(gains_of(of(FAILING)), Sinusoid())
-    certified.assurance.admit(gains_of(of(FAILING)), Sinusoid(), required=False)
-    certified.assurance.required = False
-    certified.assurance.admit(gains_of(of(FAILING)), Sinusoid())
+        certified.gate.admit(gains_of(of(FAILING)), Sinusoid())
+    certified.gate.admit(gains_of(of(FAILING)), Sinusoid(), required=False)
+    certified.gate.required = False
+    certified.gate.admit(gains_of(of(FAILING)), Sinusoid())

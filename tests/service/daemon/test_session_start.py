@@ -23,8 +23,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, distance, received_quaternion
 from aeroloop.service.daemon.session_start import remaining
 from aeroloop.service.settings import ControllerSettings
-from tests.service.daemon.test_operator_changes import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, turned
-from tests.service.daemon.test_operator_changes import time as time  # the fixture
+from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, turned
 
 GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
 TARGET = Hold(attitude=(0.0, 0.0, 60.0))

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from aeroloop.protocol.messages.models import Percentiles, Status, Timing
+from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.host.health import LATE_SHARE, SILENT_S, Trouble, troubles
@@ -113,3 +114,10 @@ def test_skipped_ticks_are_counted_over_the_last_ten_seconds(monkeypatch: pytest
             clock[0] = at
             role.status(PLANT.model_copy(update={"skipped": skipped}))
     assert published == [0, 2, 2, 0, 1]
+
+
+def test_a_recorder_that_cannot_write_is_a_trouble() -> None:
+    recorder = status("recorder", NOT_RECORDING, cause="the disk is full")
+    (trouble,) = troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
+    assert (trouble.kind, trouble.role) == (NOT_RECORDING, "recorder")
+    assert trouble.text == "aero's recorder records nothing: the disk is full"

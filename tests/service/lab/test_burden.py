@@ -23,7 +23,7 @@ from aeroloop.service.lab.burden_figure import draw_burden
 from aeroloop.service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
 from aeroloop.service.lab.burden_table import HEADER, markdown
 from aeroloop.service.lab.workers import Workers
-from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.outputs import OutputError
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
@@ -138,7 +138,8 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """A grid of three cells, 4 s each, by the command: what it prints as JSON, and the figure that it draws."""
     figure = tmp_path_factory.mktemp("burden") / "burden.png"
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(printed), pytest.MonkeyPatch.context() as patched:
+        patched.setattr("aeroloop.service.lab.burden.Workers", InThisProcess)
         arguments = ["--bits", "8/6", "--bits", "2/2", "--quantizer", "uniform", "--sensors", "encoders"]
         assert execute(["lab", "burden", *arguments, "--duration", "4", "--figure", str(figure), "--json"]) == 0
     return printed.getvalue(), figure
@@ -183,7 +184,7 @@ def test_the_figure_is_an_image(document: tuple[str, Path], tmp_path: Path) -> N
     draw_burden(burden, tmp_path / "burden.svg")
     text = (tmp_path / "burden.svg").read_text()
     assert "<svg" in text
-    with pytest.raises(ReviewError, match="folder"):
+    with pytest.raises(OutputError, match="folder"):
         draw_burden(burden, tmp_path / "none" / "burden.svg")
 
 

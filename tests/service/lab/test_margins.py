@@ -68,9 +68,8 @@ def test_at_the_largest_age_a_certificate_holds_and_just_beyond_it_does_not(bits
     assert found.in_range is not None
     assert certify(settings, late_s=found.in_range - period).holds
     larger = evaluate(settings, late_s=found.in_range + STEP_S - period)
-    exceeded = (
-        [key for *_, key in beyond(settings, larger.plant, larger.plant_reach)] if larger.plant_reach else [NO_SET]
-    )
+    desired, plant, reached = larger.desired, larger.plant, larger.plant_reach
+    exceeded = [key for *_, key in beyond(settings, desired, plant, reached)] if reached else [NO_SET]
     assert exceeded == [found.limited_by]
     assert evaluate(settings, late_s=found.proven - period).body_reach is not None
     assert evaluate(settings, late_s=found.proven + STEP_S - period).body_reach is None

@@ -25,7 +25,7 @@ from aeroloop.service.logs.files import LogFiles, ReviewError
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.logs.table import Rows, TruthColumns, euler_deg, groups
-from aeroloop.service.logs.table_files import ParquetFile
+from aeroloop.service.logs.table_files import ArrowFile
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.review.review import review
 from tests.support.edited_log import PERIOD_NS
@@ -312,7 +312,7 @@ def test_what_stands_in_the_way_is_reported_in_one_line_and_nothing_is_left_behi
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(ParquetFile, "write", full)
+    monkeypatch.setattr(ArrowFile, "write", full)
     with pytest.raises(OutputError, match="No space left"):
         export([log], "parquet", tmp_path / "a.parquet")
     assert sorted(tmp_path.iterdir()) == before

@@ -103,7 +103,16 @@ def test_another_file_is_replaced_only_with_force(here: Path, verb: str, capfd: 
     assert contents(here).keys() == {"a.mcap", "b.mcap", "out.png"}  # nothing half done stays behind
 
 
-def test_figures_are_drawn_all_or_none(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_figures_are_drawn_all_or_none(
+    here: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def save(_: object, folder: Path, name: str) -> list[Path]:  # what is in them is up to tests/service/report
+        paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
+        for path in paths:
+            path.write_bytes(b"drawn")
+        return paths
+
+    monkeypatch.setattr("aeroloop.service.report.plots.save", save)
     assert execute(["log", "review", "a.mcap", "--figures", "."]) == 0
     drawn = [path for path in here.iterdir() if path.suffix != ".mcap"]
     assert len(drawn) >= 6

@@ -280,3 +280,10 @@ def test_logs_named_by_the_time_are_kept_together_over_runs(tmp_path: Path, stor
     recording.log.close()
     assert not (tmp_path / "aeroloop-20200101-000000.mcap").exists()
     assert (tmp_path / "demo-1.mcap").exists()
+
+
+def test_a_name_without_an_ending_is_a_folder(tmp_path: Path, story: EventLog, clock: Clock) -> None:
+    """A review of the folder above finds it only with its ending."""
+    recording = Recording(clock, story, path=tmp_path / "run1")
+    recording.log.close()
+    assert [path.parent.name for path in tmp_path.rglob("*.mcap")] == ["run1"]

@@ -41,7 +41,7 @@ def quantized(logs: dict[str, Path]) -> Report:
 @pytest.fixture(scope="module")
 def drawn(quantized: Report, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Every figure of the quantized case, by name."""
-    paths = draw_figures(quantized, load(), tmp_path_factory.mktemp("figures") / "new")
+    paths = draw_figures(quantized, load(), tmp_path_factory.mktemp("figures"))
     return {path.name: path for path in paths}
 
 
@@ -95,13 +95,13 @@ def test_bands_are_shaded_with_their_labels(quantized: Report, tmp_path: Path) -
 
 
 def test_without_ticks_there_is_nothing_to_draw_and_a_file_for_a_folder_is_one_line(
-    quantized: Report, tmp_path: Path
+    logs: dict[str, Path], quantized: Report, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ReviewError, match="no answered measurement"):
         draw_figures(replace(quantized, time=quantized.time[:0]), load(), tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ReviewError, match="cannot write figures into"):
-        draw_figures(quantized, load(), tmp_path / "file")
+    assert execute(["log", "review", str(logs["quantized"]), "--figures", str(tmp_path / "file")]) == 1
+    assert capfd.readouterr().err.splitlines() == [f"aeroloop: cannot write into {tmp_path / 'file'}: File exists"]
 
 
 def test_a_part_without_ticks_or_of_no_length_is_refused(

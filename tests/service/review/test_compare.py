@@ -9,7 +9,7 @@ import pytest
 
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import load
-from aeroloop.service.review.compare import Comparison, broken_limits, named_apart
+from aeroloop.service.review.compare import Comparison, broken_limits, named_apart, read_runs
 from aeroloop.service.review.report import Check
 from tests.support.made_log import make_log
 from tests.support.made_report import made_report
@@ -70,3 +70,11 @@ def test_a_review_writes_its_page_with_its_verdict(
     assert run(("log", "review", logs[0], "--html", str(out), "--require", "z_track=1e-9")) == 1
     assert "Not held" in out.read_text()
     assert f"aeroloop: wrote {out}" in capfd.readouterr().err
+
+
+def test_logs_of_one_name_are_named_with_their_folders(logs: tuple[str, str], tmp_path: Path) -> None:
+    for folder, log in zip(("before", "after"), logs, strict=True):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "log.mcap").write_bytes(Path(log).read_bytes())
+    named = read_runs([tmp_path / "before/log.mcap", tmp_path / "after/log.mcap"])
+    assert [run.name for run in named] == ["before/log", "after/log"]

@@ -210,8 +210,10 @@ KEYS = {
     "missing", "frames", "clock_offset_us", "faults", "recorded", "disagreements",
 }  # fmt: skip
 THEOREM_KEYS = {
-    "verdict", "holds", "radius", "radius_deg", "transient_s", "since_s", "until_s", "z_norm", "z_norm_share",
-    "error_deg", "true_z_norm", "true_error_deg", "damping_known", "samples", "outside", "judged", "lemma", "broken",
+    "verdict", "holds", "held", "radius", "pointwise_radius", "pointwise_deg", "mean_square_share", "mean_square_at_s",
+    "mean_square_judged", "spacing_s", "pointwise_share", "pointwise_at_s", "pointwise_judged", "pointwise_since_s",
+    "pointwise_bound", "transient_s", "since_s", "until_s", "z_norm", "error_deg", "true_z_norm", "true_error_deg",
+    "damping_known", "samples", "outside", "judged", "lemma", "broken",
 }  # fmt: skip
 
 

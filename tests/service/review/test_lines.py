@@ -12,8 +12,8 @@ from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.wire.attitude import Quaternion, to_euler
 from aeroloop.service.config import load
 from aeroloop.service.logs.files import ReviewError
+from aeroloop.service.logs.table import euler_deg
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.review.angles import roll_pitch_yaw
 from aeroloop.service.review.downsample import DownsampledLines
 from aeroloop.service.review.observe import DrawnPart
 from aeroloop.service.review.review import read, report
@@ -82,7 +82,7 @@ def test_of_both_signs_the_attitude_is_drawn_with_that_beside_the_desired_one() 
 def test_roll_pitch_and_yaw_are_the_angles_of_each_quaternion() -> None:
     q = np.random.default_rng(1).normal(size=(200, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    np.testing.assert_allclose(roll_pitch_yaw(q), np.degrees([to_euler(tuple(one)) for one in q.tolist()]), atol=1e-9)
+    np.testing.assert_allclose(euler_deg(q), np.degrees([to_euler(tuple(one)) for one in q.tolist()]), atol=1e-9)
 
 
 def test_yaw_runs_on_where_the_body_turns_past_half_a_turn_and_what_is_measured_and_true_stays_beside_it() -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import asin, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 import pytest
 
+from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
+from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.config import Settings, load_over
-from aeroloop.service.control.law import build_law
+from aeroloop.service.control.law import Law, LawSettings, build_law
 from aeroloop.service.control.reference import Floats, Plan
 from aeroloop.service.theorem.certificate import evaluate, premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
@@ -72,13 +74,13 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
         eps_e = eps_bar + kappa1 * w_s
         e = np.append(sqrt(1 - eps_e @ eps_e), eps_e)
         q = _product(q_d, e)
-        R_d, R = _matrix(q_d), _matrix(q)
+        R_d, R_b = _matrix(q_d), _matrix(q)
         omega_d, omega_d_dot = R_d @ b[i], R_d @ b_dot[i]  # inertial
-        omega = omega_e + R.T @ omega_d
+        omega = omega_e + R_b.T @ omega_d
         eps_Q = (
             q[1:] + settings.wire.attitude.quantizer().bound * np.sign(rng.standard_normal(3)) * rng.random(3) ** 0.1
         )
-        q_Q = np.append(np.sign(q[0]) * sqrt(max(0.0, 1 - eps_Q @ eps_Q)), eps_Q)
+        q_Q = np.append(np.sign(q[0]) * sqrt(max(0.0, 1.0 - float(eps_Q @ eps_Q))), eps_Q)
         omega_Q = omega + settings.wire.rate.quantizer().bound * rng.uniform(-1, 1, 3)
         u, theta_hat_dot = (
             np.array(part).ravel()
@@ -88,7 +90,7 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
         omega_dot = (np.array(Psi(q, omega)).ravel() - omega * theta + B @ u) / J  # (C.2)
         A = e[0] * np.identity(3) + _skew(eps_e)
         eps_e_dot = A @ omega_e / 2  # (C.17)
-        omega_e_dot = omega_dot - R.T @ omega_d_dot + np.cross(omega, R.T @ omega_d)
+        omega_e_dot = omega_dot - R_b.T @ omega_d_dot + np.cross(omega, R_b.T @ omega_d)
         z2_dot = omega_e_dot + C1 * eps_e_dot
         w_s_dot = w_s_dot_theta + b[i] * theta_hat_dot
         found1 = eps_e_dot - kappa1 * w_s_dot - (z_bar - C1 * eps_bar) / 2
@@ -103,7 +105,7 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
 def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(settings: Settings, bits: int) -> None:
     wire = [f"wire.{name}.bits={bits}" for name in ("attitude", "rate", "voltage")]
     for start in (0.0, 0.05):
-        found = worst(load_over(settings, wire), start, 1500, bits)
+        found = worst(load_over(settings, wire), start, 400, bits)
         assert 0.2 < found.d1 <= 1
         assert 0.3 < found.d2 <= 1
 
@@ -111,7 +113,7 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(settings: 
 def test_half_of_the_bounds_is_exceeded() -> None:
     """What the test above rests on can fail: the quantizers' part of D₂ is attained but for its directions."""
     quiet = load_over(PAPER, ["law.damping_bound=0.0119", "wire.voltage.bits=cont", "wire.rate.bits=cont"])
-    assert worst(quiet, 0.0, 3000, 1).d2 > 0.5
+    assert worst(quiet, 0.0, 1500, 1).d2 > 0.5
 
 
 def test_the_gains_are_the_largest_answers_to_bounded_inputs() -> None:
@@ -153,7 +155,7 @@ def test_the_gains_are_the_largest_answers_to_bounded_inputs() -> None:
         {"k_omega_d_dot": 0.2},
     ],
 )
-def test_the_set_grows_with_everything_that_disturbs(worse: dict[str, float]) -> None:
+def test_the_set_grows_with_everything_that_disturbs(worse: dict[str, Any]) -> None:
     p = of(load_over(PAPER, [f"wire.{name}.bits=10" for name in ("attitude", "rate", "voltage")]))
     before, after = reach(p), reach(replace(p, **worse))
     assert before is not None
@@ -186,26 +188,29 @@ def test_a_held_roll_takes_from_the_yaw_what_u1_would_have_added() -> None:
 def test_the_reached_attitude_error_is_that_of_the_angle() -> None:
     e = evaluate(PAPER)
     assert e.body_reach is not None
-    assert e.body_reach.half_angle == pytest.approx(e.known.half_angle_d + asin(e.body_reach.eps_e))
+    assert e.body_reach.half_angle == pytest.approx(
+        e.known.half_angle_d + asin(e.body_reach.eps_e),
+        rel=1e-3,  # guesses are raised by as much
+    )
 
 
-def _psi(law: object, built: object) -> ca.SX:
-    """Ψ of (C.4) for the true state, from u of (C.22): the law's own part without the rest is not separable."""
-    from aeroloop.protocol.wire.attitude import R, S
-
-    q, omega = built.q, built.omega  # type: ignore[attr-defined]
-    J = ca.diag(ca.SX(law.inertia))  # type: ignore[attr-defined]
-    f_g = ca.vertcat(0, 0, -law.mass * law.gravity)  # type: ignore[attr-defined]
-    return -S(omega) @ (J @ omega) + S(ca.SX(law.centre_of_mass)) @ R(q).T @ f_g  # type: ignore[attr-defined]
+def _psi(law: LawSettings, built: Law) -> ca.SX:
+    """Ψ of (C.4) at the true state."""
+    J = ca.diag(ca.SX(law.inertia))
+    f_g = ca.vertcat(0, 0, -law.mass * law.gravity)
+    Psi: ca.SX = -S(built.omega) @ (J @ built.omega) + S(ca.SX(law.centre_of_mass)) @ R(built.q).T @ f_g
+    return Psi
 
 
 def _direction(rng: np.random.Generator) -> Floats:
     v = rng.standard_normal(3)
-    return v / np.linalg.norm(v)
+    direction: Floats = v / np.linalg.norm(v)
+    return direction
 
 
 def _in_ball(rng: np.random.Generator, radius: float) -> Floats:
-    return _direction(rng) * radius * rng.random() ** 0.1
+    inside: Floats = _direction(rng) * radius * rng.random() ** 0.1
+    return inside
 
 
 def _skew(v: Floats) -> Floats:
@@ -214,9 +219,86 @@ def _skew(v: Floats) -> Floats:
 
 
 def _matrix(q: Floats) -> Floats:
-    S = _skew(q[1:])
-    return np.identity(3) + 2 * q[0] * S + 2 * S @ S
+    V = _skew(q[1:])
+    matrix: Floats = np.identity(3) + 2 * q[0] * V + 2 * V @ V
+    return matrix
 
 
 def _product(p: Floats, q: Floats) -> Floats:
     return np.append(p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))
+
+
+GENTLE = load_over(
+    PAPER, ["reference.amplitude=[0, 8, 20]", *(f"wire.{name}.bits=14" for name in ("attitude", "rate", "voltage"))]
+)
+
+
+def test_no_state_of_a_body_with_a_held_roll_is_disturbed_by_more_than_its_bounds() -> None:
+    """The Aero's own equations, pitch and yaw near the reference; derivatives by differences over a microsecond."""
+    law = GENTLE.law
+    p = replace(of(GENTLE), tilt=extremes(GENTLE.reference).tilt)
+    at = reach(p, 0.02)
+    assert at is not None
+    C1, C2, J = (np.array(v) for v in (law.C1, law.C2, law.inertia))
+    kappa1 = 1 / (1 + C1 * C2)
+    built = build_law(law)
+    inputs = [built.q, built.omega, built.q_d, built.omega_d, built.omega_d_dot, built.theta, built.s]
+    command = ca.Function("c", [*inputs, built.C1, built.C2, built.Gamma], [built.u, built.theta_dot])
+    plan, rng, step = Plan.of(GENTLE.reference), np.random.default_rng(7), 1e-6
+
+    def coordinates_at(t: float, x: Floats, theta: Floats, theta_hat: Floats) -> tuple[Floats, ...]:
+        desired = plan.at(np.array([[t]]))
+        angles = type(desired)(*(part.reshape(1, 3) for part in desired))
+        (b,), (b_dot,) = body_rates(angles)
+        eps_d = vectors(angles)[0]
+        q_d = np.append(sqrt(1 - eps_d @ eps_d), eps_d)
+        pitch, yaw, pitch_rate, yaw_rate = x
+        sine, cosine = np.sin(pitch), np.cos(pitch)
+        turned, pitched = (np.array([np.cos(a / 2), 0, 0, 0]) for a in (yaw, pitch))
+        turned[3], pitched[2] = np.sin(yaw / 2), np.sin(pitch / 2)
+        q = _product(turned, pitched)
+        omega = np.array([-sine * yaw_rate, pitch_rate, cosine * yaw_rate])
+        R_d, R_b = _matrix(q_d), _matrix(q)
+        omega_d, omega_d_dot = R_d @ b, R_d @ b_dot
+        e = _product(q_d * [1, -1, -1, -1], q)
+        omega_e = omega - R_b.T @ omega_d
+        missing = theta_hat[0] * b[0] + J[0] * (R_b.T @ omega_d_dot)[0]  # the slow part of what u₁ should have been
+        vertical = np.array([-sine, 0, cosine])
+        force = -b * (theta - theta_hat) + sine * missing * vertical
+        w_s = np.array([0, force[1], 0]) + force @ vertical / cosine**2 * vertical
+        return e[1:], omega_e + C1 * e[1:], omega_e, w_s, q, omega, q_d, omega_d, omega_d_dot
+
+    most1 = most2 = 0.0
+    judged = 0
+    for k in range(1200):
+        if k % 100 == 0:
+            theta = _in_ball(rng, p.k_theta)
+            damping = (theta[0], theta[1], theta[2])
+            aero = aero_dynamics(AeroSettings(centre_of_mass=law.centre_of_mass, damping=damping))
+        theta_hat = _in_ball(rng, p.k_theta_hat)
+        t = rng.uniform(0, 40)
+        desired = plan.at(np.array([[t]]))
+        error = rng.uniform(-1, 1, 4) * [2 * at.eps_bar, 2 * at.eps_bar, at.omega_e, at.omega_e]
+        x = np.concatenate([desired.angle[0, 0, 1:], desired.rate[0, 0, 1:]]) + error
+        eps_e, z2, omega_e, w_s, q, omega, q_d, omega_d, omega_d_dot = coordinates_at(t, x, theta, theta_hat)
+        eps_bar, z_bar = eps_e - kappa1 * w_s, z2 - C1 * kappa1 * w_s
+        sizes = (eps_bar, at.eps_bar), (omega_e, at.omega_e), (eps_bar + C2 * z_bar, at.torque), (eps_e, at.eps_e)
+        if any(np.linalg.norm(v) > most for v, most in sizes):
+            continue
+        judged += 1
+        eps_Q = q[1:] + GENTLE.wire.attitude.quantizer().bound * rng.uniform(-1, 1, 3)
+        q_Q = np.append(sqrt(1 - float(eps_Q @ eps_Q)), eps_Q)
+        omega_Q = omega + GENTLE.wire.rate.quantizer().bound * rng.uniform(-1, 1, 3)
+        given = q_Q, omega_Q, q_d, omega_d, omega_d_dot, theta_hat, 1.0, C1, C2, np.array(law.Gamma)
+        u, theta_hat_dot = (np.array(part).ravel() for part in command(*given))
+        x_dot = np.array(aero(x, u[1:], [0, 0])).ravel()
+        later = coordinates_at(t + step, x + step * x_dot, theta, theta_hat + step * theta_hat_dot)
+        eps_bar_dot = (later[0] - kappa1 * later[3] - eps_bar) / step
+        z_bar_dot = (later[1] - C1 * kappa1 * later[3] - z_bar) / step
+        d1 = eps_bar_dot - (z_bar - C1 * eps_bar) / 2
+        d2 = J * z_bar_dot + p.share * (eps_bar + C2 * z_bar)
+        most1 = max(most1, float(np.linalg.norm(d1)) / at.D1)
+        most2 = max(most2, float(np.linalg.norm(d2)) / at.D2)
+    assert judged > 100
+    assert 0.2 < most1 <= 1
+    assert 0.2 < most2 <= 1

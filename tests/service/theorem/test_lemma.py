@@ -7,7 +7,7 @@ with little error. There a bound of half the size would be exceeded, so the chec
 from __future__ import annotations
 
 from dataclasses import replace
-from math import asin, floor, radians, sin, sqrt
+from math import asin, degrees, floor, radians, sin, sqrt
 
 import numpy as np
 import pytest
@@ -17,10 +17,10 @@ from aeroloop.protocol.wire.attitude import IDENTITY, Vector, received_quaternio
 from aeroloop.protocol.wire.quantizer import Quantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import Plan, reference_function
-from aeroloop.service.theorem.certificate import Evaluated, evaluate, known
-from aeroloop.service.theorem.extremes import extremes
+from aeroloop.service.theorem.certificate import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of
@@ -49,7 +49,7 @@ LEMMA = tuple(DELTAS)
 
 
 def bounds(wire: WireSpec, error: float = ERROR) -> Evaluated:
-    return evaluate(known(wire, LAW, desired=extremes(REFERENCE), disturbance=0.0, error=error))
+    return evaluate(Settings(wire=wire, law=LAW, reference=REFERENCE), attitude_error_deg=degrees(error))
 
 
 def wire_of(bits: int) -> WireSpec:
@@ -170,14 +170,15 @@ def test_v_falls_as_fast_as_the_theorem_says() -> None:
     """V̇ of the body under the quantized law, with any θ, θ̂ and disturbance in their bounds, by the twin's equations."""
     wire = wire_of(8).model_copy(update={"voltage": SignalSpec(bits=8, limit=1000.0)})  # no command saturates
     disturbance = 0.02
-    b = evaluate(known(wire, LAW, desired=extremes(REFERENCE), disturbance=disturbance, error=ERROR))
+    settings = Settings(wire=wire, law=LAW, reference=REFERENCE)
+    b = evaluate(settings, disturbance=disturbance, attitude_error_deg=degrees(ERROR))
     t = b.theorem
     assert t.k is not None
     assert t.radius is not None
     x, omega_d_dot = random_samples(wire, b, seed=5)
     rng = np.random.default_rng(5)
     body, voltage = body_of(LAW), wire.voltage.quantizer()
-    theta, estimate, torque = (_within(r, rng) for r in (LAW.damping_bound, LAW.damping_bound, disturbance))
+    theta, estimate, torque = (_within(r, rng) for r in (LAW.damping_bound, LAW.damping_bound / 0.95, disturbance))
     q = np.where((x.q * x.q_Q).sum(axis=1, keepdims=True) < 0, -x.q, x.q)
     c = coordinates(q, x.omega, x.q_d, x.omega_d, x.sign, np.array(LAW.C1))
     V_dot = np.empty(COUNT)

@@ -1,0 +1,131 @@
+"""Sources of the configuration: a TOML file, the environment and `--set`, each as a tree of sections and keys."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.wording import Shapes, closest
+
+ENV_PREFIX: Final = "AEROLOOP_"
+"""Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
+
+
+class ConfigError(AeroloopError):
+    """The configuration is wrong; one line with the key and its allowed values."""
+
+
+def sources(
+    file: Path | None, overrides: Sequence[str], model: type[BaseModel], unread: Collection[str] = ()
+) -> Iterator[dict[str, Any]]:
+    """What is configured, as a tree for each source; a later one replaces values of an earlier one.
+
+    Args:
+        file: A TOML file, or None.
+        overrides: `section.key=value`, values as TOML writes them (quotes may be left out).
+        model: Has the keys that the environment may give.
+        unread: Sections of which the environment's variables are not read.
+
+    Raises:
+        ConfigError: A source cannot be read, or the environment gives a key that the model does not have.
+    """
+    if file is not None:
+        yield _read(file)
+    yield _environment(model, unread)
+    yield tree_of(overrides)
+
+
+def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
+    """The tree of `section.key=value` overrides. Raises ConfigError."""
+    tree: dict[str, Any] = {}
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set takes section.key=value, not {override!r}")
+        _put(tree, key.strip(), _value(text.strip()))
+    return tree
+
+
+def merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
+    """Put the values of one tree into another. A reference of another kind replaces the one that is there."""
+    value: Any
+    present: Any
+    for name, value in changes.items():
+        present = tree.get(name)
+        # A reference of another kind has other keys; the kinds of a quantizer share theirs.
+        other_kind = name == "reference" and isinstance(value, dict) and "kind" in value
+        if (
+            isinstance(value, dict)
+            and isinstance(present, dict)
+            and not (other_kind and value["kind"] != present["kind"])
+        ):
+            merge(present, value)
+        else:
+            tree[name] = value
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        tree = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"no configuration file at {file}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{file} is not TOML: {error}") from None
+    reference = tree.get("reference")
+    if isinstance(reference, dict) and isinstance(reference.get("path"), str):
+        reference["path"] = str(file.parent / reference["path"])
+    return tree
+
+
+def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, Any]:
+    elsewhere = tuple(_variable(f"{section}.") for section in unread)
+    given = {
+        name: text
+        for name, text in os.environ.items()
+        if name.upper().startswith(ENV_PREFIX) and not name.upper().startswith(elsewhere)
+    }
+    known = {_variable(key): key for key, _ in Shapes(model).every_key()} if given else {}
+    tree: dict[str, Any] = {}
+    for name, text in sorted(given.items()):
+        variable, _, option = name.upper().partition(_OPTIONS)
+        if option:
+            merge(tree, {"can": {"options": {option.lower(): _value(text)}}})
+        elif variable in known:
+            _put(tree, known[variable], _value(text))
+        else:
+            found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
+            hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"
+            raise ConfigError(f"{name} in the environment is no setting: {hint}")
+    return tree
+
+
+def _variable(key: str) -> str:
+    return ENV_PREFIX + key.upper().replace(".", "__")
+
+
+_OPTIONS: Final = _variable("can.options.")
+"""What follows it names an option of the CAN interface; any may be given."""
+
+
+def _put(tree: dict[str, Any], key: str, value: Any) -> None:
+    *sections, name = key.split(".")
+    for section in sections:
+        tree = tree.setdefault(section, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{section} is given a value, and then {key}: set its keys one by one")
+    tree[name] = value
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,227 @@
+"""The node on a CAN bus, without a bridge: sessions made by the other side's heartbeat, commands obeyed, a bus lost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID
+from aeroloop.protocol.transport.can_link import CanLink
+from tests.support.can_in_process import Flaws, virtual
+from tests.support.can_stage import COUNTERS, OFF, Bus, command
+
+SLACK_S = 0.3
+"""For a test that other work on the machine keeps waiting: it must run to notice anything."""
+
+
+@pytest.fixture
+def hasty_bus() -> Iterator[Bus]:
+    """A node on a bus."""
+    bus = Bus(virtual())
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def bus(hasty_bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Bus:
+    """The same, where half a second in which this test is kept waiting does not end a session that is to go on."""
+    monkeypatch.setattr(CanLink, "silent", False)
+    return hasty_bus
+
+
+def test_a_session_begins_when_the_other_side_reports_granted_and_counts_from_0(bus: Bus) -> None:
+    bus.await_heartbeat(PlantState.IDLE)
+    assert bus.front.link is None
+    bus.turn_for(0.05)
+    assert bus.side.take() is None, "a measurement without a session"
+    bus.begin()
+    assert bus.endpoint.state is PlantState.GRANTED
+    assert bus.front.link is not None
+    bus.await_heartbeat(PlantState.GRANTED)
+    seen = bus.counters(40)
+    assert seen == [k % COUNTERS for k in range(len(seen))]
+
+
+def test_a_command_drives_it_none_from_before_the_session_and_the_heartbeat_reports_it_at_once(bus: Bus) -> None:
+    bus.turn_for(0.1)  # so that any echo could be that of a measurement, were there one
+    bus.side.send(command(15, code=31))
+    bus.begin()
+    bus.turn_for(0.1)
+    assert bus.endpoint.state is PlantState.GRANTED
+    assert bus.plant.voltages == OFF
+    bus.drive(code=5)
+    bus.turn()
+    assert bus.plant.voltages == (5 * 48 / 63, -5 * 48 / 63)
+    bus.await_heartbeat(PlantState.DRIVEN)
+
+
+def test_heartbeats_come_ten_times_a_second_and_at_once_on_a_change(bus: Bus) -> None:
+    bus.await_heartbeat(PlantState.IDLE)
+    bus.stranger.everything()
+    bus.turn_for(1.0)
+    beats = [m for m in bus.stranger.everything() if m.arbitration_id == PLANT_HEARTBEAT_ID + 1]
+    assert 5 <= len(beats) <= 11  # fewer only where this test is kept waiting
+    bus.until("a heartbeat", lambda: bool(bus.stranger.everything()))
+    bus.endpoint.stop()  # not 0.1 s later, but with this turn
+    bus.turn()
+    assert bus.stranger.heartbeat(PlantState.TRIPPED).cause is TripCause.OPERATOR
+
+
+def test_another_fingerprint_is_never_followed_and_ends_a_session_that_runs(
+    bus: Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What makes a fingerprint another one: ../protocol/transport/test_can_format.py."""
+    bus.send_heartbeat(PlantState.GRANTED, 1, bytes(7))
+    bus.until("the refusal", lambda: "another wire spec" in caplog.text)
+    for echo in range(40):
+        bus.side.send(command(echo))
+        bus.turn()
+    bus.turn_for(0.2)
+    assert bus.plant.voltages == OFF
+    assert bus.endpoint.state is PlantState.IDLE
+    assert bus.side.take() is None
+    assert len(caplog.records) == 1, "it is reported now and then, not with every heartbeat"
+    bus.begin(number=1)  # the same number, with the right one
+    bus.drive()
+    bus.send_heartbeat(PlantState.GRANTED, 2, bytes(7))
+    bus.await_heartbeat(PlantState.IDLE)
+    bus.turn()
+    assert bus.plant.voltages == OFF
+    assert bus.endpoint.session is None
+
+
+def test_idle_from_the_other_side_releases_it(bus: Bus) -> None:
+    bus.begin()
+    bus.drive()
+    bus.send_heartbeat(PlantState.IDLE)
+    bus.await_heartbeat(PlantState.IDLE)
+    bus.turn()
+    assert bus.plant.voltages == OFF
+    assert bus.front.link is None
+    bus.begin(number=1)  # it may even be the same number: idle came in between
+    assert bus.counters(1)
+
+
+def test_silence_trips_it_after_half_a_second(hasty_bus: Bus) -> None:
+    bus = hasty_bus
+    bus.begin()
+    bus.drive()
+    bus.turn_for(0.2)
+    bus.say = None
+    bus.await_heartbeat(PlantState.TRIPPED, 7)
+    assert 0.5 <= time.monotonic() - bus.said_at < 0.5 + SLACK_S
+    assert bus.plant.voltages == OFF
+    assert bus.endpoint.trip is TripCause.HOLDER_GONE
+
+
+def test_commands_are_a_sign_of_life_too(hasty_bus: Bus) -> None:
+    """Every frame counts as a sign of life; heartbeats are for when no other frame is sent."""
+    bus = hasty_bus
+    bus.begin()
+    bus.drive()
+    bus.say = None
+    deadline = time.monotonic() + 0.7
+    while time.monotonic() < deadline:
+        bus.side.send(command(0))
+        bus.turn()
+    assert bus.endpoint.state is PlantState.DRIVEN
+
+
+def test_another_number_is_another_session(bus: Bus) -> None:
+    bus.begin(number=3)
+    bus.drive()
+    bus.turn()
+    assert bus.plant.voltages != OFF
+    bus.stranger.everything()
+    bus.begin(number=4)
+    assert bus.endpoint.state is PlantState.GRANTED
+    bus.turn()
+    assert bus.plant.voltages == OFF
+    bus.await_heartbeat(PlantState.GRANTED)
+    seen = bus.counters(40)
+    start = next(i for i in range(len(seen)) if seen[i : i + 16] == list(range(16)))
+    assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
+
+
+def test_a_session_begins_afresh_with_counter_0_whatever_the_last_one_came_to(bus: Bus) -> None:
+    for number in range(1, 6):
+        bus.begin(number)
+        assert bus.counters(1)[0] == 0
+        bus.turn_for(0.01 * number)
+        bus.send_heartbeat(PlantState.IDLE)
+        bus.until("the release", lambda: bus.endpoint.session is None)
+        bus.stranger.everything()
+
+
+def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus: Bus) -> None:
+    bus.begin(number=1)
+    bus.drive()
+    bus.endpoint.expire(TripCause.ENVELOPE, "tilted too far")
+    bus.await_heartbeat(PlantState.TRIPPED, 3)
+    bus.turn_for(0.3)  # heartbeats of the same number go on, and commands too
+    bus.side.send(command(1))
+    bus.turn_for(0.05)
+    assert bus.endpoint.state is PlantState.TRIPPED
+    assert bus.plant.voltages == OFF
+    bus.send_heartbeat(PlantState.IDLE, 1)
+    bus.turn_for(0.05)
+    assert bus.endpoint.state is PlantState.TRIPPED, "a release is not an arming"
+    bus.begin(number=2)
+    bus.await_heartbeat(PlantState.GRANTED, 0)
+
+
+def test_a_node_that_leaves_reports_idle_and_is_at_rest(bus: Bus) -> None:
+    bus.begin()
+    bus.drive()
+    bus.front.leave()
+    bus.stranger.heartbeat(PlantState.IDLE)
+    assert bus.endpoint.session is None
+    sent = bus.side.peer
+    bus.front.leave()
+    assert bus.side.peer is sent
+
+
+def test_a_bus_that_fails_for_a_moment_is_opened_again_and_the_session_goes_on(
+    flaws: Flaws, bus: Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus.begin()
+    bus.drive()
+    opened = flaws.opened
+    bus.stranger.say(0x40, bytes(8), is_error_frame=True)  # bus-off, at both ends
+    bus.until("the fault", lambda: "bus-off" in caplog.text)
+    assert bus.side.reopen()
+    assert flaws.opened == opened + 2
+    bus.stranger.everything()
+    bus.side.peer = None
+    bus.await_heartbeat(PlantState.DRIVEN)
+    assert bus.counters(1)
+    bus.turn_for(0.2)
+    assert bus.endpoint.session == "can-1"
+
+
+def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
+    flaws: Flaws, hasty_bus: Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus = hasty_bus
+    bus.begin()
+    bus.drive()
+    opened = flaws.opened
+    flaws.lost = flaws.gone = True
+    lost_at = time.monotonic()
+    bus.until("the trip", lambda: bus.endpoint.state is PlantState.TRIPPED)
+    assert time.monotonic() - lost_at < 0.5 + SLACK_S
+    assert bus.endpoint.trip is TripCause.HOLDER_GONE
+    bus.turn_for(1.2)
+    assert bus.plant.voltages == OFF
+    assert 2 <= flaws.opened - opened <= 2 + (time.monotonic() - lost_at) / 0.5
+    assert sum("trying again" in record.getMessage() for record in caplog.records) == 1
+    flaws.lost = flaws.gone = False
+    assert bus.side.reopen()
+    bus.send_heartbeat(PlantState.IDLE)
+    bus.await_heartbeat(PlantState.TRIPPED, 7)  # mended, it says what happened
+    bus.begin(number=2)
+    bus.await_heartbeat(PlantState.GRANTED)
+    bus.drive()

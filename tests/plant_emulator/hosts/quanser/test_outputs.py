@@ -1,0 +1,223 @@
+"""Aero on Quanser's board: voltages, amplifier and lights, and the watchdog that takes them over."""
+
+from __future__ import annotations
+
+from math import inf, nan
+from typing import Any
+
+import pytest
+
+from aeroloop.plant_emulator.hosts.quanser.usb import COLOURS
+from aeroloop.protocol.messages.states import PlantState
+from tests.support.quanser_board import (
+    OFF,
+    VOLTS,
+    WATCHDOG,
+    Calls,
+    drive,
+    driven_plant,
+    expired_plant,
+    is_nothing,
+    plant_on_board,
+)
+
+REST = 250
+"""Samples in 0.5 s."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "commanded", "written"),
+    [
+        ({}, (19.0, -24.0), [18.0, -18.0]),
+        ({}, (inf, -inf), [18.0, -18.0]),
+        ({"voltage_limit": 5.0}, (4.0, -6.0), [4.0, -5.0]),
+        ({}, (nan, 3.0), [0.0, 3.0]),
+        ({"motor_channels": (1, 0), "motor_signs": (1, -1)}, (4.0, 6.0), [-6.0, 4.0]),
+    ],
+)
+def test_voltages_are_clipped_no_number_is_0_v_and_motors_can_be_crossed_and_turned(
+    changed: dict[str, Any], commanded: tuple[float, float], written: list[float]
+) -> None:
+    plant, board = plant_on_board(**changed)
+    plant.actuate(commanded)
+    assert board.analog == written
+
+
+def test_another_number_of_voltages_is_refused() -> None:
+    plant, _ = plant_on_board()
+    with pytest.raises(ValueError, match="argument"):
+        plant.actuate((1.0, 2.0, 3.0))
+
+
+def test_the_amplifier_is_on_from_the_first_voltage_until_half_a_second_of_none() -> None:
+    plant, board = plant_on_board()
+    for periods, voltages, on in [
+        (10, OFF, False),
+        (1, (0.0, 0.1), True),
+        (REST, OFF, True),
+        (1, VOLTS, True),  # a voltage in between
+        (REST, OFF, True),
+        (1, OFF, False),
+        (1, VOLTS, True),
+    ]:
+        drive(plant, periods, voltages)
+        assert board.enabled == [on, on]
+    assert board.truth().voltages == VOLTS
+
+
+def test_with_explicit_enable_only_its_caller_switches_the_amplifier() -> None:
+    plant, board = plant_on_board()
+    plant.enable(False)
+    drive(plant, 3)
+    assert (board.enabled, board.analog) == ([False, False], [0.0, 0.0])
+    plant.enable(True)
+    assert (board.enabled, board.analog) == ([True, True], list(VOLTS))
+    drive(plant, 2 * REST, OFF)
+    assert board.enabled == [True, True]
+    drive(plant, 1)
+    plant.enable(False)
+    assert (board.enabled, board.analog) == ([False, False], [0.0, 0.0])
+
+
+def test_lights_show_the_state_and_are_written_when_it_changes() -> None:
+    plant, board = plant_on_board()
+    assert board.leds == [0.0, 0.0, 0.0]
+    shown = []
+    for state in PlantState:
+        plant.show(state)
+        plant.show(state)
+        shown.append(tuple(board.leds))
+    assert shown == [COLOURS[state] for state in PlantState]
+    assert len(set(shown)) == list(board.calls).count("write_other") == 4
+    strongest = {state: max(zip(colour, "rgb", strict=True))[1] for state, colour in COLOURS.items()}
+    assert [strongest[s] for s in (PlantState.IDLE, PlantState.DRIVEN, PlantState.TRIPPED)] == ["b", "g", "r"]
+
+
+def test_a_light_that_fails_is_tried_again_and_costs_no_sample() -> None:
+    plant, board = driven_plant()
+    board.fail_next("write_other")
+    plant.show(PlantState.DRIVEN)
+    calls = Calls(board)
+    plant.advance()
+    assert "watchdog_reload" in calls.names()
+    assert not is_nothing(plant.measure())
+    plant.show(PlantState.DRIVEN)
+    assert board.leds == list(COLOURS[PlantState.DRIVEN])
+
+
+def test_lights_come_back_with_the_outputs() -> None:
+    plant, board = expired_plant()
+    plant.show(PlantState.DRIVEN)
+    assert board.leds == list(COLOURS[PlantState.TRIPPED])  # the board's own
+    assert plant.failures == 0
+    calls = Calls(board)
+    plant.actuate(OFF)
+    assert board.leds == list(COLOURS[PlantState.DRIVEN])
+    assert "write_other" in calls.names()  # not every board may restore them by itself
+
+
+# The watchdog
+
+
+def test_a_loop_that_stands_still_leaves_the_motors_at_0_v_when_the_watchdogs_time_is_over() -> None:
+    plant, board = driven_plant()
+    board.let_pass(WATCHDOG - 1)
+    plant.advance()
+    assert not is_nothing(plant.measure())  # just in time
+    assert (plant.expiries, board.expired) == (0, False)
+    board.let_pass(WATCHDOG)
+    assert board.truth().voltages == VOLTS  # in the last period before it
+    board.let_pass(1)
+    assert board.truth().voltages == board.motor_voltages == OFF
+    assert (board.analog, board.enabled, board.leds) == ([0.0, 0.0], [False, False], list(COLOURS[PlantState.TRIPPED]))
+
+
+@pytest.mark.parametrize("reads_go_on", [True, False])
+def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the_outputs(reads_go_on: bool) -> None:
+    plant, board = driven_plant()
+    plant.actuate(OFF)
+    board.reads_while_expired = reads_go_on
+    board.let_pass(WATCHDOG + 1)
+    calls = Calls(board)
+    plant.advance()
+    assert (plant.expiries, is_nothing(plant.measure())) == (1, True)
+    assert not reads_go_on or (plant.passed, plant.failures) == (WATCHDOG + 1, 0)
+    for _ in range(WATCHDOG + REST + 2):  # long enough to switch the amplifier off, were it on
+        plant.advance()
+    plant.enable(True)
+    assert not any(call.startswith("write") for call in calls.names())
+    assert plant.expiries == 1
+
+
+@pytest.mark.parametrize("reads_go_on", [True, False])
+def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_armed(reads_go_on: bool) -> None:
+    plant, board = expired_plant()
+    board.reads_while_expired = reads_go_on
+    calls = Calls(board)
+    for _ in range(5):
+        drive(plant, 1)
+        assert is_nothing(plant.measure())
+        assert board.truth().voltages == OFF
+    assert not {"watchdog_clear", "write_analog", "write_digital"} & set(calls.names())
+    calls = Calls(board)
+    drive(plant, 1, OFF)
+    clearing = ["watchdog_stop", "watchdog_clear", "watchdog_start", "write_analog", "write_digital"]
+    assert calls.names()[:5] == clearing
+    assert not is_nothing(plant.measure())
+    assert board.truth().voltages == OFF  # though clearing restored the outputs of before
+    drive(plant, 1)
+    assert board.truth().voltages == VOLTS
+    board.let_pass(WATCHDOG + 1)
+    assert board.motor_voltages == OFF
+    plant.advance()
+    assert plant.expiries == 2
+
+
+def test_an_enabled_amplifier_is_on_again_when_its_watchdog_is_cleared() -> None:
+    plant, board = expired_plant()
+    plant.enable(True)
+    assert board.expired
+    assert plant.failures == 0  # nothing was tried
+    drive(plant, 1, OFF)
+    assert board.enabled == [True, True]
+
+
+@pytest.mark.parametrize("call", ["watchdog_start", "write_analog", "write_digital"])
+def test_outputs_that_cannot_be_had_back_stay_at_0_v_until_they_can(call: str) -> None:
+    plant, board = expired_plant()
+    board.fail_next(call)
+    drive(plant, 1, OFF)
+    assert is_nothing(plant.measure())
+    assert plant.failures == 1
+    board.let_pass(WATCHDOG)  # if the outputs came back alone, the watchdog takes them again
+    assert board.motor_voltages == OFF
+    drive(plant, WATCHDOG + 2, OFF)
+    assert not is_nothing(plant.measure())
+    drive(plant, 1)
+    assert board.truth().voltages == VOLTS
+
+
+def test_a_command_that_could_not_be_written_does_not_reload_the_watchdog() -> None:
+    plant, board = driven_plant()
+    board.fail_next("write_analog")
+    for reloads in (False, True):
+        calls = Calls(board)
+        drive(plant, 1)
+        assert ("watchdog_reload" in calls.names()) == reloads
+        assert not is_nothing(plant.measure())  # what it sees is true all the same
+    assert plant.failures == 1
+
+
+@pytest.mark.parametrize("call", ["task_read", "write_analog", "write_digital"])
+def test_where_reads_or_writes_fail_for_long_the_board_goes_to_0_v_by_itself(call: str) -> None:
+    plant, board = driven_plant()
+    board.fail_next(call, 1000)
+    for k in range(WATCHDOG + 5):
+        assert (board.truth().voltages == OFF) == (k > WATCHDOG)  # of the period that is over
+        plant.actuate(VOLTS)  # the loop that drives it goes on
+        if call == "write_digital":
+            plant.enable(False)
+            board.analog[:] = VOLTS  # were only the amplifier left to switch the motors off
+        plant.advance()
+    assert is_nothing(plant.measure())
+    assert plant.expiries == 1

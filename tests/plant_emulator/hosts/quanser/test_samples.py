@@ -1,0 +1,264 @@
+"""Aero on Quanser's board: what is measured, of samples that are read, lost, late, or not to be had."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, pi, sin
+
+import pytest
+
+from aeroloop.plant_emulator.hosts.quanser.fake import FakeQuanser
+from aeroloop.plant_emulator.model.sensors import FilteredDerivative, SensorSettings
+from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.plant_emulator.quanser_settings import CardType, QuanserSettings
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.wire.attitude import IDENTITY
+from tests.support.quanser_board import (
+    AERO,
+    PERIOD,
+    Calls,
+    HandClock,
+    drive,
+    driven_plant,
+    emulated_aero,
+    is_nothing,
+    plant_on_board,
+)
+
+PERIOD_NS = 2_000_000
+
+
+def turn_encoders(board: FakeQuanser, pitch: int, yaw: int) -> None:
+    board.set_counts(2, pitch)
+    board.set_counts(3, yaw)
+
+
+@pytest.mark.parametrize(
+    ("card", "counts", "voltages", "periods", "yaw"),
+    [
+        ("quanser_aero2_usb", (2880, 4096), (-18.0, 18.0), 3000, 4096),
+        ("quanser_aero_usb", (2048, 4096), (9.0, -12.0), 300, 20),
+    ],
+)
+def test_measurements_are_those_of_an_emulated_aero_with_the_cards_encoders(
+    card: CardType, counts: tuple[int, int], voltages: tuple[float, float], periods: int, yaw: int
+) -> None:
+    """To the last bit: encoders, filter and body are the same pieces, also where yaw has turned more than once."""
+    assert QuanserSettings(card_type=card).counts == counts
+    plant, board = plant_on_board(card_type=card)
+    twin = emulated_aero(counts=counts)
+    assert plant.measure() == Measurement(IDENTITY, (0.0, 0.0, 0.0))
+    for _ in range(periods):
+        for each in (plant, twin):
+            drive(each, 1, voltages)
+        assert plant.measure() == twin.measure()
+    assert abs(board.sample([3], [])[0][0]) > yaw
+
+
+@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+def test_counts_are_an_angle_each_with_its_sign(signs: tuple[int, int]) -> None:
+    plant, board = plant_on_board(encoder_signs=signs, pitch_counts=4000, yaw_counts=5000)
+    turn_encoders(board, 160, -512)
+    plant.advance()
+    p, y = signs[0] * 2 * pi * 160 / 4000 / 2, signs[1] * 2 * pi * -512 / 5000 / 2
+    half = cos(y) * cos(p), -sin(y) * sin(p), cos(y) * sin(p), sin(y) * cos(p)  # R_z(yaw) R_y(pitch)
+    assert plant.measure().attitude == pytest.approx(half, abs=1e-15)
+
+
+def test_rates_are_the_filtered_derivative_in_the_body_frame() -> None:
+    plant, board = plant_on_board(bandwidth=30.0, damping_ratio=0.7)
+    of_pitch, of_yaw = (FilteredDerivative(30.0, 0.7, PERIOD) for _ in range(2))
+    of_pitch.update(0.0)
+    of_yaw.update(0.0)
+    for k in range(1, 200):
+        turn_encoders(board, 3 * k, -5 * k)
+        plant.advance()
+        p = 2 * pi / 2880 * 3 * k
+        dp, dy = of_pitch.update(p), of_yaw.update(-2 * pi / 4096 * 5 * k)
+        assert plant.measure().rate == pytest.approx((-sin(p) * dy, dp, cos(p) * dy), abs=1e-12)
+    assert dp > 3.0  # 3 counts a sample are 3.27 rad/s
+
+
+@pytest.mark.parametrize(("axes", "signs", "scale"), [((0, 1, 2), (1, 1, 1), 1.0), ((2, 0, 1), (1, -1, -1), 0.5)])
+def test_a_gyros_rates_need_no_filter_and_its_axes_signs_and_scale_can_be_set(
+    axes: tuple[int, int, int], signs: tuple[int, int, int], scale: float
+) -> None:
+    plant, board = driven_plant(rate="gyro", gyro_axes=axes, gyro_signs=signs, gyro_scale=scale)
+    true = board.truth().rate
+    assert 0.0 not in true
+    assert plant.measure().rate == tuple(sign * scale * true[axis] for axis, sign in zip(axes, signs, strict=True))
+
+
+def test_a_gyros_bias_is_that_of_the_emulated_aero() -> None:
+    settings = AERO.model_copy(update={"sensors": SensorSettings(gyro_bias=(0.1, 0.2, 0.3))})
+    plant, _ = plant_on_board(settings, rate="gyro")
+    plant.advance()
+    assert plant.measure().rate == pytest.approx((0.1, 0.2, 0.3), abs=1e-4)  # it has begun to sink by less
+
+
+def test_the_ideal_aero_on_the_board_has_encoders_all_the_same() -> None:
+    plant, board = plant_on_board(PlantSettings(ideal=True, voltage_limit=18.0))
+    for _ in range(100):
+        drive(plant, 1)
+        seen, true = plant.measure().attitude, board.truth().attitude
+        assert seen == pytest.approx(true, abs=2 * pi / 2880)  # half a count in pitch and in yaw, halved again
+    assert seen != true
+
+
+# Reads that fail
+
+FAILURES = [
+    (lambda board: board.fail_next("task_read"), "task_read was told to fail", False),
+    (lambda board: board.short_next(), "the board's task gave no sample", False),
+    (lambda board: board.fail_next("watchdog_reload"), "watchdog_reload was told to fail", True),
+]
+
+
+@pytest.mark.parametrize(("fail", "words", "reloads"), FAILURES)
+@pytest.mark.parametrize("rate", ["derivative", "gyro"])
+def test_a_failed_read_is_an_invalid_sample_and_no_old_one_and_reloads_no_watchdog(
+    rate: str, fail: Callable[[FakeQuanser], None], words: str, reloads: bool
+) -> None:
+    plant, board = driven_plant(rate=rate)
+    fail(board)
+    calls = Calls(board)
+    drive(plant, 1)
+    assert is_nothing(plant.measure())
+    assert ("watchdog_reload" in calls.names()) == reloads
+    drive(plant, 1)
+    assert not is_nothing(plant.measure())
+    assert plant.failures == 1
+    assert plant.failure == words
+    assert (plant.passed, plant.overrun, plant.expiries) == (1, 0, 0)
+
+
+def test_after_a_failed_read_the_attitude_is_the_joints_and_the_filter_starts_anew() -> None:
+    plant, board = driven_plant()
+    twin = emulated_aero()
+    drive(twin, 100)
+    board.fail_next("task_read", 3)
+    for each in (plant, twin):
+        drive(each, 4)
+    assert plant.measure().attitude == twin.measure().attitude
+    assert twin.measure().rate[2] != 0.0
+    assert plant.measure().rate == (0.0, 0.0, 0.0)  # at rest until the filter has seen more
+
+
+def test_reads_that_fail_take_their_time(clock: HandClock) -> None:
+    """With nothing to wait for, a loop would spin."""
+    plant, board = plant_on_board()
+    plant.advance()
+    plant.advance()
+    assert clock.slept == []  # a good one has waited for its sample
+    board.fail_next("task_read", 3)
+    for work_ns in (500_000, 5_000_000, 0):  # of its owner: within a period, and longer than one
+        plant.advance()
+        clock.ns += work_ns
+    assert clock.slept == pytest.approx([PERIOD, PERIOD - 0.0005], abs=1e-9)
+
+
+# Samples that are not read in time
+
+
+def test_of_samples_that_were_not_read_the_newest_is_measured_and_the_others_count_and_measure_nothing() -> None:
+    plant, board = driven_plant()
+    twin = emulated_aero()
+    drive(twin, 100)
+    board.let_pass(4)  # the first three are lost to the fourth
+    plant.advance()
+    for _ in range(4):
+        twin.advance()
+    assert plant.measure().attitude == twin.measure().attitude
+    assert (plant.passed, plant.overrun) == (4, 3)
+    calls, now = Calls(board), board.time
+    for _ in range(3):  # periods that are over are not waited for
+        plant.advance()
+        assert is_nothing(plant.measure())
+    assert (calls.names(), board.time) == ([], now)
+    plant.advance()
+    assert not is_nothing(plant.measure())
+    assert (board.time, plant.passed, plant.overrun) == (now + 1, 1, 3)
+
+
+def test_for_the_filter_the_newest_sample_lasts_as_long_as_those_that_were_lost() -> None:
+    plant, board = plant_on_board()
+    filtered = FilteredDerivative(50.0, 0.8, PERIOD)
+    filtered.update(0.0)
+    plant.advance()
+    filtered.update(0.0)
+    turn_encoders(board, 0, 40)
+    board.let_pass(4)
+    plant.advance()
+    for _ in range(4):
+        rate = filtered.update(2 * pi / 4096 * 40)
+    assert plant.measure().rate == (0.0, 0.0, rate)
+    assert rate > 0.5
+
+
+def test_a_failed_read_counts_as_a_period_once() -> None:
+    plant, board = driven_plant()
+    for _ in range(5):
+        board.fail_next("task_read")
+        plant.advance()
+        assert plant.passed == 1
+    plant.advance()
+    assert (plant.passed, plant.overrun) == (1, 0)
+    board.let_pass(3)
+    plant.advance()
+    assert (plant.passed, plant.overrun) == (3, 2)
+
+
+def test_a_board_that_does_not_count_overflows_is_taken_to_be_in_time() -> None:
+    plant, board = plant_on_board()
+    board.counts_overflows = False
+    drive(plant, 10)
+    board.let_pass(4)
+    plant.advance()
+    assert not is_nothing(plant.measure())
+    assert (plant.passed, plant.overrun, plant.failures) == (1, 0, 0)
+
+
+# A board that samples by the clock
+
+
+def test_the_clocks_board_paces_its_reader_on_an_absolute_grid(clock: HandClock) -> None:
+    plant, board = plant_on_board(realtime=True)
+    began = clock.ns
+    for k in range(1, 20):
+        plant.actuate((0.0, 0.0))
+        plant.advance()
+        assert clock.ns == began + k * PERIOD_NS
+        assert (plant.passed, board.time) == (1, k)
+        clock.ns += 100_000 * (k % 7)  # the owner's work, of less than a period
+    assert plant.overrun == 0
+
+
+def test_the_clocks_board_goes_on_while_its_reader_is_late(clock: HandClock) -> None:
+    plant, board = plant_on_board(realtime=True)
+    plant.advance()
+    slept = len(clock.slept)
+    clock.ns += 25 * PERIOD_NS + PERIOD_NS // 2
+    plant.advance()
+    assert (plant.passed, plant.overrun, board.time) == (25, 24, 26)
+    assert not is_nothing(plant.measure())
+    assert len(clock.slept) == slept  # the newest sample was there
+    for _ in range(25):
+        plant.advance()
+    assert clock.slept[-1] == PERIOD / 2  # and the next is due where it always was
+    assert (plant.passed, plant.overrun) == (1, 24)
+
+
+def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: HandClock) -> None:
+    """They return at once, and samples go on coming: those are not counted twice."""
+    plant, board = plant_on_board(realtime=True)
+    began = clock.ns
+    plant.advance()
+    board.fail_next("task_read", 10)
+    for k in range(2, 12):
+        plant.advance()
+        assert (clock.ns, plant.passed) == (began + k * PERIOD_NS, 1)
+    plant.advance()  # finds the sample of the last failed read, at once: the one period that is counted twice
+    assert (clock.ns, plant.passed, board.time) == (began + 11 * PERIOD_NS, 1, 11)
+    plant.advance()
+    assert (clock.ns, plant.passed, board.time) == (began + 12 * PERIOD_NS, 1, 12)
+    assert (plant.failures, plant.overrun) == (10, 0)

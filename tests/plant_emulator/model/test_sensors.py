@@ -1,0 +1,182 @@
+"""Sensors: encoders in whole counts, the filtered derivative, the gyro's noise and bias; against closed solutions.
+
+Random numbers are seeded; a tolerance is five standard deviations of the estimate.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, exp, inf, pi, sin, sqrt
+
+import numpy as np
+import pytest
+
+from aeroloop.plant_emulator.model.sensors import FilteredDerivative, Sensors, SensorSettings
+from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
+from tests.support import numpy_twin as twin
+
+PERIOD = 0.002
+OMEGA_N, ZETA = 50.0, 0.8
+
+
+def _step_response(t: float) -> float:
+    """Of ωn² s/(s² + 2ζωn s + ωn²) to a unit step [1/s]."""
+    ringing = OMEGA_N * sqrt(1 - ZETA**2)
+    return OMEGA_N**2 / ringing * exp(-ZETA * OMEGA_N * t) * sin(ringing * t)
+
+
+@pytest.mark.parametrize("period", [0.002, 0.05])
+def test_the_derivative_of_held_samples_is_the_sum_of_their_steps(period: float) -> None:
+    """Exact whatever the period, by superposition: so is that of one step, of a ramp and of a constant."""
+    rng = np.random.default_rng(2)
+    angles = np.cumsum(rng.normal(size=60))
+    f = FilteredDerivative(OMEGA_N, ZETA, period)
+    rates = [f.update(float(angle)) for angle in angles]
+    for k in range(60):
+        expected = sum((angles[j] - angles[j - 1]) * _step_response((k - j + 1) * period) for j in range(1, k + 1))
+        assert rates[k] == pytest.approx(expected, abs=1e-11)  # rounding of 60 steps of some 20 rad/s
+
+
+def test_the_derivative_of_a_constant_is_zero_from_the_first_sample() -> None:
+    f = FilteredDerivative(OMEGA_N, ZETA, PERIOD)
+    assert [f.update(-2.5) for _ in range(100)] == [0.0] * 100
+    f.update(3.0)
+    for _ in range(1000):
+        rate = f.update(3.0)
+    # ζ ωn t = 80, e⁻⁸⁰ of some 100 rad/s; what stays is too slow to move an angle of 3 rad by its rounding in a period
+    assert abs(rate) * PERIOD < np.spacing(3.0)
+
+
+FINE = (2**22, 2**22)
+"""Counts so fine, 1.5e-6 rad, that what is seen is what is."""
+
+
+def _sensors(period: float = PERIOD, **changed: object) -> Sensors:
+    return Sensors(SensorSettings.model_validate(changed), period)
+
+
+def _angles(q: Quaternion) -> tuple[float, float]:
+    """[pitch, yaw] of R_z(yaw) R_y(pitch), both within ±π."""
+    w, _, y, z = q
+    return 2 * atan2(y, w), 2 * atan2(z, w)
+
+
+AT_REST: Vector = (0.0, 0.0, 0.0)
+
+
+def test_encoders_read_whole_counts_within_one_count_of_the_truth() -> None:
+    sensors = _sensors(rate="perfect", counts=(2048, 4096))
+    steps = np.array([2 * pi / 2048, 2 * pi / 4096])
+    rng = np.random.default_rng(4)
+    errors = []
+    for _ in range(2000):
+        true = rng.uniform(-3.0, 3.0, 2)
+        counts = np.array(_angles(sensors.read(IDENTITY, AT_REST, true.tolist()).attitude)) / steps
+        assert np.abs(counts - np.round(counts)).max() < 1e-9  # rounding of 1e-16 rad, a thousandth of a rad a count
+        errors.append(counts - true / steps)
+    spread = np.ptp(errors, axis=0)
+    assert (np.abs(errors) < 1 + 1e-9).all()
+    # One count wide and no more; that the outer 2 % are missed by 2000 samples has a chance of e⁻⁴⁰ or so.
+    assert (spread < 1 + 1e-9).all()
+    assert (spread > 0.98).all()
+
+
+def _zero(axis: int, seed: int) -> float:
+    """Where within a count an encoder is zeroed: how much of the count from 0 on it already reads as 1."""
+    sensors = _sensors(rate="perfect", seed=seed, counts=(1000, 1000))
+    step = 2 * pi / 1000
+    read = 0
+    for k in range(64):
+        angles = [0.0, 0.0]
+        angles[axis] = (k + 0.5) / 64 * step
+        read += _angles(sensors.read(IDENTITY, AT_REST, angles).attitude)[axis] > step / 2
+    return read / 64
+
+
+def test_the_seed_shifts_the_zero_anywhere_within_a_count() -> None:
+    zeros = np.array([[_zero(axis, seed) for axis in (0, 1)] for seed in range(100)])
+    assert _zero(0, 7) == zeros[7, 0]  # and always to the same place
+    # An even spread over 0…1 has the mean ½, the deviation 1/√12 and the kurtosis 1.8: of n seeds the mean is known to
+    # 1/√(12 n), the deviation to ½ √(0.8/n) of itself, a correlation to 1/√n. A 64th is as fine as `_zero` looks.
+    assert zeros.mean(axis=0) == pytest.approx([0.5, 0.5], abs=5 / sqrt(1200))
+    assert zeros.std(axis=0) * sqrt(12) == pytest.approx([1, 1], rel=5 * 0.5 * sqrt(0.8 / 100))
+    assert abs(np.corrcoef(zeros.T)[0, 1]) < 5 / sqrt(100)
+
+
+def test_an_encoder_at_zero_reads_zero_whatever_the_seed() -> None:
+    for seed in range(20):
+        assert _sensors(seed=seed).read(IDENTITY, AT_REST, [0.0, 0.0]) == Measurement(IDENTITY, AT_REST)
+
+
+def test_the_attitude_of_encoders_is_yaw_then_pitch() -> None:
+    """R_z(yaw) R_y(pitch), multiplied out as matrices."""
+    sensors = _sensors(rate="perfect", counts=FINE)
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        p, y = rng.uniform(-7.0, 7.0, 2)  # more than a turn
+        yawed = np.array([[cos(y), -sin(y), 0], [sin(y), cos(y), 0], [0, 0, 1]])
+        pitched = np.array([[cos(p), 0, sin(p)], [0, 1, 0], [-sin(p), 0, cos(p)]])
+        q = sensors.read(IDENTITY, AT_REST, [p, y]).attitude
+        assert np.abs(twin.rotation(np.array(q)) - yawed @ pitched).max() < 2 * 2 * pi / FINE[0]  # a count of each
+
+
+def test_the_rate_of_encoders_is_that_of_the_joints_in_the_body_frame() -> None:
+    """ω = [−sin p ẏ, ṗ, cos p ẏ] while both joints turn steadily."""
+    sensors = _sensors(counts=FINE)
+    dp, dy = 0.4, -0.9
+    for k in range(500):  # ζ ωn t = 40
+        p = dp * k * PERIOD
+        _, rate = sensors.read(IDENTITY, AT_REST, [p, dy * k * PERIOD])
+    # The ripple of a held ramp, (ωn T)²/12 and a tenth for the next order. Counts of l shake it by less than ωn l.
+    assert rate == pytest.approx([-sin(p) * dy, dp, cos(p) * dy], abs=0.9 * (50 * PERIOD) ** 2 / 12 * 1.1 + 50 * 1.5e-6)
+
+
+def test_the_derivative_is_of_the_angles_as_counted() -> None:
+    """At rest but for less than a count there is no rate; a count is a step, and its rate the step's response."""
+    step = 2 * pi / 2048
+    sensors = _sensors(counts=(2048, 4096), seed=1)
+    assert all(sensors.read(IDENTITY, AT_REST, [0.0, 0.0]).rate == AT_REST for _ in range(10))
+    for n in range(1, 50):
+        _, rate = sensors.read(IDENTITY, AT_REST, [step, 0.0])
+        assert rate[1] == pytest.approx(step * _step_response(n * PERIOD), abs=1e-14)  # rounding, of 0.06 rad/s
+
+
+def test_a_gyro_adds_its_noise_and_bias_to_the_true_rate() -> None:
+    noise, bias, n = 0.03, (0.1, -0.2, 0.05), 20_000
+    sensors = _sensors(attitude="perfect", rate="gyro", gyro_noise=noise, gyro_bias=bias)
+    rng = np.random.default_rng(6)
+    true = rng.normal(size=(n, 3))
+    errors = np.array([sensors.read(IDENTITY, (x, y, z), []).rate for x, y, z in true.tolist()]) - true
+    # independent samples: the mean is known to σ/√n, the deviation to σ/√(2n), a correlation to 1/√n
+    assert errors.mean(axis=0) == pytest.approx(bias, abs=5 * noise / sqrt(n))
+    assert errors.std(axis=0) == pytest.approx([noise] * 3, abs=5 * noise / sqrt(2 * n))
+    white = (errors - errors.mean(axis=0)) / noise
+    assert np.abs((white[1:] * white[:-1]).mean(axis=0)).max() < 5 / sqrt(n)
+    assert np.abs(np.corrcoef(white.T) - np.identity(3)).max() < 5 / sqrt(n)
+    assert np.abs((white * true).mean(axis=0)).max() < 5 / sqrt(n)
+
+
+def test_a_gyro_repeats_with_its_seed_and_only_with_it() -> None:
+    def rates(seed: int) -> list[Vector]:
+        sensors = _sensors(attitude="perfect", rate="gyro", gyro_noise=0.1, seed=seed)
+        return [sensors.read(IDENTITY, AT_REST, []).rate for _ in range(5000)]  # more than one draw
+
+    assert rates(1) == rates(1)
+    assert all(one != other for one, other in zip(rates(1), rates(2), strict=True))
+
+
+def test_perfect_sensors_and_a_gyro_without_noise_and_bias_pass_everything_through() -> None:
+    attitude, rate = (0.6, 0.0, 0.8, 0.0), (0.1, 0.2, 0.3)
+    angles = [0.1, 0.2]  # which say something else
+    for kind in ("perfect", "gyro"):
+        assert _sensors(attitude="perfect", rate=kind).read(attitude, rate, angles) == (attitude, rate)
+    assert _sensors(attitude="perfect", rate="derivative").read(attitude, rate, angles) == (attitude, AT_REST)
+    mixed = _sensors(attitude="encoders", rate="perfect").read(attitude, rate, angles)
+    assert mixed.rate == rate
+    assert mixed.attitude != attitude
+
+
+def test_sensors_of_a_state_that_has_left_the_numbers_have_no_valid_value() -> None:
+    sensors = Sensors(SensorSettings(), PERIOD)
+    attitude, rate = sensors.read((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, inf), (0.0, inf))
+    assert all(value != value for value in (*attitude, *rate))

@@ -1,0 +1,141 @@
+"""What both ends of a CAN bus must agree on: heartbeats bit by bit, widths that fit a frame, the fingerprint."""
+
+from __future__ import annotations
+
+import json
+import re
+from hashlib import sha256
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_format import CanError, CanSettings, Heartbeat, check_widths, fingerprint
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
+from aeroloop.protocol.wire.spec import WireSpec
+from tests.support.can_in_process import PAPER, wire_of
+
+PERIOD_NS = 2_000_000
+MARK = b"\1\2\3\4\5\6\7"
+
+
+@settings(max_examples=40)
+@given(state=st.sampled_from(PlantState), number=st.integers(0, 15), mark=st.binary(min_size=7, max_size=7))
+def test_a_heartbeat_has_eight_bytes_as_specified_and_is_read_as_it_was_written(
+    state: PlantState, number: int, mark: bytes
+) -> None:
+    packed = Heartbeat(state, number, mark).pack()
+    states = [PlantState.IDLE, PlantState.GRANTED, PlantState.DRIVEN, PlantState.TRIPPED]
+    assert packed == bytes([number << 4 | states.index(state)]) + mark
+    assert Heartbeat.unpack(packed, 5) == Heartbeat(state, number, mark, 5)
+
+
+def test_causes_are_numbered_as_in_the_specification() -> None:
+    causes = [
+        "no command in time",
+        "invalid command",
+        "attitude or rate envelope",
+        "voltage saturation",
+        "no valid measurement",
+        "operator's stop",
+        "controller gone",
+        "no answer in lockstep",
+        "bus lost",
+        "node lost",
+        "another plant of this name",
+    ]
+    assert [TripCause(cause).number for cause in causes] == list(range(1, 12))
+    said = [Heartbeat(PlantState.TRIPPED, number, MARK).cause for number in range(16)]
+    assert said == [None, *causes, None, None, None, None]
+
+
+WIDTHS = st.one_of(st.none(), st.integers(MIN_BITS, MAX_BITS))
+ADVICE = re.compile(
+    r"a (?P<frame>\w+) frame has (?P<size>\d+) bytes, and a classic CAN frame holds 8: set can\.fd = true, "
+    r"or wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
+    r"(?P<shorter>, or wire\.counter_bits = 4 with can\.short_counter = true)?$"
+)
+
+
+def _refusal(spec: WireSpec, *, fd: bool) -> str | None:
+    try:
+        check_widths(CanSettings(fd=fd), spec)
+    except CanError as error:
+        return str(error)
+    return None
+
+
+def _size(frame: str, bits: dict[str, int | None], actuators: int, counter_bits: int) -> int:
+    size: int = getattr(wire_of(**bits, actuators=actuators, counter_bits=counter_bits), frame).size
+    return size
+
+
+@settings(max_examples=60)
+@given(
+    attitude=WIDTHS, rate=WIDTHS, voltage=WIDTHS, actuators=st.sampled_from([2, 3]), counted=st.sampled_from([4, 8, 16])
+)
+def test_a_spec_that_does_not_fit_is_refused_with_the_widths_that_would(
+    attitude: int | None, rate: int | None, voltage: int | None, actuators: int, counted: int
+) -> None:
+    bits = {"attitude": attitude, "rate": rate, "voltage": voltage}
+    assert _refusal(wire_of(**bits, actuators=actuators, counter_bits=counted), fd=True) is None
+    while (said := _refusal(wire_of(**bits, actuators=actuators, counter_bits=counted), fd=False)) is not None:
+        advice = ADVICE.match(said)
+        assert advice is not None, said
+        frame, size, widest = advice["frame"], int(advice["size"]), int(advice["widest"])
+        assert _size(frame, bits, actuators, counted) == size > 8
+        assert (advice["shorter"] is not None) == (_size(frame, bits, actuators, 4) <= 8)
+        signals = [name for name in (advice["first"], advice["second"]) if name is not None]
+        bits |= dict.fromkeys(signals, widest)
+        assert _size(frame, bits, actuators, counted) <= 8
+        if widest < MAX_BITS:
+            assert _size(frame, {**bits, **dict.fromkeys(signals, widest + 1)}, actuators, counted) > 8
+    assert all(_size(frame, bits, actuators, counted) <= 8 for frame in ("measurement", "command"))
+
+
+def test_the_fingerprint_is_the_one_of_the_specification() -> None:
+    """Seven bytes of SHA-256 over this very text; another implementation must come to the same."""
+    text = (
+        '{"lockstep": false, "period_ns": 2000000, "wire": {"actuators": 2, '
+        '"attitude": {"bits": 8, "deadzone": null, "limit": 1.0}, "counter_bits": 8, '
+        '"rate": {"bits": 8, "deadzone": null, "limit": 1.0}, '
+        '"voltage": {"bits": 6, "deadzone": null, "limit": 24.0}}}'
+    )
+    ours = fingerprint(PAPER, PERIOD_NS, lockstep=False)
+    assert ours == sha256(text.encode()).digest()[:7]
+    assert ours.hex() == "094b8ce4a32f59"
+
+
+def test_the_fingerprint_differs_if_anything_does_that_both_ends_must_agree_on() -> None:
+    others = {"bits": 9, "limit": 2.5, "deadzone": 0.125}
+    kinds: dict[str, object] = {
+        "kind": "logarithmic-uniform",
+        "hysteresis": {"kind": "hysteresis-uniform", "hysteresis": 0.125},
+        "threshold": {"kind": "logarithmic-uniform", "threshold": 0.125},
+    }
+    changes: dict[str, object] = {
+        f"{signal}.{field}": other
+        for signal in ("attitude", "rate", "voltage")
+        for field, other in (others | kinds).items()
+    }
+    changes |= {"actuators": 3, "counter_bits": 10}
+    changes |= {"transmit.measurement": "on_change", "transmit.command": "on_change", "transmit.heartbeat_s": 0.02}
+    plain = PAPER.model_dump()
+    leaves = {
+        f"{name}.{field}" if isinstance(value, dict) else name
+        for name, value in plain.items()
+        for field in (value if isinstance(value, dict) else [""])
+    }
+    assert set(changes) == leaves, "a field of the wire is not tried here"
+    seen = {fingerprint(PAPER, PERIOD_NS, lockstep=False), fingerprint(PAPER, PERIOD_NS, lockstep=True)}
+    seen.add(fingerprint(PAPER, PERIOD_NS + 1, lockstep=False))
+    for path, value in changes.items():
+        other = json.loads(json.dumps(plain))
+        *sections, field = path.split(".")
+        (other[sections[0]] if sections else other).update(value if isinstance(value, dict) else {field: value})
+        seen.add(fingerprint(WireSpec.model_validate(other), PERIOD_NS, lockstep=False))
+    seen.add(fingerprint(PAPER.with_bits(None, 6), PERIOD_NS, lockstep=False))
+    assert len(seen) == 3 + len(changes) + 1
+    assert fingerprint(PAPER.with_bits(8, 6), PERIOD_NS, lockstep=False) == fingerprint(
+        PAPER, PERIOD_NS, lockstep=False
+    )

@@ -1,0 +1,70 @@
+"""Address of a vehicle: an operator's command starts light, and stops a plant whatever else is misconfigured."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import Settings
+from aeroloop.service.config_sources import ConfigError
+from aeroloop.service.host import operator
+from aeroloop.service.vehicle_address import UNREAD, VehicleAddress, load_vehicle_address
+
+
+def test_every_other_section_is_left_unread() -> None:
+    assert set(UNREAD) == set(Settings.model_fields) - set(VehicleAddress.model_fields)
+
+
+def test_a_mistake_elsewhere_does_not_keep_an_operator_from_a_vehicle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "config.toml"
+    file.write_text('vehicle = "beta"\n[loop]\nrate_hz = -1\n[wire]\nvolts = 3\n')
+    monkeypatch.setenv("AEROLOOP_LAW__NONE", "1")
+    monkeypatch.setenv("AEROLOOP_NETWORK__PORTS", "3")
+    found = load_vehicle_address(file, ["network.lease_ms=200", "plant.vai=can"])
+    assert (found.vehicle, found.network.ports, found.network.lease_ms) == ("beta", 3, 200)
+
+
+@pytest.mark.parametrize(
+    "given", ["netwrok.ports=3", "network.prots=3", "vehicle=a/b", "network.ports=0", "lop=1", "x.y=1"]
+)
+def test_a_wrong_vehicle_network_or_name_of_a_section_is_refused(given: str) -> None:
+    with pytest.raises(ConfigError, match=given.partition("=")[0].partition(".")[0]):
+        load_vehicle_address(None, [given])
+
+
+@pytest.mark.parametrize("variable", ["AEROLOOP_NETWORK__PROTS", "AEROLOOP_LOP__RATE_HZ"])
+def test_a_wrong_variable_is_refused(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(variable, "1")
+    with pytest.raises(ConfigError, match=f"^{variable} in the environment is no setting"):
+        load_vehicle_address()
+
+
+def test_every_plant_is_stopped_unless_a_vehicle_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[str | None] = []
+
+    def stop(_: object, vehicle: str | None) -> operator.Stopped:
+        stopped.append(vehicle)
+        return operator.Stopped(["at 0 V"], [])
+
+    monkeypatch.setattr(operator, "stop", stop)
+    for words in ((), ("--set", "vehicle=aero"), ("--set", "vehicle=aero", "--all")):
+        assert execute(["op", "stop", *words]) == 0
+    assert stopped == [None, "aero", None]
+
+
+def test_an_operators_command_imports_no_mathematics_and_no_plant() -> None:
+    program = (
+        "import sys\n"
+        "from aeroloop.service.cli.main import execute\n"
+        "assert execute(['op', 'stop', '--set', 'network.rendezvous=[]']) == 1\n"
+        "print(*(name for name in sys.modules if name in ('casadi', 'numpy', 'rich') or 'plant_emulator' in name\n"
+        "        or name == 'aeroloop.service.config'))"
+    )
+    found = subprocess.run([sys.executable, "-P", "-c", program], check=True, capture_output=True, text=True)
+    assert found.stdout.split() == []

@@ -1,0 +1,77 @@
+"""A plant that counts its periods as its sensors' truth, behind faults of signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, isnan, sin
+
+from aeroloop.plant_emulator.faults.language import Fault
+from aeroloop.plant_emulator.faults.signals import FaultyPlant
+from aeroloop.plant_emulator.plant import Measurement, Plant
+
+PERIOD = 0.1
+LIMIT = 24.0
+
+
+def sample(k: int) -> Measurement:
+    """What is true after k periods: no two are alike, in no component."""
+    return Measurement((cos(0.01 * k), 0.0, 0.0, sin(0.01 * k)), (1.0 * k, 10.0 * k, 100.0 * k))
+
+
+class Stand(Plant):
+    """Remembers the voltages of each period."""
+
+    def __init__(self, actuators: int = 2) -> None:
+        self.actuators = actuators
+        self.k = 0
+        self.voltages: tuple[float, ...] = (0.0,) * actuators
+        self.periods: list[tuple[float, ...]] = []
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        self.voltages = tuple(voltages)
+
+    def advance(self) -> None:
+        self.k += 1
+        self.periods.append(self.voltages)
+
+    def measure(self) -> Measurement:
+        return sample(self.k)
+
+    def close(self) -> None:
+        self.voltages = (0.0,) * self.actuators
+
+
+def faulty(
+    *faults: str | Fault, seed: int = 0, actuators: int = 2, started: bool = True, period: float = PERIOD
+) -> tuple[FaultyPlant, Stand]:
+    """A plant with these faults, and what is behind them."""
+    stand = Stand(actuators)
+    parsed = [Fault.parse(fault) if isinstance(fault, str) else fault for fault in faults]
+    plant = FaultyPlant(stand, parsed, period, voltage_limit=LIMIT, seed=seed)
+    if started:
+        plant.start()
+    return plant, stand
+
+
+def sensed(*faults: str, ticks: int = 8, seed: int = 0) -> list[Measurement]:
+    """What is measured at 0 s, 0.1 s, 0.2 s and so on."""
+    plant, _ = faulty(*faults, seed=seed)
+    seen = [plant.measure()]
+    for _ in range(ticks):
+        plant.advance()
+        seen.append(plant.measure())
+    return seen
+
+
+def driven(*faults: str, ticks: int = 8, seed: int = 0) -> list[tuple[float, ...]]:
+    """What the motors have in the periods that begin at 0, 0.1, 0.2, …, commanded (k, −k)."""
+    plant, stand = faulty(*faults, seed=seed)
+    for k in range(ticks):
+        plant.actuate((float(k), float(-k)))
+        plant.advance()
+    return stand.periods
+
+
+def missing(values: Sequence[float]) -> bool:
+    """Whether there is no valid value."""
+    return all(isnan(value) for value in values)

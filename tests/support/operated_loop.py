@@ -1,0 +1,251 @@
+"""A controller's loop with operator changes, without network and clock.
+
+A real Role on a double of the network: outgoing messages are kept as bytes, incoming ones are fed through the declared
+callbacks. Time stands still unless the test moves it (fixture `time` of tests/service/daemon).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import atan2, degrees, radians, sin
+from types import SimpleNamespace
+from typing import Any, TypeVar
+
+import pytest
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event, SessionRecord
+from aeroloop.protocol.messages.operator import Answer, Change, Gains, Hold, Message, Reference, Setpoint, Sinusoid
+from aeroloop.protocol.messages.trace import TraceWriter
+from aeroloop.protocol.runtime import role, throttle
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.config import Settings
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.law import LawSettings
+from aeroloop.service.daemon import operator_changes
+from aeroloop.service.daemon.certificate_gate import CertificateGate
+from aeroloop.service.daemon.operator_changes import OperatorChanges
+from aeroloop.service.settings import ControllerSettings
+
+PERIOD = 0.002
+LAW = LawSettings()
+LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
+SWING = Sinusoid(amplitude=(0.0, 5.0, 20.0), frequency=(0.0, 0.5, 0.4))
+CONFIGURED = ControllerSettings(after_restart="configured")
+"""Which session begins with what: test_session_start.py."""
+WIRE = WireSpec(
+    attitude=SignalSpec(bits=None, limit=1.0),
+    rate=SignalSpec(bits=None, limit=5.0),
+    voltage=SignalSpec(bits=None, limit=1e9),
+)
+"""Unquantized and hardly limited: a command says the last bit of what the law computes."""
+AT_REST = [0.0] * 6
+M = TypeVar("M", bound=Message)
+
+
+def measured(k: int, codes: list[float] | None = None) -> bytes:
+    """The measurement of tick k: at rest and level unless given."""
+    return WIRE.measurement.pack(k % WIRE.measurement.counters, codes or AT_REST)
+
+
+def turned(yaw: float) -> list[float]:
+    """The codes of a body at rest that has yawed [deg]."""
+    attitude, rate = WIRE.attitude.quantizer(), WIRE.rate.quantizer()
+    return [*(attitude.encode(x) for x in (0.0, 0.0, sin(radians(yaw) / 2))), *(rate.encode(0.0) for _ in range(3))]
+
+
+def _bytes(payload: bytes) -> SimpleNamespace:
+    return SimpleNamespace(to_bytes=lambda: payload)  # as Zenoh hands them over
+
+
+class Query:
+    """What a queryable is called with; keeps what it is answered."""
+
+    def __init__(self, key: str, payload: bytes) -> None:
+        self.key_expr, self.payload = key, _bytes(payload)
+        self.answers: list[Answer] = []
+
+    def reply(self, key: str, payload: bytes) -> None:
+        assert key == self.key_expr
+        self.answers.append(Answer.model_validate_json(payload))
+
+    def drop(self) -> None:
+        """No further answer will come."""
+
+
+class Network:
+    """A Zenoh session without any other: it keeps what is declared and what is put."""
+
+    def __init__(self) -> None:
+        self.put: list[tuple[str, bytes]] = []
+        self.queryables: dict[str, Callable[[Any], None]] = {}
+        self.subscribers: dict[str, Callable[[Any], None]] = {}
+
+    def declare_queryable(self, key: str, callback: Callable[[Any], None], *, complete: bool) -> None:
+        assert complete
+        self.queryables[key] = callback
+
+    def declare_subscriber(self, key: str, callback: Callable[[Any], None]) -> None:
+        self.subscribers[key] = callback
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+class LonelyRole(Role):
+    """A role whose publications stay on the network of the test."""
+
+    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
+        del per_s, lossless
+        network: Any = self.zenoh
+        key = topics.key(topic, self.vehicle, role=self.role)
+        publisher: Any = SimpleNamespace(id=None, put=lambda payload: network.put.append((key, payload)))
+        self._publishers[topic] = publisher
+
+
+class FakeTime:
+    """A clock that moves only when set."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        for module in (throttle, role, operator_changes):
+            patch.setattr(module, "time", self)
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+class Loop:
+    """What the daemon does around OperatorChanges, with a log of what a recorder would have kept.
+
+    Attributes:
+        k: The next tick.
+        session: Name of the session, or "".
+        log: Of each session, its frames: (tick, measurement, command).
+        gate: Its certificates; OperatorChanges needs them if a certified configuration is given.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        settings: ControllerSettings = CONFIGURED,
+        *,
+        rolls: bool = False,
+        certified: Settings | None = None,
+    ) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            self.network = Network()
+            patch.setattr(role, "join", lambda _: self.network)
+            self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
+        self.configured = reference
+        self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), reference)
+        self.trace = TraceWriter("controller", WIRE, 1, 10**8)
+        self.live = OperatorChanges(
+            self.role, LAW, reference, settings, self.trace, self.gate if certified else None, rolls=rolls
+        )
+        self.live.serve()
+        self.controller = self.fresh()
+        self.k, self.session = 0, ""
+        self.log: dict[str, list[tuple[int, bytes, bytes | None]]] = {}
+
+    def fresh(self, reference: Reference | None = None) -> Controller:
+        """A controller as the configuration makes it, or with another reference."""
+        return Controller(WIRE, LAW, reference or self.configured, PERIOD)
+
+    # The loop
+
+    def begin(self, last: SessionRecord | None = None) -> None:
+        """A session is granted, with the plant's record of the one before."""
+        self.session = f"s{len(self.log)}"
+        self.log[self.session] = []
+        self.controller, self.k = self.fresh(), 0
+        self.live.begin(self.controller, self.session, last)
+
+    def end(self) -> None:
+        self.live.end()
+        self.session = ""
+
+    def tick(self, codes: list[float] | None = None) -> bytes | None:
+        """A measurement comes, at rest and level unless given, and is answered."""
+        frame = measured(self.k, codes)
+        self.live.before_tick(self.k, frame)
+        command = self.controller.tick(frame, self.k)
+        self.log[self.session].append((self.k, frame, command))
+        self.k += 1
+        return command
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / PERIOD)):
+            self.tick()
+
+    def malformed(self) -> None:
+        """Something comes that is no measurement; the daemon counts it as the one that was due."""
+        self.live.before_tick(self.k, b"junk")
+        assert self.controller.tick(b"junk", self.k) is None
+
+    # The operator
+
+    def ask(self, topic: str, message: Message | bytes) -> Query:
+        """Put a question; it is answered between two ticks."""
+        key = topics.key(topic, "aero")
+        query = Query(key, message if isinstance(message, bytes) else message.encode())
+        self.network.queryables[key](query)
+        return query
+
+    def answered(self, topic: str, message: Message | bytes) -> Answer:
+        """The answer to a question, by the next tick."""
+        query = self.ask(topic, message)
+        self.tick()
+        (answer,) = query.answers
+        return answer
+
+    def stream(self, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> None:
+        """A set-point comes [deg]."""
+        self.raw(Setpoint(attitude=(roll, pitch, yaw)).encode())
+
+    def raw(self, payload: bytes) -> None:
+        """Bytes come where set-points should."""
+        self.network.subscribers[topics.key("reference", "aero")](SimpleNamespace(payload=_bytes(payload)))
+
+    def read_again(self, law: LawSettings, reference: Reference) -> None:
+        """A configuration is read again, as reload.py's SIGHUP does."""
+        self.role.enqueue(lambda: self.live.adopt(law, reference))
+
+    # What was published
+
+    def published(self, topic: str, model: type[M]) -> list[M]:
+        """Every message on a topic."""
+        key = topics.key(topic, "aero", role="controller")
+        return [model.model_validate_json(payload) for at, payload in self.network.put if at == key]
+
+    def changes(self) -> list[Change]:
+        """Every change of this session, as a log has it."""
+        return [change for change in self.trace.changes if change.session == self.session]
+
+    def events(self, kind: str) -> list[str]:
+        """The texts of a kind that were published."""
+        return [event.text for event in self.published("event", Event) if event.kind == kind]
+
+    def yaw(self) -> float:
+        """Of q_d at the last tick, level [deg]."""
+        w, x, y, z = self.controller.desired
+        assert (x, y) == (0.0, 0.0)
+        return degrees(2 * atan2(z, w))
+
+    def assert_it_runs_again(self) -> None:
+        """From the configuration, the frames and the changes, as the review does: byte for byte."""
+        for session, ticks in self.log.items():
+            again = self.fresh()
+            logged = [change.encode() for change in self.trace.changes if change.session == session]
+            changes = [Change.model_validate_json(text) for text in logged]
+            for k, frame, command in ticks:
+                while changes and changes[0].tick <= k:
+                    again.apply(changes.pop(0))
+                assert again.tick(frame, k) == command, f"{session}, tick {k}"
+
+
+def gains_with(**changed: tuple[float, float, float]) -> Gains:
+    """The configured gains with these changed."""
+    return Gains.model_validate({"C1": LAW.C1, "C2": LAW.C2, "Gamma": LAW.Gamma, **changed})

@@ -1,0 +1,94 @@
+"""The plant on Quanser's fake board, with an emulated Aero behind it, as several tests drive it.
+
+The fake refuses every call that a board would refuse, so every test also checks types, channels and order. Its time is
+a count of samples of 2 ms: the board's watchdog of 0.1 s expires after 50 of them.
+"""
+
+from __future__ import annotations
+
+from math import isnan
+from typing import Any
+
+from aeroloop.plant_emulator.hosts.quanser.fake import FakeQuanser
+from aeroloop.plant_emulator.hosts.quanser.usb import QuanserPlant
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant
+from aeroloop.plant_emulator.model.sensors import SensorSettings
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.quanser_settings import QuanserSettings
+from aeroloop.plant_emulator.settings import PlantSettings
+
+PERIOD = 0.002
+WATCHDOG = 50
+"""Samples in 0.1 s."""
+AERO = PlantSettings(voltage_limit=18.0)
+OFF = (0.0, 0.0)
+VOLTS = (9.0, -12.0)
+
+
+def plant_on_board(
+    settings: PlantSettings = AERO, *, realtime: bool = False, **changed: Any
+) -> tuple[QuanserPlant, FakeQuanser]:
+    """A plant that was just opened, and its board; `changed` are fields of QuanserSettings."""
+    quanser = QuanserSettings(**changed)
+    board = FakeQuanser(settings, PERIOD, card_type=quanser.card_type, realtime=realtime)
+    return QuanserPlant(quanser, PERIOD, hardware=board), board
+
+
+def drive(plant: Plant, periods: int, voltages: tuple[float, float] = VOLTS) -> None:
+    """Command the voltages in each of these periods."""
+    for _ in range(periods):
+        plant.actuate(voltages)
+        plant.advance()
+
+
+def driven_plant(**changed: Any) -> tuple[QuanserPlant, FakeQuanser]:
+    """A plant that has been driven for long enough to be in motion."""
+    plant, board = plant_on_board(**changed)
+    drive(plant, 100)
+    return plant, board
+
+
+def expired_plant() -> tuple[QuanserPlant, FakeQuanser]:
+    """A plant whose board's watchdog expired while it was driven, and that has noticed; no periods are owed."""
+    plant, board = driven_plant()
+    board.let_pass(WATCHDOG + 1)
+    for _ in range(WATCHDOG + 1):
+        plant.advance()
+    assert (plant.expiries, board.expired) == (1, True)
+    return plant, board
+
+
+def emulated_aero(settings: PlantSettings = AERO, counts: tuple[int, int] = (2880, 4096)) -> EmulatedPlant:
+    """The same Aero without a board: an Aero 2's encoders unless given."""
+    return settings.model_copy(update={"sensors": SensorSettings(counts=counts)}).build(PERIOD)
+
+
+def is_nothing(seen: Measurement) -> bool:
+    """Whether a measurement has no value at all."""
+    return all(isnan(value) for value in (*seen.attitude, *seen.rate))
+
+
+class Calls:
+    """Names of the calls to a board since this was made."""
+
+    def __init__(self, board: FakeQuanser) -> None:
+        self._board, self._before = board, len(board.calls)
+
+    def names(self) -> list[str]:
+        """The names, in order."""
+        return list(self._board.calls)[self._before :]
+
+
+class HandClock:
+    """Takes the place of the module `time`; sleeping takes no time but its own."""
+
+    def __init__(self) -> None:
+        self.ns = 10**9
+        self.slept: list[float] = []
+
+    def monotonic_ns(self) -> int:
+        return self.ns
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.ns += round(seconds * 1e9)
