@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,11 +20,16 @@ from aeroloop.service.cli.common import (
     Markdown,
     Overrides,
     checked,
+    fail,
     guarded,
     settings_of,
     show,
     with_bits_of,
 )
+
+if TYPE_CHECKING:
+    from aeroloop.service.config import Settings
+    from aeroloop.service.lab.margins import Bits, Margins
 
 group = typer.Typer(no_args_is_help=True, help="Experiments, tables, calibration and certificates, in lockstep.")
 
@@ -113,12 +120,38 @@ def certify(
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
+    margins: Annotated[
+        bool,
+        typer.Option(
+            "--margins",
+            help="Print the delay and the lost frames that it survives, over bits and rates, beside those at which "
+            "simulation diverges; minutes.",
+        ),
+    ] = False,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="With --margins: draw them into a .png, .svg or .pdf file.", show_default=False),
+    ] = None,
+    force: Force = False,
     json: Json = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
     """Check whether the paper's theorem holds for the configuration, and print the error that it guarantees."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    if margins:
+        if late:
+            fail("--margins finds the largest --late: leave one of them out", 2)
+        with checked():
+            _check_figure(figure, config, force)
+        pair = (settings.wire.attitude.bits, settings.wire.voltage.bits) if bits_out or bits_in else None
+        found = _margins(settings, pair, disturbance or 0.0, json)
+        if figure is not None:
+            from aeroloop.service.lab.margins_figure import draw_margins
+
+            with _new_file(figure, config, force) as part:
+                draw_margins(found, part)
+        return
     from aeroloop.service.terminal.certificate_table import certificate_table
     from aeroloop.service.theorem.certificate import certify
 
@@ -126,6 +159,17 @@ def certify(
         result = certify(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
     show(result, json, lambda found: certificate_table(found, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
+
+
+def _margins(settings: Settings, pair: Bits | None, disturbance: float, json: bool) -> Margins:
+    from aeroloop.service.lab.margins import BITS, measure_margins
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.margins_table import margins_table
+
+    with guarded(), count_bar("margins", hidden=json) as update:
+        found = measure_margins(settings, [pair] if pair else BITS, disturbance=disturbance, progress=update)
+    show(found, json, margins_table)
+    return found
 
 
 @group.command()
@@ -220,19 +264,31 @@ def burden(
     from aeroloop.service.terminal.display import count_bar
 
     with checked():
-        if figure is not None:
-            from aeroloop.service.lab.burden_figure import check_path
-            from aeroloop.service.logs.outputs import check_output
-
-            check_path(figure)
-            check_output(figure, [config], force=force)
+        _check_figure(figure, config, force)
         cells = grid(settings, bits or (), quantizer or (), sensors or ())
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = measure_burden(settings, cells, duration, update)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else burden_table)
-    if figure is not None:  # last: a full disk must not cost the table
+    if figure is not None:
         from aeroloop.service.lab.burden_figure import draw_burden
-        from aeroloop.service.logs.outputs import writing
 
-        with guarded(), writing(figure, [config], force=force) as part:
+        with _new_file(figure, config, force) as part:
             draw_burden(result, part)
+
+
+def _check_figure(figure: Path | None, config: Path | None, force: bool) -> None:
+    if figure is not None:
+        from aeroloop.service.logs.outputs import check_output
+        from aeroloop.service.report.figure_style import check_path
+
+        check_path(figure)
+        check_output(figure, [config], force=force)
+
+
+@contextmanager
+def _new_file(figure: Path, config: Path | None, force: bool) -> Iterator[Path]:
+    """A path to draw to, once the table is printed: a full disk must not cost the table."""
+    from aeroloop.service.logs.outputs import writing
+
+    with guarded(), writing(figure, [config], force=force) as part:
+        yield part

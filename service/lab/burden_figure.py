@@ -16,11 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from aeroloop.service.lab.burden import Burden, Point
-from aeroloop.service.lab.burden_grid import BurdenError
 from aeroloop.service.lab.burden_table import short_name
-from aeroloop.service.report.figure_style import BLACK, BLUE, FORMATS, GREEN, ORANGE, PURPLE, WIDTH_IN, figure_style
+from aeroloop.service.report.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, WIDTH_IN, figure_style, save_as
 
-SUFFIXES: Final = tuple(f".{name}" for name in FORMATS)
 _STYLES: Final = {
     "uniform": (BLUE, "o"),
     "hysteresis-uniform": (ORANGE, "s"),
@@ -34,28 +32,10 @@ _LABEL_HEIGHT: Final = 0.055
 _TICKS: Final = [digit * 10**power for power in range(-1, 6) for digit in (1, 2, 3, 5)]
 
 
-def check_path(path: Path) -> Path:
-    """The path of a figure. Raises BurdenError if its suffix or folder is wrong."""
-    if path.suffix not in SUFFIXES:
-        raise BurdenError(f"a figure ends in {', '.join(SUFFIXES)}, not {path.name!r}")
-    if not path.absolute().parent.is_dir():
-        raise BurdenError(f"there is no folder {path.parent} for the figure")
-    return path
-
-
 def draw_burden(burden: Burden, path: Path) -> None:
-    """Draw the grid into a file.
-
-    Raises:
-        BurdenError: The file cannot be written.
-    """
-    check_path(path)
+    """Draw the grid into a file. Raises OutputError if its name is wrong, or it cannot be written."""
     with figure_style():
-        figure = _figure(burden)
-        try:
-            figure.savefig(path, **FORMATS[path.suffix[1:]])
-        except OSError as error:
-            raise BurdenError(f"cannot write {path}: {error.strerror}") from None
+        save_as(_figure(burden), path)
 
 
 def _figure(burden: Burden) -> Figure:

@@ -15,6 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from aeroloop.service.logs.outputs import OutputError
+
 Columns = Literal[1, 2]
 
 WIDTH_IN: Final[dict[Columns, float]] = {1: 3.5, 2: 7.16}
@@ -75,6 +77,24 @@ def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     return figure, axes
+
+
+def check_path(path: Path) -> Path:
+    """The path of a single figure. Raises OutputError if its suffix or folder is wrong."""
+    suffixes = [f".{name}" for name in FORMATS]
+    if path.suffix not in suffixes:
+        raise OutputError(f"a figure ends in {', '.join(suffixes)}, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"there is no folder {path.parent} for the figure")
+    return path
+
+
+def save_as(figure: Figure, path: Path) -> None:
+    """Save a figure in the format of the path's suffix. Raises OutputError if it cannot be written."""
+    try:
+        figure.savefig(check_path(path), **FORMATS[path.suffix[1:]])
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:

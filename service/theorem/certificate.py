@@ -302,20 +302,23 @@ def _violated(settings: Configured, e: Evaluated) -> list[str]:
     return found
 
 
-def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
-    """Which ranges the set exceeds."""
+def beyond(settings: Configured, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
+    """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
     wire = settings.wire
-    volts, limit = largest_voltage(settings, e.desired, at), min(wire.voltage.limit, settings.plant.voltage_limit)
-    where = "the set" if e.plant_reach else "what the quantizers alone do along the reference"
+    volts, limit = largest_voltage(settings, desired, at), min(wire.voltage.limit, settings.plant.voltage_limit)
     ranges = (
-        (at.axis_rate + e.plant.delta_omega, wire.rate.limit, "|ω_k|", "rad/s", "range: wire.rate.limit"),
-        (sin(at.half_angle), wire.attitude.limit, "|ε_k|", "", "range: wire.attitude.limit"),
-        (volts, limit, "|u_k|", "V", "saturation: wire.voltage.limit"),
+        ("|ω_k|", at.axis_rate + p.delta_omega, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
+        ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
+        ("|u_k|", volts, "V", limit, "saturation: wire.voltage.limit"),
     )
+    return [each for each in ranges if each[1] > each[3]]
+
+
+def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
+    where = "the set" if e.plant_reach else "what the quantizers alone do along the reference"
     return [
         f"{name} = {most:g} {unit}".rstrip() + f", and {symbol} may reach {value:.3g} {unit}".rstrip() + f" by {where}"
-        for value, most, symbol, unit, name in ranges
-        if value > most
+        for symbol, value, unit, most, name in beyond(settings, e.desired, e.plant, at)
     ]
 
 

@@ -23,6 +23,7 @@ from aeroloop.service.lab.burden_figure import draw_burden
 from aeroloop.service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
 from aeroloop.service.lab.burden_table import HEADER, markdown
 from aeroloop.service.lab.workers import Workers
+from aeroloop.service.logs.outputs import OutputError
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
@@ -183,7 +184,7 @@ def test_the_figure_is_an_image(document: tuple[str, Path], tmp_path: Path) -> N
     draw_burden(burden, tmp_path / "burden.svg")
     text = (tmp_path / "burden.svg").read_text()
     assert "<svg" in text
-    with pytest.raises(BurdenError, match="folder"):
+    with pytest.raises(OutputError, match="folder"):
         draw_burden(burden, tmp_path / "none" / "burden.svg")
 
 
