@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,6 +29,7 @@ from aeroloop.service.cli.common import (
 
 if TYPE_CHECKING:
     from aeroloop.service.config import Settings
+    from aeroloop.service.lab.attack import Attack
     from aeroloop.service.lab.margins import Bits, Margins
 
 group = typer.Typer(no_args_is_help=True, help="Experiments, tables, calibration and certificates, in lockstep.")
@@ -120,6 +121,16 @@ def certify(
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every term, with its equation.")] = False,
+    runs: Annotated[
+        int,
+        typer.Option(
+            "--attack",
+            metavar="RUNS",
+            min=0,
+            help="Print beside the bound the largest ‖z‖ that a search over so many experiments finds; 256 take a second.",
+            show_default=False,
+        ),
+    ] = 0,
     margins: Annotated[
         bool,
         typer.Option(
@@ -152,13 +163,26 @@ def certify(
             with _new_file(figure, config, force) as part:
                 draw_margins(found, part)
         return
+    from aeroloop.service.lab.attack import largest_norm
     from aeroloop.service.terminal.certificate_table import certificate_table
     from aeroloop.service.theorem.certificate import certify
 
     with guarded():
         result = certify(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
+    if runs:
+        largest = largest_norm(_attacked(settings, runs, disturbance=disturbance or 0.0, json=json))
+        result = result.model_copy(update={"largest_found": largest})
     show(result, json, lambda found: certificate_table(found, verbose=verbose))
     raise typer.Exit(0 if result.holds else 1)
+
+
+def _attacked(settings: Settings, runs: int, *, json: bool, **options: Any) -> Attack:
+    from aeroloop.service.lab.attack import attack
+    from aeroloop.service.lab.workers import Workers
+    from aeroloop.service.terminal.display import count_bar
+
+    with guarded(), count_bar("experiments", hidden=json) as update, Workers() as workers:
+        return attack(settings, runs, workers=workers, progress=update, **options)
 
 
 def _margins(settings: Settings, pair: Bits | None, disturbance: float, json: bool) -> Margins:
@@ -196,23 +220,10 @@ def attack(
 ) -> None:
     """Search, as an adversary, for a run of the paper's body that breaks the certificate; exit 1 if one is found."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
-    from aeroloop.service.lab.attack import attack
-    from aeroloop.service.lab.workers import Workers
     from aeroloop.service.terminal.attack_table import attack_table
-    from aeroloop.service.terminal.display import count_bar
 
-    with guarded(), count_bar("experiments", hidden=json) as update, Workers() as workers:
-        result = attack(
-            settings,
-            runs,
-            seed=seed,
-            duration_s=duration,
-            disturbance=disturbance,
-            seconds=seconds,
-            out=out,
-            workers=workers,
-            progress=update,
-        )
+    options = {"seed": seed, "duration_s": duration, "seconds": seconds, "out": out}
+    result = _attacked(settings, runs, disturbance=disturbance, json=json, **options)
     show(result, json, lambda found: attack_table(found, verbose=verbose))
     raise typer.Exit(1 if result.beaten else 0)
 

@@ -92,6 +92,11 @@ class Attack(BaseModel):
     statements: list[Statement]
 
 
+def largest_norm(found: Attack) -> float:
+    """The largest ‖z‖ of runs that began at x = 0, by any errors within the quantizers' bounds [1, rad/s]."""
+    return max(s.found for s in found.statements if s.what == "‖z‖" and not s.start)
+
+
 class _Group(NamedTuple):
     """Experiments with the same bounds, by the names of _UNITS; without those that are not proven."""
 

@@ -49,6 +49,8 @@ def _bounds(certificate: Certificate) -> Table:
     ):
         shown = "not proven" if radius is None else f"{radius:.4g}"
         table.add_row(what, shown, "" if angle is None else f"{angle:.2f}°")
+    if certificate.largest_found is not None:
+        table.add_row("largest that an attack on that body found", f"{certificate.largest_found:.4g}", "")
     return table
 
 

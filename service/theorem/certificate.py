@@ -68,6 +68,9 @@ class Certificate(BaseModel):
     violated: list[str] = Field(description="what fails, each with the key that would mend it; empty where it holds")
     terms: list[CertificateTerm]
     remedies: list[Remedy] = Field(description="changes with which it would hold, the least of each kind")
+    largest_found: float | None = Field(
+        default=None, description="largest ‖z‖ that an attack found against pointwise_radius; null without --attack"
+    )
 
     @property
     def blame(self) -> str | None:

@@ -29,6 +29,7 @@ from aeroloop.service.theorem.bounds import Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.certificate import evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from aeroloop.service.theorem.lemma import coordinates
+from tests.support.certified import FREE, bits
 
 SMALL = ["law.damping_bound=0.0119"]
 SHORT = 3.0
@@ -222,3 +223,12 @@ def test_the_old_claim_held_where_the_loop_leaves_the_wire_s_ranges(bits: str) -
     assert found.lasted.max() < 1.0
     assert found.u.max() > settings.wire.voltage.limit
     assert evaluate(settings).body_reach is None  # nothing is claimed now
+
+
+def test_a_certificate_prints_the_largest_that_an_attack_found_beside_its_bound(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    overrides = [word for change in (*FREE, *bits(12, 12)) for word in ("--set", change)]
+    assert run(("lab", "certify", "--attack", "256", "--json", *overrides)) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert 0.1 * found["pointwise_radius"] < found["largest_found"] <= found["pointwise_radius"]

@@ -31,7 +31,7 @@ EXAMPLES = Path(__file__).parents[3] / "service" / "examples"
 STILL = Hold(attitude=(0.0, 0.0, 0.0))
 KEYS = [
     "holds", "margin", "c0", "delta_V1", "delta_V2", "delta_Q", "k", "radius", "rms_radius", "pointwise_radius",
-    "pointwise_deg", "plant_radius", "plant_deg", "assumptions", "violated", "terms", "remedies",
+    "pointwise_deg", "plant_radius", "plant_deg", "assumptions", "violated", "terms", "remedies", "largest_found",
 ]  # fmt: skip
 SMALL = ["law.damping_bound=0.0119"]
 
