@@ -127,7 +127,7 @@ def certify(
             "--attack",
             metavar="RUNS",
             min=0,
-            help="Print beside the bound the largest ‖z‖ that a search over so many experiments finds; 256 take a second.",
+            help="Print beside the bound the largest ‖z‖ that a search over so many experiments finds.",
             show_default=False,
         ),
     ] = 0,
