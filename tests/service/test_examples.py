@@ -92,5 +92,5 @@ def test_what_is_wrong_is_one_line() -> None:
 
 
 def test_a_certificate_is_that_of_the_configuration() -> None:
-    assert aeroloop.certify(aeroloop.load_settings(overrides={"wire.voltage.bits": 12})).holds
-    assert not aeroloop.certify(aeroloop.load_settings(overrides={"wire.rate.limit": 0.1})).holds
+    assert aeroloop.certify(aeroloop.load_settings(EXAMPLES / "rigid-body.toml")).holds
+    assert not aeroloop.certify(aeroloop.load_settings()).holds
