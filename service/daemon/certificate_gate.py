@@ -1,9 +1,9 @@
 """Certificate gate: publishes the theorem's verdict on the running controller, and refuses what must hold and does not.
 
 With `controller.require_certificate` the controller claims no vehicle unless the theorem holds, and an operator's
-change after which it would not hold is refused. A certificate takes some 10 ms, and 200 ms with remedies, so it is
-computed in the thread of the operator's query and cached; the loop only looks it up. Without that setting it is
-computed in a thread of its own after the change, and counts as not holding until then.
+change after which it would not hold is refused. A certificate takes some 20 ms, and up to a second with remedies, so it
+is computed in the thread of the operator's query and cached; the loop only looks it up. Without that setting it is
+computed in a thread of its own after the change, without remedies, and counts as not holding until then.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class Verdict(NamedTuple):
         text = text[0].lower() + text[1:]  # within a sentence
         if certificate.holds:
             return cls(certificate, text)
+        if not certificate.remedies:
+            return cls(certificate, text)
         ways = [remedy.text for remedy in certificate.remedies if remedy.overrides]
         return cls(certificate, text, f"; what would do: {', or '.join(ways) or 'no bits and no gains'}")
 
@@ -90,7 +92,7 @@ class CertificateGate:
         try:
             with _giving_way():
                 changed = self._settings.model_copy(update={"law": law, "reference": reference})
-                verdict = Verdict.of(certify(changed))
+                verdict = Verdict.of(certify(changed, seek_remedies=self.required))
         except BoundlessError as error:
             verdict = Verdict(None, f"nothing is certified: {error}")
         self._cache.append((gains, reference, verdict))

@@ -63,5 +63,5 @@ def certified_bounds(
     if (law, reference) == (settings.law, settings.reference) and promised is not None:
         with suppress(ValidationError):
             certificate = Certificate.model_validate(promised)
-    certificate = certificate or certify(begun)
+    certificate = certificate or certify(begun, seek_remedies=False)
     return CertifiedBounds(law, certificate, bounds, certificate.verdict)

@@ -128,6 +128,7 @@ def certify(
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
     late_s: float = 0.0,
+    seek_remedies: bool = True,
 ) -> Certificate:
     """The certificate of a configuration.
 
@@ -136,6 +137,7 @@ def certify(
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
         attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; controller.start_within_deg if None.
         late_s: Further age of a command, by delay or lost frames [s].
+        seek_remedies: Whether to search for changes with which it would hold; that takes most of the time, up to 1 s.
 
     Raises:
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
@@ -145,7 +147,7 @@ def certify(
     e = evaluated(settings)
     t = e.theorem
     violated, ways = _violated(settings, e), list[Remedy]()
-    if violated:
+    if violated and seek_remedies:
 
         def holds(tried: Configured) -> bool:
             now = evaluated(tried, only_plant=True, desired=e.desired)  # the reference stays
