@@ -256,7 +256,7 @@ def _disturbances(
             + j * c1 / 2 * (delta_omega_e + delta_q * omega_e)  # ᾱ
             + p.norm_B * p.delta_u
         )  # fmt: skip
-        theta_dot = max(p.Gamma) * sqrt(max(p.Gamma) / min(p.Gamma)) * axis_omega * (z2 + delta_z2)
+        theta_dot = max(p.Gamma) * sqrt(max(p.Gamma) / min(p.Gamma)) * (axis_omega + delta_omega) * (z2 + delta_z2)
         hold = stale_torque(p, omega, axis_omega, omega_e, z2_dot, theta_dot)
         fast = noise + hold + theta * turned + p.k_tau_d
         if held:  # what u₁ should have added to the yaw, beyond the slow part and the feedback that φ counts
