@@ -148,7 +148,7 @@ def certify(
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
-    """Check whether the paper's theorem holds for the configuration, and print the error that it guarantees."""
+    """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
     if margins:
         if late:
