@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import hypot
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -112,8 +112,7 @@ def build_law(p: LawSettings) -> Law:
     Raises:
         ValueError: B cannot be inverted.
     """
-    if np.linalg.cond(np.array(p.allocation)) > 1e12:
-        raise ValueError("law.allocation (B) has no inverse: every axis needs a motor that acts on it")
+    check_invertible(np.array(p.allocation))
     J, B = ca.diag(ca.SX(p.inertia)), ca.SX(np.array(p.allocation))
     gains = ca.SX.sym("C1", 3), ca.SX.sym("C2", 3), ca.SX.sym("Gamma", 3)
     C1, C2, Gamma = (ca.diag(gain) for gain in gains)
@@ -148,6 +147,12 @@ def build_law(p: LawSettings) -> Law:
     theta_dot = projection(tau, theta, Gamma, p.damping_bound)  # (C.38)
 
     return Law(q, omega, q_d, omega_d, omega_d_dot, theta, s, *gains, eta_e, eps_e, omega_e, z1, z2, u, tau, theta_dot)
+
+
+def check_invertible(B: np.ndarray[Any, Any]) -> None:  # the paper's letter
+    """Raise ValueError, with the key, if B or a part of it has no inverse. Shape (n, n)."""
+    if np.linalg.cond(B) > 1e12:
+        raise ValueError("law.allocation (B) has no inverse: every axis needs a motor that acts on it")
 
 
 def projection(tau: ca.SX, theta: ca.SX, Gamma: ca.SX, bound: float) -> ca.SX:

@@ -32,7 +32,7 @@ from aeroloop.service.lab.attacked_lemma import Instants
 from aeroloop.service.lab.attacked_loops import WAVES, Experiments, Loops, Outcome, Wave
 from aeroloop.service.lab.search_points import ball, proposals
 from aeroloop.service.lab.workers import Workers
-from aeroloop.service.theorem.certificate import Evaluated, evaluate, largest_voltage
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate, largest_voltage
 from aeroloop.service.theorem.invariant import largest_start, reach
 
 BATCH: Final = 128

@@ -11,7 +11,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.reference import Floats
 from aeroloop.service.lab.attacked_loops import desired, span, turned
 from aeroloop.service.lab.search_points import ball
-from aeroloop.service.theorem.certificate import Evaluated
+from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.lemma import Samples, lemma_inequalities, rotation, times
 
 SIZE: Final = 13

@@ -25,7 +25,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.lab.experiment import LoopEndedError, run_experiment
 from aeroloop.service.lab.workers import Workers
-from aeroloop.service.theorem.certificate import beyond, premises
+from aeroloop.service.theorem.evaluation import beyond, premises
 from aeroloop.service.theorem.extremes import extremes
 from aeroloop.service.theorem.invariant import reach
 from aeroloop.service.theorem.lemma import coordinates, rotation, times

@@ -16,7 +16,8 @@ from pydantic import ValidationError
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
-from aeroloop.service.theorem.certificate import Certificate, Evaluated, certify, evaluate
+from aeroloop.service.theorem.certificate import Certificate, certify
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError
 
 

@@ -24,7 +24,7 @@ from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array
 from aeroloop.service.review.certified_bounds import CertifiedBounds
-from aeroloop.service.theorem.certificate import Evaluated
+from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.invariant import Premises, largest_start, reach
 from aeroloop.service.theorem.lemma import Coordinates, Samples, lyapunov, norm, rotation, times
 from aeroloop.service.theorem.mean_square import Decay, decay

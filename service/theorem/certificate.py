@@ -9,21 +9,18 @@ presumes: the wire's ranges, the voltages within reach, half a turn, the bound o
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from math import asin, ceil, degrees, hypot, inf, pi, radians, sin, sqrt
+from dataclasses import replace
+from functools import partial
+from math import asin, ceil, degrees, hypot, pi, sin
 from typing import Any, Final, get_type_hints
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from aeroloop.protocol.wire.spec import SignalSpec
-from aeroloop.service.control.law import ESTIMATE_REACH
-from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem, lemma_1, theorem_1
+from aeroloop.protocol.messages.operator import Hold
+from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem
 from aeroloop.service.theorem.configured import Configured
-from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
-from aeroloop.service.theorem.invariant import Premises, Reach, reach, without_error
-from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
+from aeroloop.service.theorem.evaluation import Evaluated, beyond, evaluate, largest_voltage
+from aeroloop.service.theorem.invariant import Reach, reach, without_error
 from aeroloop.service.theorem.remedies import Holds, Remedy, remedies
 
 
@@ -95,33 +92,6 @@ class Certificate(BaseModel):
         return {term.symbol: term.value for term in self.terms}[symbol]
 
 
-@dataclass(frozen=True)
-class Evaluated:
-    """The quantities of a certificate.
-
-    Attributes:
-        desired: The reference's extremes.
-        known: Inputs.
-        lemma: The bounds of Lemma 1.
-        theorem: The bounds of Theorem 1.
-        body: Premises of the paper's body.
-        plant: Premises of the configured plant.
-        body_reach: What the paper's body reaches; None where nothing is proven.
-        plant_reach: What the configured plant reaches; likewise.
-        bounds: What the plant does beyond the paper's equations.
-    """
-
-    desired: Extremes
-    known: Known
-    lemma: Lemma
-    theorem: Theorem
-    body: Premises
-    plant: Premises
-    body_reach: Reach | None
-    plant_reach: Reach | None
-    bounds: PlantBounds
-
-
 def certify(
     settings: Configured,
     *,
@@ -175,124 +145,6 @@ def certify(
     )
 
 
-def evaluate(
-    settings: Configured,
-    *,
-    disturbance: float | None = None,
-    attitude_error_deg: float | None = None,
-    late_s: float = 0.0,
-    only_plant: bool = False,
-    desired: Extremes | None = None,
-) -> Evaluated:
-    """The quantities of a certificate, to check a run against; arguments and errors as of `certify`.
-
-    With `only_plant` the paper's body is left out, which does not decide whether a certificate holds; `desired` are the
-    reference's extremes if they are known.
-    """
-    stated = disturbance or 0.0
-    if not 0 <= stated < inf:
-        raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
-    desired = desired or extremes(settings.reference)
-    bounds = plant_bounds(settings, disturbance is not None)
-    body = premises(settings, desired, paper_body(settings), stated, late_s)
-    plant = premises(settings, desired, bounds, stated, late_s)
-    body_reach = None if only_plant else reach(body)
-    plant_reach = reach(plant)
-    start_deg = settings.controller.start_within_deg if attitude_error_deg is None else attitude_error_deg
-    p = _known(settings, desired, body, body_reach, radians(min(180.0, start_deg)))
-    lemma = lemma_1(p)
-    if body_reach is not None:  # the noise, too, is of a state that has changed since
-        noise = theorem_1(p, lemma).delta_V1 * body.age * body_reach.z_dot
-        p = replace(p, hold=p.hold + noise)
-    return Evaluated(desired, p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
-
-
-def premises(
-    settings: Configured, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
-) -> Premises:
-    """Premises of the invariant set.
-
-    Args:
-        settings: The configuration.
-        desired: The reference's extremes.
-        plant: What the plant does beyond the paper's equations.
-        disturbance: Further torque [N·m].
-        late_s: Further age of a command [s].
-    """
-    wire, law = settings.wire, settings.law
-    gravity = law.mass * law.gravity
-    return Premises(
-        C1=law.C1,
-        C2=law.C2,
-        Gamma=law.Gamma,
-        J=law.inertia,
-        k_theta=law.damping_bound,
-        k_theta_hat=law.damping_bound * ESTIMATE_REACH,
-        weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
-        weight_roll=abs(law.centre_of_mass[1]) * gravity,
-        norm_B=_norm_B(settings),
-        delta_omega=_error(wire.rate, 3) + plant.delta_omega,
-        delta_u=_error(wire.voltage, wire.actuators),
-        k_omega_d=desired.rate,
-        k_omega_d_dot=desired.acceleration,
-        k_omega_d_ddot=desired.jerk,
-        axis_rate=desired.axis_rate,
-        half_angle_d=desired.half_angle,
-        delta_q=chords(desired.samples, _error(wire.attitude, 1) + plant.delta_eps),
-        age=plant.age + late_s,
-        rate_lag=plant.rate_lag,
-        k_tau_d=plant.torque + disturbance,
-        tilt=desired.tilt if plant.held_roll else None,
-    )
-
-
-def _known(settings: Configured, desired: Extremes, body: Premises, within: Reach | None, error: float) -> Known:
-    wire, law = settings.wire, settings.law
-    return Known(
-        lambda_J=max(law.inertia),
-        weight=body.weight,
-        norm_B=body.norm_B,
-        C1_min=min(law.C1),
-        C1_max=max(law.C1),
-        C2_min=min(law.C2),
-        C2_max=max(law.C2),
-        delta_eps=_error(wire.attitude, 3),
-        delta_omega=_error(wire.rate, 3),
-        delta_u=body.delta_u,
-        k_omega_d=desired.rate,
-        k_omega_d_dot=desired.acceleration,
-        half_angle_d=desired.half_angle,
-        half_angle_e=error / 2,
-        k_theta=body.k_theta,
-        k_theta_hat=body.k_theta_hat,
-        k_tau_d=body.k_tau_d,
-        hold=within.hold if within else 0.0,
-        power=within.power if within else 0.0,
-        omega_limit=wire.rate.limit,
-        u_limit=wire.voltage.limit,
-    )
-
-
-def _norm_B(settings: Configured) -> float:  # noqa: N802  # the paper's letter
-    # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
-    first = 3 - settings.wire.actuators
-    return float(np.linalg.norm(np.array(settings.law.allocation)[first:, first:], 2))
-
-
-@lru_cache(maxsize=64)
-def _error(signal: SignalSpec, elements: int) -> float:
-    """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
-    return sqrt(elements) * signal.quantizer().bound
-
-
-def largest_voltage(settings: Configured, desired: Extremes, at: Reach) -> float:
-    """The largest |u_k| that the law commands within a set [V]."""
-    first = 3 - settings.wire.actuators
-    inverse = np.linalg.inv(np.array(settings.law.allocation)[first:, first:])
-    along = np.abs(feedforward(desired.samples, settings.law)[:, first:] @ inverse.T).max(axis=0)
-    return float((along + np.linalg.norm(inverse, axis=1) * at.deviation).max())
-
-
 def _violated(settings: Configured, e: Evaluated) -> list[str]:
     """What fails, the gravest first."""
     found = list(e.bounds.unproven)
@@ -305,18 +157,6 @@ def _violated(settings: Configured, e: Evaluated) -> list[str]:
     if e.plant_reach is None:
         found.append(_unproven(e))
     return found
-
-
-def beyond(settings: Configured, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
-    """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
-    wire = settings.wire
-    volts, limit = largest_voltage(settings, desired, at), min(wire.voltage.limit, settings.plant.voltage_limit)
-    ranges = (
-        ("|ω_k|", at.axis_rate + p.delta_omega, "rad/s", wire.rate.limit, "range: wire.rate.limit"),
-        ("|ε_k|", sin(at.half_angle), "", wire.attitude.limit, "range: wire.attitude.limit"),
-        ("|u_k|", volts, "V", limit, "saturation: wire.voltage.limit"),
-    )
-    return [each for each in ranges if each[1] > each[3]]
 
 
 def _beyond(settings: Configured, e: Evaluated, at: Reach) -> list[str]:
@@ -362,6 +202,7 @@ def _condition(d: Lemma, t: Theorem) -> str:
 def _assumptions(settings: Configured, e: Evaluated, disturbance: float | None) -> list[str]:
     law = settings.law
     start = degrees(2 * e.known.half_angle_e)
+    found = isinstance(settings.reference, Hold) and settings.reference.attitude is None
     torque = f"no torque beyond the plant's settings and {disturbance or 0:g} N·m (--disturbance)"
     return [
         f"‖θ‖ ≤ {law.damping_bound:g} N·m·s/rad, and θ is constant (law.damping_bound)",
@@ -369,6 +210,7 @@ def _assumptions(settings: Configured, e: Evaluated, disturbance: float | None) 
         f"for the mean square: the attitude error stays below {start:g}° (--attitude-error)",
         "for the bound at every instant: a state near enough to the set, once (`log review` finds it)",
         "the law's J, B, m and r_g are the plant's ([law])",
+        *(["the attitude that it finds and holds is level (reference.attitude)"] if found else []),
         *e.bounds.assumed,
     ]
 

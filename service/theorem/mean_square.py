@@ -20,7 +20,7 @@ from math import asin, hypot, isfinite, pi, sin, sqrt
 from typing import Final, NamedTuple
 
 from aeroloop.service.theorem.bounds import lemma_1, theorem_1
-from aeroloop.service.theorem.certificate import Evaluated
+from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.invariant import Premises, stale_torque
 
 _MOST_ITERATIONS: Final = 1000

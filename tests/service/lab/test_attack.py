@@ -26,7 +26,7 @@ from aeroloop.service.lab.attacked_lemma import SIZE, Instants
 from aeroloop.service.lab.attacked_loops import Experiments, Loops, Outcome, balance, desired, quantized
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.theorem.bounds import Theorem, lemma_1, theorem_1
-from aeroloop.service.theorem.certificate import evaluate
+from aeroloop.service.theorem.evaluation import evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from aeroloop.service.theorem.lemma import coordinates
 from tests.support.certified import FREE

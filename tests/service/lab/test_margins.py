@@ -36,7 +36,8 @@ from aeroloop.service.lab.margins import (
 from aeroloop.service.lab.workers import Workers
 from aeroloop.service.terminal import margins_table
 from aeroloop.service.terminal.console import Console
-from aeroloop.service.theorem.certificate import beyond, certify, evaluate
+from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.evaluation import beyond, evaluate
 
 SMALL = ["law.damping_bound=0.0119", "loop.lockstep=true"]
 PAPER = load_over(Settings(), SMALL)

@@ -19,7 +19,7 @@ from aeroloop.service.review import guarantees
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read
-from aeroloop.service.theorem.certificate import Evaluated, evaluate
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from aeroloop.service.theorem.mean_square import Decay, decay
 from tests.support.edited_log import Said, rewrite

@@ -26,7 +26,8 @@ from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report
 from aeroloop.service.review.theorem_check import TheoremCheck
 from aeroloop.service.terminal.log_tables import review_account
-from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
+from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import coordinates
 from tests.support import numpy_twin as twin
 from tests.support.edited_log import Said, rewrite, ticks_of

@@ -20,7 +20,8 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import Plan, reference_function
 from aeroloop.service.theorem.bounds import attitude_error
-from aeroloop.service.theorem.certificate import Evaluated, certify, evaluate
+from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError, extremes
 from aeroloop.service.theorem.lemma import Samples, coordinates, lemma_inequalities, rotation
 from tests.support import numpy_twin as twin
@@ -199,6 +200,25 @@ def test_everything_that_the_proof_presumes_is_required(change: str, names: str)
     found = certify(certified_settings(12, 12, *changes))
     assert not found.holds
     assert any(names in reason for reason in found.violated), found.violated
+
+
+def test_a_reference_that_rolls_is_not_certified_where_the_roll_is_held() -> None:
+    gentle = ["plant.ideal=true", "law.damping_bound=0.0232", "reference.kind=hold", *bits(14, 14)]
+    assert certify(load_over(PAPER, [*gentle, "reference.attitude=[0, 5, 10]"])).holds
+    assert any(
+        "rolls" in reason for reason in certify(load_over(PAPER, [*gentle, "reference.attitude=[5, 5, 10]"])).violated
+    )
+
+
+def test_the_assumed_error_is_never_smaller_than_that_of_the_set() -> None:
+    found = certify(certified_settings(8, 8), attitude_error_deg=0.1)
+    assert found.plant_deg is not None
+    assert degrees(2 * (found.value("max ∡e/2") or 0.0)) == pytest.approx(found.plant_deg)
+
+
+def test_motors_that_cannot_be_inverted_are_named(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(("lab", "certify", "--set", "law.allocation=[[1, 0, 0], [0, 1, 1], [0, 1, 1]]")) == 1
+    assert capfd.readouterr().err.startswith("aeroloop: law.allocation (B) has no inverse")
 
 
 def test_a_machine_holds_only_with_a_stated_disturbance() -> None:

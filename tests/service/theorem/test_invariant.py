@@ -15,9 +15,10 @@ from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.law import Law, LawSettings, build_law
 from aeroloop.service.control.reference import Floats, Plan
-from aeroloop.service.theorem.certificate import evaluate, premises
+from aeroloop.service.theorem.evaluation import evaluate, premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
-from aeroloop.service.theorem.invariant import Premises, gains_of, largest_start, reach
+from aeroloop.service.theorem.invariant import Premises, largest_start, reach
+from aeroloop.service.theorem.linear import gains_of
 from aeroloop.service.theorem.plant_bounds import PlantBounds
 
 PAPER = load_over(Settings(), ["law.damping_bound=0.0119"])

@@ -20,7 +20,7 @@ from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.reference import Plan, reference_function
-from aeroloop.service.theorem.certificate import Evaluated, evaluate
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of

@@ -13,7 +13,7 @@ from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.law import build_law
 from aeroloop.service.control.reference import Floats, Plan
-from aeroloop.service.theorem.certificate import Evaluated, evaluate
+from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import coordinates
 from aeroloop.service.theorem.mean_square import decay, mechanism_torque
 
