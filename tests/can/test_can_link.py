@@ -15,7 +15,8 @@ from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.support.can_in_process import PAPER, Stranger, both_ends, virtual, wire_of
+from tests.support.can_in_process import PAPER, Stranger, both_ends, virtual
+from tests.support.wires import wire_of
 from tests.support.zenoh_network import PATIENCE_S, eventually
 
 MARK = b"\1\2\3\4\5\6\7"

@@ -25,21 +25,6 @@ from tests.support.zenoh_network import PATIENCE_S, eventually
 PAPER = WireSpec()
 
 
-def wire_of(
-    attitude: int | None, rate: int | None, voltage: int | None, actuators: int = 2, counter_bits: int = 8
-) -> WireSpec:
-    """A spec of these bits."""
-    return WireSpec.model_validate(
-        {
-            "attitude": {"bits": attitude, "limit": 1.0},
-            "rate": {"bits": rate, "limit": 1.0},
-            "voltage": {"bits": voltage, "limit": 24.0},
-            "actuators": actuators,
-            "counter_bits": counter_bits,
-        }
-    )
-
-
 def virtual(*, fd: bool = False, node: int = 1, channel: str | None = None) -> CanSettings:
     """A bus of this process, on a channel of its own unless one is given."""
     return CanSettings(interface="virtual", channel=channel or uuid.uuid4().hex, fd=fd, node=node)

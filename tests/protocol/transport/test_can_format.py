@@ -13,7 +13,8 @@ from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import CanError, CanSettings, Heartbeat, check_widths, fingerprint
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.support.can_in_process import PAPER, wire_of
+from tests.support.can_in_process import PAPER
+from tests.support.wires import wire_of
 
 PERIOD_NS = 2_000_000
 MARK = b"\1\2\3\4\5\6\7"

@@ -24,7 +24,8 @@ from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from tests.protocol.test_spec_document import FRAME_ROWS, Row, as_bits
-from tests.protocol.wire.test_frames import codes_of, specs
+from tests.protocol.wire.test_frames import codes_of
+from tests.support.wires import specs
 
 NODE: Final = 5
 PERIOD_NS: Final = 2_000_000

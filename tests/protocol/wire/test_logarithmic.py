@@ -166,8 +166,8 @@ def test_nan_has_no_code_and_what_is_no_code_is_refused() -> None:
         (8, {"deadzone": 0.5}, "between 0 and the threshold"),
         (3, {"threshold": 0.01}, "between 0 and the threshold"),
         (8, {"deadzone": 0.0}, "dead zone"),
-        (16, {"deadzone": 0.1, "threshold": 0.1 + 1e-15}, "tell apart"),
-        (8, {"deadzone": 5e-324}, "tell apart"),
+        (16, {"deadzone": 0.1, "threshold": 0.1 + 1e-15}, "distinguish"),
+        (8, {"deadzone": 5e-324}, "distinguish"),
     ],
 )
 def test_what_makes_no_intervals_is_refused(bits: int, more: dict[str, float], why: str) -> None:
