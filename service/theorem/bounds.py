@@ -67,7 +67,7 @@ class Known:
             "Assumption 3",
             "rad",
             "assumed: the attitude error stays below twice this; from --attitude-error, else "
-            "controller.start_within_deg, within which sessions begin",
+            "controller.start_within_deg, within which sessions begin; at least that of the invariant set",
         ),
     ]
     k_theta: Annotated[

@@ -125,30 +125,30 @@ class Reach:
         deviation: Largest torque of the command beyond that of the reference [N·m].
     """
 
-    start: float
-    radius: float
-    eps_bar: float
-    torque: float
-    eps_e: float
-    z2: float
-    omega_e: float
-    axis_rate: float
-    half_angle: float
-    slow: float
-    fast: float
-    hold: float
-    power: float
-    z_dot: float
-    D1: float
-    D2: float
-    deviation: float
+    start: float = 0.0
+    radius: float = 0.0
+    eps_bar: float = 0.0
+    torque: float = 0.0
+    eps_e: float = 0.0
+    z2: float = 0.0
+    omega_e: float = 0.0
+    axis_rate: float = 0.0
+    half_angle: float = 0.0
+    slow: float = 0.0
+    fast: float = 0.0
+    hold: float = 0.0
+    power: float = 0.0
+    z_dot: float = 0.0
+    D1: float = 0.0
+    D2: float = 0.0
+    deviation: float = 0.0
 
 
 def without_error(p: Premises) -> Reach:
     """What is reached along the reference if quantization is the only error: a part of every set."""
     c1, c2 = max(p.C1), max(p.C2)
     torque = p.delta_q(0.0) * (1 + c1 * c2) + c2 * p.delta_omega
-    return Reach(0, 0, 0, 0, 0, 0, 0, p.axis_rate, p.half_angle_d, 0, torque, 0, 0, 0, 0, 0, torque)
+    return Reach(axis_rate=p.axis_rate, half_angle=p.half_angle_d, fast=torque, deviation=torque)
 
 
 def reach(p: Premises, start: float = 0.0) -> Reach | None:

@@ -6,7 +6,7 @@ must be stated, by `--disturbance`. Each bound that a random number could exceed
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import hypot, pi, sqrt
 from typing import Final
 
@@ -131,17 +131,7 @@ def _with_sensors(sensors: SensorSettings, plant: PlantBounds) -> PlantBounds:
         delta_omega = hypot(*sensors.gyro_bias) + sqrt(3) * DEVIATIONS * sensors.gyro_noise
         if sensors.gyro_noise:
             assumed.append(f"the gyro's noise stays within {DEVIATIONS} standard deviations (plant.sensors.gyro_noise)")
-    return PlantBounds(
-        plant.age,
-        delta_eps,
-        delta_omega,
-        rate_lag,
-        plant.torque,
-        plant.theta,
-        plant.held_roll,
-        assumed,
-        plant.unproven,
-    )
+    return replace(plant, delta_eps=delta_eps, delta_omega=delta_omega, rate_lag=rate_lag, assumed=assumed)
 
 
 def _filter(omega_n: float, zeta: float) -> tuple[float, float]:
