@@ -188,7 +188,7 @@ class Role:
             query.drop()
 
         def received(query: zenoh.Query) -> None:
-            if not str(query.key_expr).endswith(f"/{name}"):  # `**`, by which tools list a network, asks for no verb
+            if not str(query.key_expr).endswith(f"/{name}"):  # `**`, by which tools list a network, names no verb
                 query.drop()
                 return
             try:
@@ -282,7 +282,7 @@ class Role:
         self.publish("status", status)
 
     def _answer_status(self, query: zenoh.Query) -> None:
-        """Answer with the last status and its age, which tells a loop that hangs: Zenoh's threads do not."""
+        """Answer with the last status and its age, which shows a loop that hangs: Zenoh's threads do not."""
         if self._status is not None:
             taken, status = self._status
             aged = status.model_copy(update={"age_s": round(time.monotonic() - taken, 3)})

@@ -139,7 +139,7 @@ def join(settings: NetworkSettings, *, listen: bool = True) -> zenoh.Session:
 
     Args:
         settings: Where.
-        listen: Whether others can connect to this process: yes for a role, no for a command that only asks or watches.
+        listen: Whether others can connect to this process: yes for a role, no for a command that only queries.
 
     Raises:
         NetworkError: A `listen` endpoint cannot be opened.
@@ -216,7 +216,7 @@ def _open(
             "retry": {"period_init_ms": retry_ms[0], "period_max_ms": retry_ms[1], "period_increase_factor": 1.5},
         },
         "open": {"return_conditions": {"connect_scouted": False}},  # otherwise it takes 0.5 s, whatever is linked
-        # Before it is queued, parsed or stored: what waits in memory is bounded, whoever publishes.
+        # Before it is queued, parsed or stored: what waits in memory is bounded for every publisher.
         "low_pass_filter": [
             {
                 "id": topic.name,

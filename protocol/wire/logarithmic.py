@@ -63,7 +63,7 @@ class LogarithmicQuantizer(CodedQuantizer):
         self.edges = self._edges()
         lengths = [b - a for a, b in pairwise(self.edges)]
         if not all(b - a > _APART * b for a, b in pairwise(self.edges)):
-            raise ValueError(f"a limit of {limit} leaves no intervals that a float can tell apart")
+            raise ValueError(f"a limit of {limit} leaves no intervals that a float can distinguish")
         self.bound = max(self.deadzone, max(lengths) / 2)
         self._tabulate([(a + b) / 2 for a, b in pairwise(self.edges)])
 

@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
         z: Largest ‖z‖ [1, rad/s].
         omega: Largest |ω_k| [rad/s].
         eps: Largest |ε_k| [1].
-        u: Largest |u_k| of the motors present, as the law asks [V].
+        u: Largest |u_k| of the motors present, as the law commands [V].
         square: ∫‖z‖² dt [s].
         lasted: Time until it left [s].
         V: V at the start [N·m].

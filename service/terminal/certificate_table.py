@@ -15,7 +15,7 @@ from aeroloop.service.theorem.certificate import Certificate
 DECIDING: Final = (
     "‖δ_ε‖", "‖δ_ω‖", "‖δ_u‖", "max ‖θ̃‖", "δ_V1", "c₀/2 − δ_V1", "k", "‖w_s‖", "‖w_f‖", "τ_h of the plant"
 )  # fmt: skip
-"""Symbols of the terms that are shown unless all are asked for: what goes in, what decides, what comes out."""
+"""Symbols of the terms that are shown unless --verbose: what goes in, what decides, what comes out."""
 
 
 def certificate_table(certificate: Certificate, *, verbose: bool = False) -> None:

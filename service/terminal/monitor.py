@@ -155,7 +155,7 @@ class Footer:
         self._shown = Text("; ".join([*failures, *answers]), style=BAD if failures else GOOD)
 
     def draw(self) -> Text:
-        """The last two lines of the view: what was asked or done, and the keys."""
+        """The last two lines of the view: the question or the answer, and the keys."""
         return Text("\n").join([self._shown, Text(f"s: stop {self._what}   q: quit", style=STALE)])
 
 

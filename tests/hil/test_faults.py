@@ -306,7 +306,7 @@ def test_corrupted_commands_end_in_a_trip_with_its_cause_or_do_no_harm(lockstep:
 
 
 def test_commands_that_are_late_for_good_are_refused_although_their_echo_looks_fresh(hil: Hil) -> None:
-    """300 ms are 150 ticks, of the 256 that the echo tells apart."""
+    """300 ms are 150 ticks, of the 256 that the echo distinguishes."""
     hil.start(settings=FAST_TRUTH)
     hil.run(0.3)
     hil.inject("command:delay=0.3")

@@ -102,7 +102,7 @@ def test_a_demo_in_real_time_tracks_and_two_run_beside_each_other(tmp_path: Path
         assert 4.0 - 16 * 0.002 <= figures["duration_s"] <= 4.0 + 0.1
         # Two demos want six processes on two cores, so a share of the ticks may be late. The plant holds its last
         # command meanwhile; the error stays that of the reference's start plus quantization, some 2.5 degrees. Half
-        # the ticks and 10 degrees tell a loop that works from one that does not.
+        # the ticks and 10 degrees separate a loop that works from one that does not.
         assert figures["command"]["frames_per_s"] > 250
         assert figures["max_error_deg"] < 10
         assert figures["latency_us"]["count"] > 0

@@ -231,7 +231,7 @@ class FakeQuanser:
         _refuse(self._unplugged, "the board is not connected")
         if self._failing[name]:
             self._failing[name] -= 1
-            raise HILError(f"{name} was told to fail")
+            raise HILError(f"{name} was made to fail")
 
     def restore(self, outputs: dict[Kind, list[Any]]) -> None:
         """Set outputs by their kind."""

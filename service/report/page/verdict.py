@@ -46,13 +46,13 @@ def _judgement(run: Findings) -> Judgement:
     if broken:
         return Judgement("Not held", False, f"{len(broken)} of {_count(len(run.checks), 'limit')} broken.")
     if run.checks:
-        return Judgement("Held", True, f"{_count(len(run.checks), 'limit')} asked for, none broken.")
+        return Judgement("Held", True, f"{_count(len(run.checks), 'limit')} required, none broken.")
     if run.z_track is None:
         return Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
     if run.trips:
         times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
         return Judgement("Tripped", False, f"The plant went to 0 V by itself {times}.")
-    return Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was asked for.")
+    return Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was required.")
 
 
 def run_name(report: Report, index: int, of: int) -> Html:

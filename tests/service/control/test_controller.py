@@ -295,7 +295,7 @@ def test_through_full_turns_of_a_quantized_attitude_no_voltage_jumps() -> None:
     inverse = np.linalg.inv(np.array(LAW.allocation)[1:, 1:])
     smooth = np.linalg.norm(inverse, ord=2) * moment
     wrong_sign = np.linalg.norm(inverse @ [0.0, 2 * (1 + 0.3 * 0.15)])
-    assert 10 * smooth < wrong_sign  # so what is asserted below tells one from the other
+    assert 10 * smooth < wrong_sign  # so what is asserted below separates the two
     before = None
     for k in range(round(3 * 2 * pi / rate / PERIOD)):
         controller.tick(_frame(wire, k, _yawed(rate * k * PERIOD), (0.0, 0.0, rate)), k)

@@ -146,7 +146,7 @@ def test_a_board_that_is_not_there_or_not_free_is_reported_in_one_line() -> None
 def test_a_board_that_cannot_be_made_ready_is_closed(call: str) -> None:
     board = FakeQuanser(AERO, PERIOD)
     board.fail_next(call)
-    with pytest.raises(QuanserError, match=f"cannot make quanser_aero2_usb '0' ready: {call} was told to fail"):
+    with pytest.raises(QuanserError, match=f"cannot make quanser_aero2_usb '0' ready: {call} was made to fail"):
         QuanserPlant(QuanserSettings(), PERIOD, hardware=board)
     assert board.holder is None
     QuanserPlant(QuanserSettings(), PERIOD, hardware=board)  # so another try can have it
@@ -156,7 +156,7 @@ def test_a_board_that_cannot_be_made_ready_is_closed(call: str) -> None:
 def test_a_board_that_cannot_be_started_is_reported_in_one_line(call: str) -> None:
     plant, board = plant_on_board()
     board.fail_next(call)
-    with pytest.raises(QuanserError, match=f"cannot start quanser_aero2_usb: {call} was told to fail"):
+    with pytest.raises(QuanserError, match=f"cannot start quanser_aero2_usb: {call} was made to fail"):
         plant.advance()
     plant.close()
     assert board.holder is None

@@ -108,9 +108,9 @@ def test_the_ideal_aero_on_the_board_has_encoders_all_the_same() -> None:
 # Reads that fail
 
 FAILURES = [
-    (lambda board: board.fail_next("task_read"), "task_read was told to fail", False),
+    (lambda board: board.fail_next("task_read"), "task_read was made to fail", False),
     (lambda board: board.short_next(), "the board's task gave no sample", False),
-    (lambda board: board.fail_next("watchdog_reload"), "watchdog_reload was told to fail", True),
+    (lambda board: board.fail_next("watchdog_reload"), "watchdog_reload was made to fail", True),
 ]
 
 
