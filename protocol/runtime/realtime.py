@@ -4,8 +4,8 @@ Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loo
 second, which is warm-up, and stay. Without `MCL_ONFAULT`, every thread's stack and malloc's arenas are made resident in
 full, three times what is used.
 
-An idle CPU that sleeps takes long to wake, on a virtual machine until the host schedules it again. While a process keeps
-/dev/cpu_dma_latency open with a latency of 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface).
+An idle CPU that sleeps takes long to wake; on a virtual machine, until the host schedules it again. While a process
+keeps /dev/cpu_dma_latency open with 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface.rst).
 """
 
 from __future__ import annotations
