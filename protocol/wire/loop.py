@@ -23,7 +23,8 @@ class LoopSettings(BaseModel, extra="forbid"):
 
     realtime: Literal["strict", "try", "off"] = Field(
         default="try",
-        description="request SCHED_FIFO, locked memory, affinity; strict: refuse to run without; off: request none",
+        description="request SCHED_FIFO, locked memory, affinity, and CPUs that stay awake; strict: refuse to run "
+        "without the first three; off: request none",
     )
     priority: int = Field(default=10, ge=1, le=99, description="SCHED_FIFO priority")
     cpus: list[int] = Field(default=[], description="CPUs to run on; all if empty")
