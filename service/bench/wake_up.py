@@ -49,8 +49,8 @@ class Plan(NamedTuple):
     seconds: float
 
 
-FULL: Final = Plan(rates_hz=(500.0, 1000.0), turns=9, seconds=2.5)
-QUICK: Final = Plan(rates_hz=(1000.0,), turns=5, seconds=1.0)
+FULL: Final = Plan(rates_hz=(500.0, 1000.0), turns=7, seconds=4.0)
+QUICK: Final = Plan(rates_hz=(1000.0,), turns=3, seconds=1.5)
 
 
 class WakeUp(NamedTuple):
