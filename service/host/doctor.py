@@ -49,8 +49,11 @@ def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None
     """Check the settings, then run the trial; `progress` is called five times a second with its elapsed time [s]."""
     findings = _settings()
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
-    advice = "run it as a service; for idle CPUs, let the user write to the device, or use tuned's latency-performance"
-    findings += [Finding(what="set-up", good=False, found=line, advice=advice) for line in refusals]
+    awake = "let the user write to it, or use tuned's profile latency-performance"
+    findings += [
+        Finding(what="set-up", good=False, found=line, advice=awake if "CPUs sleep" in line else "run it as a service")
+        for line in refusals
+    ]
     timing, grid = LoopTiming(warm_up_ns=500_000_000), TickGrid(loop.period_ns)
     ticks, report_every = loop.ticks(CHECK_S), max(1, loop.ticks(0.2))
     while grid.tick < ticks:
