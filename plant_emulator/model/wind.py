@@ -49,16 +49,21 @@ class Wind:
         self._keep = exp(-period / settings.gust_time_s)
         self._kick = deviation * sqrt(1 - self._keep**2)
         self._random = np.random.default_rng(settings.seed)
-        self._gust = deviation * self._random.standard_normal(axes)
+        self._gust: list[float] = (deviation * self._random.standard_normal(axes)).tolist()
         self._block: list[list[float]] = []
 
     def sample(self) -> list[float]:
         """Torque about each axis for the next period [N·m]. Shape (axes,)."""
         if not self._block:
-            torques = np.tile(self._steady, (_BLOCK, 1))
-            if self._kick:
-                for row, kick in zip(torques, self._random.standard_normal(torques.shape) * self._kick, strict=True):
-                    self._gust = self._keep * self._gust + kick
-                    row += self._gust
-            self._block = torques[::-1].tolist()
+            self._block = self._draw()[::-1]
         return self._block.pop()
+
+    def _draw(self) -> list[list[float]]:
+        steady: list[float] = self._steady.tolist()
+        if not self._kick:
+            return [steady] * _BLOCK
+        block = []
+        for kicks in (self._random.standard_normal((_BLOCK, len(steady))) * self._kick).tolist():
+            self._gust = [self._keep * gust + kick for gust, kick in zip(self._gust, kicks, strict=True)]
+            block.append([torque + gust for torque, gust in zip(steady, self._gust, strict=True)])
+        return block

@@ -11,12 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import log, nan
+from copy import copy
+from math import nan
+from typing import Final
 
 from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.hysteresis import SLACK, HysteresisQuantizer
 from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
 from aeroloop.protocol.wire.quantizer import TIE, CodedQuantizer, Continuous, Quantizer, UniformQuantizer
+
+NUMBERS: Final = ("deadzone", "step", "top", "limit", "hysteresis", "threshold", "growing")
+"""Attributes of quantizers that the expressions use; a kind has some of them."""
 
 
 @contextmanager
@@ -30,6 +35,19 @@ def as_written() -> Iterator[None]:
         yield
     finally:
         ca.GlobalOptions.setSimplificationOnTheFly(True)
+
+
+def numbers(quantizer: Quantizer) -> list[float]:
+    """The NUMBERS of a quantizer; 0 for those that its kind lacks."""
+    return [float(getattr(quantizer, name, 0.0)) for name in NUMBERS]
+
+
+def with_numbers(quantizer: Quantizer, symbols: ca.SX) -> Quantizer:
+    """A quantizer for `level` and `encode` whose NUMBERS are inputs, so that one function serves all of its kind."""
+    symbolic = copy(quantizer)
+    for i, name in enumerate(NUMBERS):
+        setattr(symbolic, name, symbols[i])
+    return symbolic
 
 
 def level(quantizer: Quantizer, code: ca.SX) -> ca.SX:
@@ -90,6 +108,6 @@ def _edge(quantizer: LogarithmicQuantizer, i: ca.SX) -> ca.SX:
 def _intervals(quantizer: LogarithmicQuantizer, value: ca.SX) -> ca.SX:
     """How many edges lie below a value: by logarithm and division, so it may be wrong by one."""
     m, ratio = quantizer.growing, quantizer.threshold / quantizer.deadzone
-    growing = ca.ceil(ca.log(ca.fmax(value, quantizer.deadzone) / quantizer.deadzone) / log(ratio) * m)
+    growing = ca.ceil(ca.log(ca.fmax(value, quantizer.deadzone) / quantizer.deadzone) / ca.log(ratio) * m)
     alike = m + ca.ceil((value - quantizer.threshold) / quantizer.step)
     return ca.if_else(value < quantizer.threshold, growing, alike)
