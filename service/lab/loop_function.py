@@ -164,7 +164,7 @@ class Loop:
         for name, column in columns.items():
             rows[name][:ticks] = column
         out = np.empty((blocks * BLOCK, sum(self._outputs.values())))
-        given["state"][:] = memoryview(state)
+        np.asarray(given["state"])[:] = state
         after = np.asarray(outputs["after"]).reshape(BLOCK, -1)
         for start in range(0, ticks, BLOCK):
             block = slice(start, start + BLOCK)
