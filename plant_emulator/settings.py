@@ -109,6 +109,11 @@ class PlantSettings(BaseModel, extra="forbid"):
         parts = {"aero": IDEAL_AERO, "rotor": rotor, "friction": friction, "wind": WindSettings()}
         return self.model_copy(update={**parts, "sensors": IDEAL_SENSORS, "ideal": False})
 
+    @property
+    def actuators(self) -> int:
+        """Number of motors of the emulated plant."""
+        return RigidBody.actuators if self.kind == "rigid_body" else Aero.actuators
+
     def mechanism(self) -> Mechanism:
         """The body, of `effective` settings."""
         return RigidBody(self.rigid_body) if self.kind == "rigid_body" else Aero(self.aero)

@@ -7,6 +7,7 @@ stepped exactly, so that its statistics do not depend on the period.
 
 from __future__ import annotations
 
+from itertools import accumulate
 from math import exp, hypot, sqrt
 
 from pydantic import BaseModel, Field
@@ -59,11 +60,16 @@ class Wind:
         return self._block.pop()
 
     def _draw(self) -> list[list[float]]:
-        steady: list[float] = self._steady.tolist()
-        if not self._kick:
-            return [steady] * _BLOCK
-        block = []
-        for kicks in (self._random.standard_normal((_BLOCK, len(steady))) * self._kick).tolist():
-            self._gust = [self._keep * gust + kick for gust, kick in zip(self._gust, kicks, strict=True)]
-            block.append([torque + gust for torque, gust in zip(steady, self._gust, strict=True)])
+        torques = np.tile(self._steady, (_BLOCK, 1))
+        if self._kick:
+            kicks = (self._random.standard_normal(torques.shape) * self._kick).T.tolist()
+            gusts = [
+                list(accumulate(each, self._next, initial=gust)) for each, gust in zip(kicks, self._gust, strict=True)
+            ]
+            self._gust = [each[-1] for each in gusts]
+            torques += np.array(gusts).T[1:]
+        block: list[list[float]] = torques.tolist()
         return block
+
+    def _next(self, gust: float, kick: float) -> float:
+        return self._keep * gust + kick

@@ -61,9 +61,8 @@ def experiment(
             progress(reported * loop.period)
             reported += max(1, report_every)
 
-    fits = settings.plant.effective.mechanism().actuators == wire.actuators
     course = None
-    if ticks and fits and not settings.plant.faults:
+    if ticks and settings.plant.actuators == wire.actuators and not settings.plant.faults:
         course = loop_of(settings).run(settings, ticks, report)
     if course is None:
         return Experiment(through_frames(settings, duration_s, progress, watch), "frames")

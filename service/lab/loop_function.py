@@ -67,6 +67,7 @@ class Loop:
     def __init__(self, settings: Settings) -> None:
         law, wire, period, plant = settings.law, settings.wire, settings.loop.period, settings.plant.effective
         self._mechanism = mechanism = plant.mechanism()
+        self._initially = initially(mechanism)
         step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
         self._sizes = {
             "x": step.numel_in("x"),
@@ -184,7 +185,7 @@ class Loop:
         """The state at the first measurement; wind and gyro's error of every period, drawn as the plant draws them."""
         plant, wire, period = settings.plant.effective, settings.wire, settings.loop.period
         wind, sensors = Wind(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
-        seen = sensors.read(*initially(self._mechanism))
+        seen = sensors.read(*self._initially)
         x = [*self._mechanism.initial, *([0.0] * (self._sizes["x"] - len(self._mechanism.initial)))]
         held = [np.nan] * (6 + wire.actuators)
         quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
