@@ -126,9 +126,7 @@ class Sensors:
         return self._given["held"].tolist()  # type: ignore[return-value]  # doubles
 
     def error(self) -> Vector:
-        """Draw a gyro's next error, noise and bias; 0 without a gyro [rad/s]."""
-        if self._settings.rate != "gyro":
-            return 0.0, 0.0, 0.0
+        """Draw a gyro's next error, noise and bias [rad/s]."""
         if not self._noise:
             drawn = self._random.standard_normal((_BLOCK, 3)) * self._settings.gyro_noise + self._settings.gyro_bias
             self._noise = [tuple(row) for row in drawn.tolist()]

@@ -88,7 +88,7 @@ class Loop:
         with as_written():
             self.tick = self._tick(settings, functions, gains)
         self._in_c: ca.Function | None = None
-        self._run = self._blocks(self.tick)
+        self._map(self.tick)
         self._desired: tuple[object, Floats] = None, np.empty(0)
 
     def _tick(
@@ -148,35 +148,31 @@ class Loop:
             {"cse": True},
         )
 
-    @staticmethod
-    def _blocks(tick: ca.Function) -> Compiled:
-        return Compiled(tick.mapaccum("loop", BLOCK))
+    def _map(self, tick: ca.Function) -> None:
+        self._block = Compiled(tick.mapaccum("loop", BLOCK))
+        inputs, outputs = self._block.inputs, self._block.outputs
+        self._state = np.asarray(inputs["state"])
+        self._rows = {name: np.asarray(inputs[name]).reshape(BLOCK, -1) for name in ("desired", "wind", "error")}
+        self._after, self._out = (np.asarray(outputs[name]).reshape(BLOCK, -1) for name in ("after", "out"))
 
     def run(self, settings: Settings, ticks: int, report: Callable[[int], None] = lambda _: None) -> Run | None:
         """Run so many ticks, at least one; None if anything is abnormal. `report` is called with the ticks done."""
         if ticks >= COMPILED_FROM and self._in_c is None:
             self._in_c = in_c(self.tick) or self.tick
-            self._run = self._blocks(self._in_c)
-        given, outputs = self._run.inputs, self._run.outputs
-        blocks = -(-ticks // BLOCK)
-        state, wind, error = self._begin(settings, ticks)
-        columns = {"desired": self._wanted(settings, ticks), "wind": wind, "error": error}
-        rows = {name: np.zeros((blocks * BLOCK, column.shape[1])) for name, column in columns.items()}
-        for name, column in columns.items():
-            rows[name][:ticks] = column
-        out = np.empty((blocks * BLOCK, sum(self._outputs.values())))
-        np.asarray(given["state"])[:] = state
-        after = np.asarray(outputs["after"]).reshape(BLOCK, -1)
+            self._map(self._in_c)
+        given = {"desired": self._wanted(settings, ticks)}
+        self._state[:], given["wind"], given["error"] = self._begin(settings, ticks)
+        out = np.empty((ticks, sum(self._outputs.values())))
         for start in range(0, ticks, BLOCK):
-            block = slice(start, start + BLOCK)
-            for name, column in rows.items():
-                np.asarray(given[name])[:] = column[block].ravel()
-            self._run()
-            np.asarray(given["state"])[:] = after[-1]
-            out[block] = np.asarray(outputs["out"]).reshape(BLOCK, -1)
-            report(min(ticks, start + BLOCK))
+            rows = min(BLOCK, ticks - start)  # of the last block the rest is computed in vain
+            for name, column in given.items():
+                self._rows[name][:rows] = column[start : start + rows]
+            self._block()
+            self._state[:] = self._after[-1]
+            out[start : start + rows] = self._out[:rows]
+            report(start + rows)
         ends = np.cumsum(list(self._outputs.values()))
-        parts = dict(zip(self._outputs, np.split(out[:ticks], ends[:-1], axis=1), strict=True))
+        parts = dict(zip(self._outputs, np.split(out, ends[:-1], axis=1), strict=True))
         u, seen = parts.pop("u"), parts.pop("seen")
         run = Run(**parts)
         return run if _normal(settings, run.voltages, u, seen) else None
@@ -191,10 +187,12 @@ class Loop:
         quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
         first = [*x, *IDENTITY, *settings.law.damping_estimate, 0.0, *seen.attitude, *seen.rate, *sensors.held, *held]
         state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros])
-        torque = np.zeros((ticks, self._mechanism.axes))
+        torque, error = np.zeros((ticks, self._mechanism.axes)), np.zeros((ticks, 3))
         if not wind.calm:
             torque[:] = [wind.sample() for _ in range(ticks)]
-        return state, torque, np.array([sensors.error() for _ in range(ticks)])
+        if plant.sensors.rate == "gyro":
+            error[:] = [sensors.error() for _ in range(ticks)]
+        return state, torque, error
 
     def _wanted(self, settings: Settings, ticks: int) -> Floats:
         """The desired motion; the last one is kept, as the cells of a table share it."""
