@@ -59,10 +59,9 @@ class Loop:
 
     Attributes:
         tick: One tick. Inputs: state; desired (q_d, ω_d, ω̇_d), wind [N·m], error of the gyro [rad/s]. Outputs: after,
-            the next state; out, what `OUTPUTS` names.
+            the next state; out, what was measured, commanded and seen.
+        in_c: Whether it runs as compiled C.
     """
-
-    OUTPUTS: Final = ("measured", "commanded", "voltages", "errors", "u", "seen")
 
     def __init__(self, settings: Settings) -> None:
         law, wire, period, plant = settings.law, settings.wire, settings.loop.period, settings.plant.effective
@@ -87,7 +86,7 @@ class Loop:
         gains = [ca.SX(gain) for gain in (law.C1, law.C2, law.Gamma)]
         with as_written():
             self.tick = self._tick(settings, functions, gains)
-        self._in_c: ca.Function | None = None
+        self.in_c = self._tried_c = False
         self._map(self.tick)
         self._desired: tuple[object, Floats] = None, np.empty(0)
 
@@ -157,9 +156,11 @@ class Loop:
 
     def run(self, settings: Settings, ticks: int, report: Callable[[int], None] = lambda _: None) -> Run | None:
         """Run so many ticks, at least one; None if anything is abnormal. `report` is called with the ticks done."""
-        if ticks >= COMPILED_FROM and self._in_c is None:
-            self._in_c = in_c(self.tick) or self.tick
-            self._map(self._in_c)
+        if ticks >= COMPILED_FROM and not self._tried_c:
+            self._tried_c = True
+            if (compiled := in_c(self.tick)) is not None:
+                self.in_c = True
+                self._map(compiled)
         given = {"desired": self._wanted(settings, ticks)}
         self._state[:], given["wind"], given["error"] = self._begin(settings, ticks)
         out = np.empty((ticks, sum(self._outputs.values())))
