@@ -17,6 +17,7 @@ from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import ConfigError, Settings, as_overrides, load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import c_code, experiment, loop_function
+from aeroloop.service.lab.bare_loop import bare_loop
 from aeroloop.service.lab.experiment import LoopEndedError, experiment_figures, through_frames
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
 from aeroloop.service.lab.traffic import frames_of, sent_ticks
@@ -226,3 +227,14 @@ def test_nothing_is_held_before_the_first_measurement() -> None:
     wire = {"actuators": 3, "rate": {"kind": "hysteresis-uniform"}}
     settings = load(overrides=as_overrides({"plant": plant, "wire": wire, "law": LAW}))
     assert_the_same(settings, ticks=20)
+
+
+@needs_a_compiler
+def test_the_floor_that_time_is_compared_with_is_the_same_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    settings = load(overrides=VARIED[1])
+    floor, course = bare_loop(settings, TICKS), loop_of(settings).run(settings, TICKS)
+    assert floor is not None
+    assert course is not None
+    for _ in range(2):  # it can be timed again
+        assert np.array_equal(floor()[:, :8], np.hstack([course.measured, course.commanded]))
