@@ -35,11 +35,9 @@ def bare_loop(settings: Settings, ticks: int) -> Callable[[], Floats] | None:
     """A function that runs so many ticks and returns `out` of each; None without a C compiler. Shape (ticks, …)."""
     loop = loop_of(settings)
     tick = loop.tick
-    arguments, results, integers, work = (
-        max(1, size) for size in (tick.sz_arg(), tick.sz_res(), tick.sz_iw(), tick.sz_w())
-    )
     sizes = {name: tick.numel_in(name) for name in tick.name_in()} | {"out": tick.numel_out("out")}
-    scratch = {"arguments": arguments, "results": results, "integers": integers, "work": work}
+    memory = {"integers": tick.sz_iw() + 1, "work": tick.sz_w() + 1}
+    scratch = {"arguments": tick.sz_arg(), "results": tick.sz_res(), **memory}
     library = library_of(source_of(tick) + _LOOP.format(**sizes, **scratch))
     if library is None:
         return None

@@ -24,9 +24,9 @@ _COMPILE_S: Final = 120.0
 
 def in_c(function: ca.Function) -> ca.Function | None:
     """The same function in C, compiled now or before; None where that fails."""
-    made = library_of(source_of(function))
+    library = library_of(source_of(function))
     try:
-        return made and ca.external(function.name(), str(made))
+        return ca.external(function.name(), str(library)) if library is not None else None
     except RuntimeError:  # not a library
         return None
 

@@ -193,18 +193,14 @@ class Loop:
             torque[:] = [wind.sample() for _ in range(ticks)]
         if plant.sensors.rate == "gyro":
             error[:] = [sensors.error() for _ in range(ticks)]
-        return {
-            "state": state,
-            "desired": np.ascontiguousarray(self._wanted(settings, ticks)),
-            "wind": torque,
-            "error": error,
-        }
+        return {"state": state, "desired": self._wanted(settings, ticks), "wind": torque, "error": error}
 
     def _wanted(self, settings: Settings, ticks: int) -> Floats:
         """The desired motion; the last one is kept, as the cells of a table share it."""
         key = settings.reference, ticks
         if self._desired[0] != key:
-            self._desired = key, desired(settings.reference, settings.loop.period, ticks)
+            rows = desired(settings.reference, settings.loop.period, ticks)
+            self._desired = key, np.ascontiguousarray(rows)
         return self._desired[1]
 
 
