@@ -44,9 +44,9 @@ def library_of(source: str) -> Path | None:
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         return None
-    built = Path(compiler).resolve().stat()
-    identity = f"{compiler} {built.st_size} {built.st_mtime_ns} {FLAGS}\n{source}"
     try:
+        built = Path(compiler).resolve().stat()
+        identity = f"{compiler} {built.st_size} {built.st_mtime_ns} {FLAGS}\n{source}"
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aeroloop"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         library = folder / f"{sha256(identity.encode()).hexdigest()}.so"
@@ -54,7 +54,7 @@ def library_of(source: str) -> Path | None:
             os.utime(library)
         else:
             _compile(compiler, source, library)
-    except (OSError, subprocess.SubprocessError):
+    except (OSError, RuntimeError, subprocess.SubprocessError):  # RuntimeError: there is no home
         return None
     return library
 

@@ -1,4 +1,4 @@
-"""Tables C.2–C.4 of the paper, predicted: one experiment per cell, in lockstep through real frames.
+"""Tables C.2–C.4 of the paper, predicted: one experiment per cell, in lockstep.
 
 The plant was calibrated on two cells without quantization: calm (C.2, C.3) and windy (C.4). All others are predictions,
 and only these count in the mean absolute relative error. Baselines without physics stand beside it.
