@@ -68,34 +68,23 @@ class Loop:
         self._mechanism = mechanism = plant.mechanism()
         self._initially = initially(mechanism)
         step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
-        self._sizes = {
-            "x": step.numel_in("x"),
-            "last": 4,
-            "theta": 3,
-            "sign": 1,
-            "seen": 7,
-            "filters": 4,
-            "measured": 6,
-            "commanded": wire.actuators,
-            "numbers": 3 * len(NUMBERS),
-            "zeros": 2,
-        }
-        self._outputs = {"measured": 6, "commanded": wire.actuators, "voltages": wire.actuators, "errors": 3}
-        self._outputs |= {"u": wire.actuators, "seen": 7}
+        held = {"measured": 6, "commanded": wire.actuators, "numbers": 3 * len(NUMBERS), "zeros": 2}
+        sizes = {"x": step.numel_in("x"), "last": 4, "theta": 3, "sign": 1, "seen": 7, "filters": 4, **held}
+        self._still = [0.0] * (sizes["x"] - len(mechanism.initial))
         functions = law_function(law, period), step, sensor_function(plant.sensors, period)
-        gains = [ca.SX(gain) for gain in (law.C1, law.C2, law.Gamma)]
         with as_written():
-            self.tick = self._tick(settings, functions, gains)
+            self.tick = self._tick(settings, sizes, functions)
         self.in_c = self._tried_c = False
         self._map(self.tick)
         self._desired: tuple[object, Floats] = None, np.empty(0)
 
     def _tick(
-        self, settings: Settings, functions: tuple[ca.Function, ca.Function, ca.Function], gains: list[ca.SX]
+        self, settings: Settings, sizes: dict[str, int], functions: tuple[ca.Function, ca.Function, ca.Function]
     ) -> ca.Function:
         law, step, sensors = functions
+        gains = [ca.SX(gain) for gain in (settings.law.C1, settings.law.C2, settings.law.Gamma)]
         wire, limit = settings.wire, settings.plant.voltage_limit
-        state = {name: ca.SX.sym(name, size) for name, size in self._sizes.items()}
+        state = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
         wanted, wind, error = ca.SX.sym("desired", 10), ca.SX.sym("wind", step.numel_in("wind")), ca.SX.sym("error", 3)
         signals: list[SignalSpec] = [wire.attitude, wire.rate, wire.voltage]
         attitude, rate, voltage = (
@@ -125,23 +114,15 @@ class Loop:
         if not true[2].numel():
             true[2] = ca.SX.zeros(2)  # a free body has no joints, and so no encoders
         next_seen, filters = sensors.call([*true, state["filters"], state["zeros"], error])
-        codes = ca.vertcat(*measured), ca.vertcat(*commanded)
-        after = [
-            x,
-            answer["q"],
-            answer["theta_next"],
-            sign,
-            next_seen,
-            filters,
-            *codes,
-            state["numbers"],
-            state["zeros"],
-        ]
-        out = [*codes, voltages, answer["eps_e"], u, seen]
+        codes = {"measured": ca.vertcat(*measured), "commanded": ca.vertcat(*commanded)}
+        learned = {"last": answer["q"], "theta": answer["theta_next"], "sign": sign}
+        after = {**state, **codes, **learned, "x": x, "seen": next_seen, "filters": filters}
+        out = {**codes, "voltages": voltages, "errors": answer["eps_e"], "u": u, "seen": seen}
+        self._outputs = {name: part.numel() for name, part in out.items()}
         return ca.Function(
             "tick",
             [ca.vertcat(*state.values()), wanted, wind, error],
-            [ca.densify(ca.vertcat(*after)), ca.densify(ca.vertcat(*out))],
+            [ca.densify(ca.vertcat(*parts.values())) for parts in (after, out)],
             ["state", "desired", "wind", "error"],
             ["after", "out"],
             {"cse": True},
@@ -183,9 +164,9 @@ class Loop:
         plant, wire, period = settings.plant.effective, settings.wire, settings.loop.period
         wind, sensors = Wind(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
         seen = sensors.read(*self._initially)
-        x = [*self._mechanism.initial, *([0.0] * (self._sizes["x"] - len(self._mechanism.initial)))]
         held = [np.nan] * (6 + wire.actuators)
         quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
+        x = *self._mechanism.initial, *self._still
         first = [*x, *IDENTITY, *settings.law.damping_estimate, 0.0, *seen.attitude, *seen.rate, *sensors.held, *held]
         state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros])
         torque, error = np.zeros((ticks, self._mechanism.axes)), np.zeros((ticks, 3))
