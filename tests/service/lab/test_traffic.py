@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from math import nan
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import SILENCE, Sender
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.burden import POLICIES, observe
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.lab.traffic import codes_of, sent_ticks, traffic
+from aeroloop.service.lab.traffic import codes_of, frames_of, sent_ticks, traffic
 
 KIND = FrameFormat([6, 6], 4)
 CODES = np.array([(0, 0), (0, 0), (0, 1), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0), (2, 0)], float)
@@ -97,3 +101,21 @@ def test_a_loop_that_sends_on_change_sends_those_frames_and_no_others(overrides:
 def _on_change(settings: Settings) -> Settings:
     transmit = settings.wire.transmit.model_copy(update={"measurement": "on_change", "command": "on_change"})
     return settings.model_copy(update={"wire": settings.wire.model_copy(update={"transmit": transmit})})
+
+
+@given(
+    st.lists(st.sampled_from([(0.0, 1.0), (-0.0, 1.0), (nan, 1.0), (2.0, 1.0)]), min_size=1, max_size=40),
+    st.integers(1, 7),
+)
+def test_ticks_sent_are_those_of_a_sender(codes: list[tuple[float, float]], heartbeat: int) -> None:
+    sender = Sender("on_change", heartbeat, 16)
+    sent = [k for k, each in enumerate(codes) if sender.due(k, each)]
+    assert sent_ticks(np.array(codes), "on_change", heartbeat).tolist() == sent
+
+
+def test_frames_of_codes_have_those_codes_and_count() -> None:
+    kind = FrameFormat([6, None, 3], 4)
+    codes = np.array([(k - 8, 0.1 * k, -2) for k in range(17)])
+    frames = frames_of(codes, kind)
+    assert np.array_equal(codes_of(frames, kind), codes)
+    assert [kind.counter(frame) for frame in frames] == [k % 16 for k in range(17)]
