@@ -60,7 +60,8 @@ def test_the_fitted_cells_do_not_count_in_the_error(tables: Tables) -> None:
 
 def test_json_has_the_papers_shape_and_markdown_every_cell(tables: Tables) -> None:
     document = json.loads(tables.model_dump_json())
-    assert set(document) == {"C2", "C3", "C4"}
+    assert set(document) == {"C2", "C3", "C4", "path"}
+    assert document["path"] == "compiled"
     for name, published in (("C2", paper.Z_TRACK), ("C3", paper.U_TOTAL)):
         assert document[name]["paper"] == [list(row) for row in published]
         assert [len(row) for row in document[name]["ours"]] == [4] * 6
