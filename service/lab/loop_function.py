@@ -32,7 +32,7 @@ from aeroloop.service.lab.c_code import in_c
 BLOCK: Final = 512
 """Ticks of one call."""
 COMPILED_FROM: Final = 20_000
-"""Ticks of a run from which on its function is compiled to C, which takes as long as some 30 000 ticks without."""
+"""Ticks of a run from which on its function is compiled to C, which takes as long as some 40 000 ticks without."""
 _LOOPS: Final = 8
 _NEAR: Final = 1e-9
 """A value this close to a limit, as a part of it, is left to the frames: sums and roots round differently."""
