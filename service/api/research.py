@@ -41,7 +41,9 @@ def run_experiment(
     controller: Controller | None = None,
     watch: Callable[[int, bytes, bytes], None] | None = None,
 ) -> Figures:
-    """Run controller and plant in lockstep in this process, through real frames; it repeats bit for bit.
+    """Run controller and plant in lockstep in this process; it repeats bit for bit.
+
+    Without `plant`, `controller` and `watch` the whole loop is one compiled function, with the same bits.
 
     Args:
         settings: The configuration; the defaults (the paper's experiment at 8 and 6 bits) if None.

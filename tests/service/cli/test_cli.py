@@ -134,6 +134,7 @@ def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixtur
         "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
         "latency_us", "log",
     }  # fmt: skip
+    assert figures["path"] == "compiled"
     assert figures["measurement"] == {"frames_per_s": 500.0, "bits_per_s": 28000.0}
     for name in ("latency_us", "log"):  # null, with the reason beside it
         assert figures[name] is None

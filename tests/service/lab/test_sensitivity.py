@@ -27,6 +27,8 @@ def _result(settings: Settings, cell: Cell) -> Result:
 class Pool:
     """`cells.Pool` without processes."""
 
+    path = "compiled"
+
     def __enter__(self) -> Self:
         return self
 
