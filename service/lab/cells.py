@@ -30,15 +30,18 @@ class Result(NamedTuple):
     u_total: float  # [V²·s]
 
 
+def with_seed(settings: Settings, seed: int) -> Settings:
+    """The settings with this seed of wind and sensors."""
+    plant = settings.plant
+    drawn = {name: getattr(plant, name).model_copy(update={"seed": seed}) for name in ("wind", "sensors")}
+    return settings.model_copy(update={"plant": plant.model_copy(update=drawn)})
+
+
 def run_cell(config: dict[str, Any], cell: Cell) -> Result:
     """Run one cell of a configuration's dump."""
-    settings = Settings.model_validate(config)
-    plant = settings.plant.model_copy(
-        update={
-            "wind": settings.plant.wind.model_copy(update={"blowing": cell.windy, "seed": cell.seed}),
-            "sensors": settings.plant.sensors.model_copy(update={"seed": cell.seed}),
-        }
-    )
+    settings = with_seed(Settings.model_validate(config), cell.seed)
+    wind = settings.plant.wind.model_copy(update={"blowing": cell.windy})
+    plant = settings.plant.model_copy(update={"wind": wind})
     wire = settings.wire.with_bits(cell.bits_out, cell.bits_in)
     figures = run_experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S)
     assert figures.z_track is not None
