@@ -50,6 +50,14 @@ BitsOut = Annotated[
     str | None, typer.Option(metavar="R|cont", help="Bits of ε and ω, 2…16, or cont.", show_default=False)
 ]
 BitsIn = Annotated[str | None, typer.Option(metavar="R|cont", help="Bits of u, 2…16, or cont.", show_default=False)]
+EngineOption = Annotated[
+    str,
+    typer.Option(
+        "--engine",
+        metavar="processes|dask:ADDRESS",
+        help="Run on every core, or on the workers of a Dask cluster, which trusts its network: TLS, or a private one.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files; never a log.")]
 Markdown = Annotated[bool, typer.Option("--markdown", help="Print Markdown.")]

@@ -15,6 +15,7 @@ from aeroloop.service.cli.common import (
     BitsOut,
     Config,
     Duration,
+    EngineOption,
     Force,
     Json,
     Markdown,
@@ -60,6 +61,7 @@ def tables(
     sensitivity: Annotated[
         bool, typer.Option("--sensitivity", help="Print how the errors change with what was not fitted; takes minutes.")
     ] = False,
+    engine: EngineOption = "processes",
     markdown: Markdown = False,
     json: Json = False,
     config: Config = None,
@@ -67,6 +69,7 @@ def tables(
 ) -> None:
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
     settings = settings_of(config, overrides)
+    _check_engine(engine)
     from aeroloop.service.lab.tables import markdown as as_markdown
     from aeroloop.service.lab.tables import markdown_table, predict
     from aeroloop.service.terminal.display import count_bar, paper_tables, rows_table
@@ -75,12 +78,12 @@ def tables(
         from aeroloop.service.lab.sensitivity import measure_sensitivity, rows
 
         with guarded(), count_bar("cells", hidden=json) as update:
-            changes = measure_sensitivity(settings, seeds, update)
+            changes = measure_sensitivity(settings, seeds, update, engine)
         text = rows(changes)
         show(changes, json, lambda _: typer.echo(markdown_table(text)) if markdown else rows_table(text))
         return
     with guarded(), count_bar("cells", hidden=json) as update:
-        result = predict(settings, seeds, update)
+        result = predict(settings, seeds, update, engine)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)
 
 
@@ -176,12 +179,12 @@ def certify(
     raise typer.Exit(0 if result.holds else 1)
 
 
-def _attacked(settings: Settings, runs: int, *, json: bool, **options: Any) -> Attack:
+def _attacked(settings: Settings, runs: int, *, json: bool, engine: str = "processes", **options: Any) -> Attack:
     from aeroloop.service.lab.attack import attack
     from aeroloop.service.lab.workers import Workers
     from aeroloop.service.terminal.display import count_bar
 
-    with guarded(), count_bar("experiments", hidden=json) as update, Workers() as workers:
+    with guarded(), count_bar("experiments", hidden=json) as update, Workers(engine) as workers:
         return attack(settings, runs, workers=workers, progress=update, **options)
 
 
@@ -211,6 +214,7 @@ def attack(
         Path | None,
         typer.Option(help="Append each round to this file of JSON lines; the next time, go on.", show_default=False),
     ] = None,
+    engine: EngineOption = "processes",
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every statement.")] = False,
@@ -220,9 +224,10 @@ def attack(
 ) -> None:
     """Search, as an adversary, for a run of the paper's body that breaks the certificate; exit 1 if one is found."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    _check_engine(engine)
     from aeroloop.service.terminal.attack_table import attack_table
 
-    options = {"seed": seed, "duration_s": duration, "seconds": seconds, "out": out}
+    options: dict[str, Any] = {"engine": engine, "seed": seed, "duration_s": duration, "seconds": seconds, "out": out}
     result = _attacked(settings, runs, disturbance=disturbance, json=json, **options)
     show(result, json, lambda found: attack_table(found, verbose=verbose))
     raise typer.Exit(1 if result.beaten else 0)
@@ -257,6 +262,7 @@ def burden(
         ),
     ] = None,
     duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
     figure: Annotated[
         Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
     ] = None,
@@ -274,17 +280,71 @@ def burden(
     from aeroloop.service.lab.burden_table import markdown as as_markdown
     from aeroloop.service.terminal.display import count_bar
 
+    _check_engine(engine)
     with checked():
         _check_figure(figure, config, force)
         cells = grid(settings, bits or (), quantizer or (), sensors or ())
     with guarded(), count_bar("experiments", hidden=json) as update:
-        result = measure_burden(settings, cells, duration, update)
+        result = measure_burden(settings, cells, duration, update, engine)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else burden_table)
     if figure is not None:
         from aeroloop.service.lab.burden_figure import draw_burden
 
         with _new_file(figure, config, force) as part:
             draw_burden(result, part)
+
+
+@group.command()
+def sweep(
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE.parquet",
+            help="Table of all experiments. Rows are kept in FILE.jsonl as they come: the same command goes on there.",
+            show_default=False,
+        ),
+    ],
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUES",
+            help="section.key=a,b,c or section.key=a..b*n, n values evenly from a to b; may be repeated, for every "
+            "combination.",
+            show_default=False,
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Runs of each combination, with seeds of wind and sensors from 0 up.")
+    ] = 1,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    force: Force = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run an experiment for every combination of values and seeds, and write a table of their figures."""
+    settings = settings_of(config, overrides)
+    _check_engine(engine)
+    from aeroloop.service.sweep.axes import parse_axes
+    from aeroloop.service.sweep.sweep import plan, rows_file, run_sweep
+    from aeroloop.service.sweep.table import check_table
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.sweep_table import sweep_table
+
+    with checked():
+        check_table(out, [config], force=force or rows_file(out).exists())  # the table of these rows may be made anew
+        planned = plan(settings, parse_axes(vary or ()), seeds, duration)
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = run_sweep(planned, out, engine=engine, progress=update)
+    show(result, json, sweep_table)
+
+
+def _check_engine(engine: str) -> None:
+    from aeroloop.service.lab.workers import check_engine
+
+    with checked():
+        check_engine(engine)
 
 
 def _check_figure(figure: Path | None, config: Path | None, force: bool) -> None:

@@ -38,6 +38,7 @@ app.add_typer(show.group, name="show")
 _EXTRAS: Final = {
     "can": ("python-can", "can"),
     "cantools": ("cantools", "can"),
+    "distributed": ("distributed", "dask"),
     "foxglove": ("foxglove-sdk", "foxglove"),
     "matplotlib": ("matplotlib", "review"),
     "plotly": ("plotly", "review"),

@@ -19,7 +19,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.lab.burden_grid import SENSORS, BurdenCell, BurdenError, cell_settings
 from aeroloop.service.lab.experiment import PATH, LoopEndedError, experiment, heartbeat_of, paths
 from aeroloop.service.lab.traffic import Traffic, codes_of, frames_of, sent_ticks, traffic
-from aeroloop.service.lab.workers import Workers
+from aeroloop.service.lab.workers import PROCESSES, Workers
 from aeroloop.service.lab.zenoh_bytes import LinkBytes, count_bytes
 
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
@@ -119,14 +119,16 @@ def measure_burden(
     cells: Sequence[BurdenCell],
     duration_s: float,
     progress: Callable[[int, int], None] | None = None,
+    engine: str = PROCESSES,
 ) -> Burden:
-    """Run a grid on every core.
+    """Run a grid on every worker.
 
     Args:
         settings: The configuration; each cell overrides its own fields.
         cells: Cells to run, with float64 for each of the sensors.
         duration_s: Length of each experiment [s].
         progress: Called with experiments done and experiments in all.
+        engine: As of `Workers`.
 
     Raises:
         BurdenError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
@@ -135,7 +137,7 @@ def measure_burden(
     jobs = [(cell_settings(settings, cell).description(), duration_s, cell.counted) for cell in cells]
     report = progress or (lambda _done, _total: None)
     report(0, len(jobs))
-    with Workers() as workers:
+    with Workers(engine) as workers:
         results = workers.each(observe, jobs, lambda done: report(done, len(jobs)))
     points = [point for cell, result in zip(cells, results, strict=True) for point in _points(cell, result)]
     sensors = dict.fromkeys(cell.sensors for cell in cells)

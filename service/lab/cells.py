@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from aeroloop.service.config import Settings
 from aeroloop.service.lab.experiment import experiment, paths
 from aeroloop.service.lab.paper import DURATION_S
-from aeroloop.service.lab.workers import Workers
+from aeroloop.service.lab.workers import PROCESSES, Workers
 
 
 class Cell(NamedTuple):
@@ -30,15 +30,18 @@ class Result(NamedTuple):
     u_total: float  # [V²·s]
 
 
+def with_seed(settings: Settings, seed: int) -> Settings:
+    """The settings with this seed of wind and sensors."""
+    plant = settings.plant
+    drawn = {name: getattr(plant, name).model_copy(update={"seed": seed}) for name in ("wind", "sensors")}
+    return settings.model_copy(update={"plant": plant.model_copy(update=drawn)})
+
+
 def run_cell(config: dict[str, Any], cell: Cell) -> tuple[Result, str]:
     """Run one cell of a configuration's dump. Returns its figures and the path that it took."""
-    settings = Settings.model_validate(config)
-    plant = settings.plant.model_copy(
-        update={
-            "wind": settings.plant.wind.model_copy(update={"blowing": cell.windy, "seed": cell.seed}),
-            "sensors": settings.plant.sensors.model_copy(update={"seed": cell.seed}),
-        }
-    )
+    settings = with_seed(Settings.model_validate(config), cell.seed)
+    wind = settings.plant.wind.model_copy(update={"blowing": cell.windy})
+    plant = settings.plant.model_copy(update={"wind": wind})
     wire = settings.wire.with_bits(cell.bits_out, cell.bits_in)
     figures, path, _ = experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S)
     assert figures.z_track is not None
@@ -49,8 +52,8 @@ def run_cell(config: dict[str, Any], cell: Cell) -> tuple[Result, str]:
 class Pool(Workers):
     """Processes that run cells, one a core. A context."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, engine: str = PROCESSES) -> None:
+        super().__init__(engine)
         self._paths: set[str] = set()
 
     def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:

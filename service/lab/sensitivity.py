@@ -20,6 +20,7 @@ from aeroloop.service.lab.calibrate import MEASURED_YAW_COULOMB, TABLE_C1_HEIGHT
 from aeroloop.service.lab.cells import Cell, Pool
 from aeroloop.service.lab.experiment import PATH
 from aeroloop.service.lab.tables import CASES
+from aeroloop.service.lab.workers import PROCESSES
 
 ROW: Final = 7
 """Bits of the input in all calm cells."""
@@ -47,7 +48,7 @@ class Sensitivity(BaseModel):
 
 
 def measure_sensitivity(
-    settings: Settings, seeds: int = 1, progress: Callable[[int, int], None] | None = None
+    settings: Settings, seeds: int = 1, progress: Callable[[int, int], None] | None = None, engine: str = PROCESSES
 ) -> Sensitivity:
     """Predict the tables as configured and after each change. Arguments as of `predict`."""
     changes = {"as configured": list[str](), **_changes(settings)}
@@ -58,7 +59,7 @@ def measure_sensitivity(
         for cell in cells
         for seed in range(seeds)
     ]
-    with Pool() as pool:
+    with Pool(engine) as pool:
         results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
     figures = np.array(results).reshape(len(changes), len(cells), seeds, 2).mean(axis=2)
     return Sensitivity(

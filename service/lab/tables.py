@@ -17,6 +17,7 @@ from aeroloop.service.lab import paper
 from aeroloop.service.lab.baselines import Baseline, baselines
 from aeroloop.service.lab.cells import Cell, Pool, Result
 from aeroloop.service.lab.experiment import PATH
+from aeroloop.service.lab.workers import PROCESSES
 
 CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
 _FIGURES: Final = {"z_track_1e-4": "z_track", "u_total": "u_total"}
@@ -54,18 +55,21 @@ class Tables(BaseModel):
     path: str = Field(description=PATH)
 
 
-def predict(settings: Settings, seeds: int = 1, progress: Callable[[int, int], None] | None = None) -> Tables:
+def predict(
+    settings: Settings, seeds: int = 1, progress: Callable[[int, int], None] | None = None, engine: str = PROCESSES
+) -> Tables:
     """Run every cell, `seeds` times each with seeds from 0 up.
 
     Args:
         settings: The configuration; each cell sets bits and wind.
         seeds: Number of runs per cell; a figure is their mean.
         progress: Called with cells done and cells in all.
+        engine: As of `Workers`.
     """
     calm = [(out, inp, False) for inp in paper.INPUT_BITS for out in paper.OUTPUT_BITS]
     windy = [(*bits, True) for bits in CASES.values()]
     jobs = [(settings, Cell(*cell, seed)) for cell in (*calm, *windy) for seed in range(seeds)]
-    with Pool() as pool:
+    with Pool(engine) as pool:
         results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
     runs = {cell: results[i * seeds : (i + 1) * seeds] for i, cell in enumerate((*calm, *windy))}
     grids = _grid(runs, "z_track", paper.Z_TRACK), _grid(runs, "u_total", paper.U_TOTAL)

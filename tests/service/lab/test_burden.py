@@ -7,7 +7,6 @@ import io
 import json
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -22,8 +21,8 @@ from aeroloop.service.lab.burden import Burden, measure_burden, pareto_front
 from aeroloop.service.lab.burden_figure import draw_burden
 from aeroloop.service.lab.burden_grid import BITS, COUNTED, QUANTIZERS, SENSORS, BurdenError, cell_settings, grid
 from aeroloop.service.lab.burden_table import HEADER, markdown
-from aeroloop.service.lab.workers import Workers
 from aeroloop.service.logs.outputs import OutputError
+from tests.support.in_this_process import InThisProcess
 
 BENCH = load()
 COSTS = st.lists(st.tuples(st.integers(0, 9).map(float), st.integers(0, 9).map(float)), max_size=30)
@@ -110,20 +109,6 @@ def test_what_there_is_not_is_refused_in_one_line_before_anything_runs(
     assert captured.out == ""
     assert len(captured.err.splitlines()) == 1
     assert names in captured.err
-
-
-class InThisProcess(Workers):
-    """Does the work itself."""
-
-    def __init__(self) -> None:
-        pass
-
-    def __exit__(self, *exception: object) -> None:
-        pass
-
-    def each(self, work: Any, jobs: Any, progress: Any = None) -> Any:
-        del progress
-        return [work(*job) for job in jobs]
 
 
 def test_where_float64_makes_no_error_there_is_nothing_to_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:

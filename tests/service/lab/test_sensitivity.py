@@ -29,6 +29,9 @@ class Pool:
 
     path = "compiled"
 
+    def __init__(self, engine: str) -> None:
+        del engine
+
     def __enter__(self) -> Self:
         return self
 

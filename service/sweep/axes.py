@@ -1,0 +1,127 @@
+"""Axes of a sweep: `--vary` as text, and every combination of its values as a configuration.
+
+Values are given as `--set` takes them, so an error in one reads as any error of the configuration. All combinations are
+checked before the first experiment runs.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Sequence
+from fractions import Fraction
+from hashlib import sha256
+from itertools import product
+from math import prod
+from typing import Any, Final, NamedTuple
+
+from aeroloop.service.config import ConfigError, Settings, load_over
+
+LIMIT: Final = 10_000_000
+"""Experiments of a sweep, at most: what fits into memory."""
+SECTIONS: Final = ("law", "loop", "plant", "reference", "wire")
+"""Sections of the configuration that an experiment depends on."""
+_SEEDS: Final = ("plant.wind.seed", "plant.sensors.seed")
+_NUMBER: Final = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,2})?"
+_RANGE: Final = re.compile(rf"({_NUMBER})\.\.({_NUMBER})\*(\d+)")
+
+
+class Axis(NamedTuple):
+    """A key of the configuration and its values, as `--set` takes them."""
+
+    key: str
+    values: tuple[str, ...]
+
+
+class Configuration(NamedTuple):
+    """One combination."""
+
+    overrides: tuple[str, ...]  # of the sweep's configuration
+    values: tuple[Any, ...]  # of the axes' keys, as the configuration has them; text where it has a section or a list
+    digest: str
+
+
+def parse_axes(texts: Sequence[str]) -> list[Axis]:
+    """Axes of `section.key=a,b,c` or `section.key=a..b*n`, n values evenly from a to b.
+
+    Raises:
+        ConfigError: Neither of them, no value, or a key that stands twice or that no experiment depends on.
+    """
+    axes = [_axis(text) for text in texts]
+    for i, axis in enumerate(axes):
+        if axis.key in (other.key for other in axes[:i]):
+            raise ConfigError(f"--vary gives {axis.key} twice: put all its values into one")
+        if axis.key in _SEEDS:
+            raise ConfigError(f"--vary {axis.key}: --seeds sets it")
+        if axis.key.partition(".")[0] not in SECTIONS:
+            raise ConfigError(f"--vary {axis.key}: an experiment depends on {', '.join(SECTIONS)} only")
+    return axes
+
+
+def _axis(text: str) -> Axis:
+    key, equals, values = map(str.strip, text.partition("="))
+    if not (key and equals and values):
+        raise ConfigError(f"--vary takes section.key=a,b,c or section.key=a..b*n, not {text!r}")
+    try:  # values as in a list of TOML, which may themselves be lists, or strings with commas
+        listed = tomllib.loads(f"values = [{values}]")["values"]
+    except tomllib.TOMLDecodeError:
+        return Axis(key, tuple(each for part in values.split(",") for each in _spread(part.strip(), text)))
+    return Axis(key, tuple(json.dumps(value, ensure_ascii=False, default=str) for value in listed))
+
+
+def _spread(part: str, text: str) -> list[str]:
+    """The values of a range, exact in decimals and whole where both ends are; or the one value that stands there."""
+    if not part:
+        raise ConfigError(f"--vary {text}: a value is missing")
+    if not re.match(rf"{_NUMBER}\.\.", part):
+        return [part]
+    found = _RANGE.fullmatch(part)
+    if found is None or not 2 <= int(found[3]) <= LIMIT:
+        raise ConfigError(f"--vary {text}: a range is a..b*n, of n values from 2 to {LIMIT}, not {part!r}")
+    low, high, last = Fraction(found[1]), Fraction(found[2]), int(found[3]) - 1
+    if low == high:
+        raise ConfigError(f"--vary {text}: the range {part!r} begins where it ends")
+    whole = all(re.fullmatch(r"[+-]?\d+", end) for end in (found[1], found[2]))
+    values = (low + (high - low) * i / last for i in range(last + 1))
+    return [str(int(value)) if whole and value.denominator == 1 else repr(float(value)) for value in values]
+
+
+def configurations(settings: Settings, axes: Sequence[Axis], seeds: int, duration_s: float) -> list[Configuration]:
+    """Every combination of the axes' values, the last axis fastest.
+
+    Raises:
+        ConfigError: One is no configuration, two are the same, or they are too many.
+    """
+    total = prod(len(axis.values) for axis in axes) * seeds
+    if total > LIMIT:
+        raise ConfigError(f"these are {total} experiments; a sweep has at most {LIMIT}")
+    found = dict[str, Configuration]()
+    for values in product(*(axis.values for axis in axes)):
+        overrides = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
+        description = load_over(settings, overrides).description()
+        columns = tuple(_column(description, *pair) for pair in zip(axes, values, strict=True))
+        digest = _digest(description, duration_s)
+        if digest in found:
+            raise ConfigError(f"--vary gives the same twice: {_words(found[digest].overrides)} and {_words(overrides)}")
+        found[digest] = Configuration(overrides, columns, digest)
+    return list(found.values())
+
+
+def _words(overrides: Sequence[str]) -> str:
+    return " ".join(overrides) or "the configuration"
+
+
+def _digest(description: dict[str, Any], duration_s: float) -> str:
+    """SHA-256 of what an experiment depends on but for the seed, however it was configured."""
+    parts: dict[str, Any] = {name: description[name] for name in SECTIONS}
+    parts["plant"] |= {name: {**parts["plant"][name], "seed": None} for name in ("wind", "sensors")}
+    canonical = json.dumps({**parts, "duration_s": duration_s}, sort_keys=True, separators=(",", ":"))
+    return sha256(canonical.encode()).hexdigest()
+
+
+def _column(description: Any, axis: Axis, given: str) -> Any:
+    value = description
+    for name in axis.key.split("."):
+        value = value[name] if isinstance(value, dict) else None
+    return given if isinstance(value, dict | list) else value

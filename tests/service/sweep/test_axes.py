@@ -1,0 +1,123 @@
+"""`--vary`: values, ranges, combinations, their names, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import ConfigError, load
+from aeroloop.service.config_sources import tree_of
+from aeroloop.service.sweep.axes import Axis, configurations, parse_axes
+
+BENCH = load()
+SCALARS = (
+    st.booleans() | st.integers(-99, 99) | st.floats(-9, 9).map(lambda x: round(x, 3)) | st.text("ab,[]=. ", max_size=4)
+)
+VALUES = SCALARS | st.lists(SCALARS, max_size=3)
+DECIMALS = st.decimals(-100, 100, places=2)
+
+
+def values_of(axis: Axis) -> list[Any]:
+    """What `--set` makes of each value."""
+    return [tree_of([f"key={value}"])["key"] for value in axis.values]
+
+
+@given(st.lists(VALUES, min_size=1, max_size=5))
+def test_values_are_those_of_a_list_whatever_they_hold(values: list[Any]) -> None:
+    [axis] = parse_axes([f"wire.x={','.join(map(json.dumps, values))}"])
+    assert axis.key == "wire.x"
+    assert values_of(axis) == values
+
+
+@given(DECIMALS, DECIMALS, st.integers(2, 50))
+def test_a_range_is_even_includes_both_ends_and_is_exact_in_decimals(low: Any, high: Any, n: int) -> None:
+    if low == high:
+        return
+    [axis] = parse_axes([f"wire.x={low}..{high}*{n}"])
+    exact = [Fraction(low) + (Fraction(high) - Fraction(low)) * i / (n - 1) for i in range(n)]
+    assert values_of(axis) == [float(value) for value in exact]
+
+
+def test_a_range_of_whole_numbers_stays_whole_where_it_can_and_stands_among_other_values() -> None:
+    for text, expected in (("6..12*4", [6, 8, 10, 12]), ("6..7*3", [6, 6.5, 7]), ("cont,4..6*2", ["cont", 4, 6])):
+        [axis] = parse_axes([f"wire.rate.bits={text}"])
+        found = values_of(axis)
+        assert found == expected
+        assert list(map(type, found)) == list(map(type, expected))
+
+
+@pytest.mark.parametrize(
+    ("vary", "names"),
+    [
+        (["nonsense"], "'nonsense'"),
+        (["=1,2"], "section.key=a,b,c"),
+        (["wire.rate.bits="], "'wire.rate.bits='"),
+        (["wire.rate.bits=cont,,8"], "a value is missing"),
+        (["wire.rate.bits=6..12*0"], "'6..12*0'"),
+        (["wire.rate.bits=6..12*1"], "'6..12*1'"),
+        (["wire.rate.bits=6..12"], "a..b*n"),
+        (["wire.rate.bits=8..8*3"], "'8..8*3'"),
+        (["wire.rate.bits=8,17"], 'wire.rate.bits must be a whole number from 2 to 16 or "cont", not 17'),
+        (["wire.rate.bits=6..7*3"], "6.5"),
+        (["wire.rate.bitz=8"], "did you mean wire.rate.bits?"),
+        (["wire.rate.bits=8,8"], "the same twice"),
+        (["wire.rate.bits=8", "wire.rate.bits=9"], "gives wire.rate.bits twice"),
+        (["plant.wind.seed=1,2"], "--seeds"),
+        (["recorder.chunk_s=1,2"], "law, loop, plant, reference, wire"),
+        (["wire.rate.limit=1..2*9999", "wire.attitude.limit=0.5..1*9999"], "at most"),
+        (["wire.rate.limit=1e999999999..2*3"], "wire.rate.limit"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_what_cannot_be_varied_is_refused_in_one_line_before_anything_is_written(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path, vary: list[str], names: str
+) -> None:
+    options = [word for text in vary for word in ("--vary", text)]
+    assert execute(["lab", "sweep", "--out", str(tmp_path / "a.parquet"), *options]) == 2
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert names in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_configurations_are_every_combination_the_last_axis_fastest_with_the_values_that_hold() -> None:
+    axes = parse_axes(["wire.voltage.bits=4,cont", "law.C2=[1,1,1],[2,2,2]", "wire.transmit=periodic,on_change"])
+    found = configurations(BENCH, axes, 1, 1.0)
+    assert [each.overrides for each in found] == [
+        tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
+        for values in product(*(axis.values for axis in axes))
+    ]
+    assert found[0].values == (4, "[1, 1, 1]", "periodic")
+    assert found[-1].values == (None, "[2, 2, 2]", "on_change")
+
+
+def test_a_configuration_has_one_name_however_it_was_configured() -> None:
+    def name(*overrides: str, vary: str = "wire.rate.bits=9", duration_s: float = 1.0) -> str:
+        [found] = configurations(load(overrides=list(overrides)), parse_axes([vary]), 1, duration_s)
+        return found.digest
+
+    same = name()
+    assert name("wire.rate.bits=9", vary="wire.voltage.bits=6") == name("wire.voltage.bits=6")
+    assert (
+        same == name("wire.rate.bits=5") == name("plant.wind.seed=7", "plant.sensors.seed=3") == name("vehicle=other")
+    )
+    others = {
+        name(duration_s=2.0), name(vary="wire.rate.bits=8"), name("plant.wind.blowing=true"), name("law.C2=[1, 1, 1]"),
+        name("reference.amplitude=[1, 2, 3]"), name("loop.rate_hz=400"), name("plant.sensors.gyro_noise=0.1"),
+    }  # fmt: skip
+    assert len(others) == 7
+    assert same not in others
+
+
+def test_a_combination_that_is_no_configuration_is_refused() -> None:
+    with pytest.raises(ConfigError, match="counter_bits = 4 counts"):
+        configurations(BENCH, parse_axes(["wire.counter_bits=4,8", "loop.rate_hz=500,1000"]), 1, 1.0)
