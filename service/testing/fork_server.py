@@ -35,6 +35,7 @@ _COMMAND: Final = "aeroloop.service.cli.entry"
 _PRELOADED: Final = (
     _COMMAND,
     "aeroloop.service.cli.main",
+    "aeroloop.service.cli.run",
     "aeroloop.service.terminal.encoding",
     "aeroloop.service.daemon.daemon",
     "aeroloop.service.daemon.plants",

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 
-from aeroloop.service.cli.main import app
 from aeroloop.service.cli.main import execute as run
+from aeroloop.service.cli.main import root
 from aeroloop.service.config import load
 
 
@@ -142,10 +141,9 @@ def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixtur
 
 def commands() -> list[list[str]]:
     """Every command, as the words that call it."""
-    root = typer.main.get_command(app)
-    groups: dict[str, Any] = root.commands  # type: ignore[attr-defined]  # of a group
-    verbs = [[name, verb] for name, group in groups.items() for verb in getattr(group, "commands", ())]
-    return [[], *([name] for name in groups), *verbs]
+    command: Any = root()
+    verbs = [[name, verb] for name, group in command.commands.items() for verb in group.list_commands(None)]
+    return [[], *([name] for name in command.list_commands(None)), *verbs]
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
