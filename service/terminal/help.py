@@ -33,7 +33,9 @@ class _Highlighter(RegexHighlighter):
 
 
 _highlight: Final = _Highlighter()
-_THEME: Final = Theme({"usage": "not bold yellow", "name": "bold cyan", "value": "bold yellow", "note": "dim", "must": "not dim red"})
+_THEME: Final = Theme(
+    {"usage": "not bold yellow", "name": "bold cyan", "value": "bold yellow", "note": "dim", "must": "not dim red"}
+)
 
 
 def print_help(command: TyperCommand | TyperGroup, ctx: Context) -> None:
