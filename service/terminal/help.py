@@ -32,7 +32,6 @@ class _Highlighter(RegexHighlighter):
     ]
 
 
-_highlight: Final = _Highlighter()
 _THEME: Final = Theme(
     {"usage": "not bold yellow", "name": "bold cyan", "value": "bold yellow", "note": "dim", "must": "not dim red"}
 )
@@ -40,9 +39,9 @@ _THEME: Final = Theme(
 
 def print_help(command: TyperCommand | TyperGroup, ctx: Context) -> None:
     """Print the help of a command, or of a group and its verbs, on stdout."""
-    console = Console(theme=_THEME)
-    console.print(Padding(_highlight(Text(command.get_usage(ctx), "bold")), 1))
-    console.print(Padding(_text(command.help), (0, 1, 1, 1)))
+    console = Console(theme=_THEME, highlighter=_Highlighter(), markup=False, emoji=False)
+    console.print(Padding(command.get_usage(ctx), 1), style="bold")
+    console.print(Padding(_unwrapped(command.help), (0, 1, 1, 1)))
     rows: dict[str, list[tuple[str, str | None]]] = {"argument": [], "option": [], "command": []}
     for parameter in command.get_params(ctx):
         if record := parameter.get_help_record(ctx):
@@ -55,13 +54,15 @@ def print_help(command: TyperCommand | TyperGroup, ctx: Context) -> None:
         if records:
             table = Table.grid(padding=(0, 2, 0, 0), expand=True)
             table.add_column()
-            table.add_column(ratio=1)
+            table.add_column(ratio=1, highlight=True)
             for names, about in records:
                 name, *value = re.split("(?<!,) ", names, maxsplit=1)
-                table.add_row(Text.assemble((name, "name"), *((f" {text}", "value") for text in value)), _text(about))
+                table.add_row(
+                    Text.assemble((name, "name"), *((f" {text}", "value") for text in value)), _unwrapped(about)
+                )
             console.print(Panel(table, title=f"{kind.capitalize()}s", title_align="left", border_style="dim"))
 
 
-def _text(text: str | None) -> Text:
+def _unwrapped(text: str | None) -> str:
     """The text without the line breaks inside its paragraphs."""
-    return _highlight(Text(re.sub(r"(?<!\n)\n(?!\n)", " ", text or "")))
+    return re.sub(r"(?<!\n)\n(?!\n)", " ", text or "")

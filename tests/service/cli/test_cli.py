@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -158,6 +161,15 @@ def test_h_is_help_everywhere_and_shows_no_type_beside_a_flag(
     assert "." in short
     assert "bool" not in short
     assert "…" not in short.replace("2…16", "").replace("…`", "")  # nothing is cut off
+
+
+def test_help_is_as_wide_as_its_frame_in_a_terminal_without_greek() -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "60"}
+    command = [sys.executable, "-P", "-m", "aeroloop", "lab", "certify", "--help"]
+    printed = subprocess.run(command, check=True, capture_output=True, encoding="ascii", env=environment).stdout
+    framed = [line for line in printed.splitlines() if line.startswith(("|", "+"))]
+    assert any("epsilon" in line for line in framed)
+    assert {len(line) for line in framed} == {60}
 
 
 def test_shells_can_complete_verbs_and_options(
