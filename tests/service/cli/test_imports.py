@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from aeroloop.service.cli.entry import _SWITCHES
+from aeroloop.service.cli.entry import SWITCHES
 
 _PROGRAM = """
 import importlib.metadata, os, sys
@@ -23,7 +23,7 @@ finally:
 
 def run(*words: str) -> tuple[int, set[str]]:
     """Threads and imported modules at the end of a command."""
-    environment = {name: os.environ[name] for name in os.environ.keys() - _SWITCHES}
+    environment = {name: os.environ[name] for name in os.environ.keys() - SWITCHES}
     command = [sys.executable, "-P", "-c", _PROGRAM, *words]
     process = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert process.returncode != 99, "it reads the metadata of every installed package"
