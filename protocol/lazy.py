@@ -1,6 +1,6 @@
 """CasADi and NumPy, imported at their first use: reading a configuration or a message must not wait for them.
 
-They take a third of a second and 47 MB. `aeroloop show` and the recorder read the settings of law and plant, which
+They take 0.15 s of a core and 47 MB. `aeroloop show` and the recorder read the settings of law and plant, which
 stand beside their equations, and compute nothing. What settings and messages are read with imports them from here.
 """
 

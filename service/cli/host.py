@@ -9,7 +9,7 @@ import typer
 
 from aeroloop.service.cli.common import Config, Json, NewLog, Overrides, guarded, settings_of, show
 
-group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
+group = typer.Typer()
 
 
 @group.command()

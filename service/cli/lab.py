@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from aeroloop.service.lab.attack import Attack
     from aeroloop.service.lab.margins import Bits, Margins
 
-group = typer.Typer(no_args_is_help=True, help="Experiments, tables, calibration and certificates, in lockstep.")
+group = typer.Typer()
 
 
 @group.command()

@@ -37,7 +37,7 @@ Vehicle = Annotated[
     typer.Option("--vehicle", metavar="NAME", help="Vehicle; the longest session's if left out.", show_default=False),
 ]
 
-group = typer.Typer(no_args_is_help=True, help="Review, compare, replay, recover and export logs; view a live loop.")
+group = typer.Typer()
 
 
 @group.command()

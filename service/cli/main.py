@@ -9,31 +9,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from difflib import get_close_matches
 from itertools import takewhile
-from typing import Annotated, Any, Final
+from typing import Annotated, Final, cast
 
-import typer
-from pydantic_core import ValidationError
-from typer.core import TyperOption
+import typer.main
 from typer.exceptions import TyperException
 
-from aeroloop.service.cli import host, lab, log, op, run, show
 from aeroloop.service.cli.common import logged_as, report, state
 from aeroloop.service.cli.entry import INTERRUPTED
+from aeroloop.service.cli.groups import Group
 
-app = typer.Typer(
-    no_args_is_help=True,
-    suggest_commands=False,  # `_alike` does, across groups
-    context_settings={"help_option_names": ["-h", "--help"]},
-    pretty_exceptions_enable=False,
-    help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
-)
-app.add_typer(run.group)
-app.add_typer(lab.group, name="lab")
-app.add_typer(log.group, name="log")
-app.add_typer(op.group, name="op")
-app.add_typer(host.group, name="host")
-app.add_typer(show.group, name="show")
-
+_GROUPS: Final = {
+    "lab": "Experiments, tables, calibration and certificates, in lockstep.",
+    "log": "Review, compare, replay, recover and export logs; view a live loop.",
+    "op": "Operate running roles over the network.",
+    "host": "Check this machine, soak the loop on it, install its daemons.",
+    "show": "Print the configuration, the wire, a DBC file, a layout, examples.",
+}
+"""Modules of verbs in this folder, with the help of each. Those of `run` stand beside the groups."""
 
 _EXTRAS: Final = {
     "can": ("python-can", "can"),
@@ -53,7 +45,7 @@ def execute(arguments: Sequence[str]) -> int:
     state["debug"] = False
     logged_as.clear()
     try:
-        return app(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
+        return root().main(list(arguments), prog_name="aeroloop", standalone_mode=False) or 0
     except TyperException as error:
         if message := _reason(error):  # empty where no verb was given and help was printed
             context = getattr(error, "ctx", None)
@@ -92,9 +84,11 @@ def _reason(error: TyperException) -> str:
     if alike := getattr(error, "possibilities", None):
         return f"No such option: {getattr(error, 'option_name', '')}; did you mean {' or '.join(sorted(alike))}?"
     parameter, cause = getattr(error, "param", None), error.__cause__
-    if parameter is not None and isinstance(cause, ValidationError):
-        found = cause.errors()[0]
-        if text := _MUST_BE.get(found["type"]):
+    if parameter is not None and cause is not None:
+        from pydantic_core import ValidationError
+
+        found = cause.errors()[0] if isinstance(cause, ValidationError) else None
+        if found and (text := _MUST_BE.get(found["type"])):
             name = parameter.opts[0] if parameter.opts else parameter.name
             given = "" if found["type"] == "value_error" else f", not {found['input']!r}"
             joint = ":" if found["type"] == "value_error" else ""
@@ -107,22 +101,14 @@ def _alike(error: TyperException) -> str:
     context = getattr(error, "ctx", None)
     if context is None or not error.message.startswith("No such command"):
         return ""
-    groups = getattr(context.find_root().command, "commands", {})
-    paths = [*groups, *(f"{name} {verb}" for name, group in groups.items() for verb in getattr(group, "commands", {}))]
+    top = context.find_root().command
+    groups = {name: top.get_command(context, name).list_commands(context) for name in _GROUPS}
+    paths = [*top.list_commands(context), *(f"{name} {verb}" for name, verbs in groups.items() for verb in verbs)]
     wrong, verbs = error.message.split("'")[1], {path.split()[-1] for path in paths}
     alike = [wrong] if wrong in verbs else get_close_matches(wrong, verbs)
     found = [f"aeroloop {path}" for path in paths if path.split()[-1] in alike]
     own = [command for command in found if command.rpartition(" ")[0] == context.command_path]
     return f"; did you mean `{'` or `'.join(own or found)}`?" if found else ""
-
-
-def _shown_type(option: TyperOption, ctx: Any) -> str | None:
-    """The type of an option's value, for its help. Typer would show `<bool>` beside every flag, which takes none."""
-    return None if option.is_flag else _TYPERS_TYPE(option, ctx)
-
-
-_TYPERS_TYPE: Final = TyperOption.display_type_rich
-TyperOption.display_type_rich = _shown_type  # type: ignore[method-assign,assignment]  # typer has no setting for it
 
 
 def _print_version(requested: bool) -> None:
@@ -136,8 +122,23 @@ def _print_version(requested: bool) -> None:
         raise typer.Exit(0)
 
 
-@app.callback()
-def options(
+def root() -> Group:
+    """The command `aeroloop`, with its options, groups and verbs."""
+    app = typer.Typer(
+        cls=Group,
+        no_args_is_help=True,
+        suggest_commands=False,  # `_alike` does, across groups
+        context_settings={"help_option_names": ["-h", "--help"]},
+        help="Adaptive attitude control over Zenoh, in frames whose every bit is a quantizer's bit.",
+    )
+    app.callback()(_options)
+    command = cast(Group, typer.main.get_command(app))
+    for name, text in _GROUPS.items():
+        command.add_command(Group(name=name, module=name, help=text, no_args_is_help=True, suggest_commands=False))
+    return command
+
+
+def _options(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[  # noqa: ARG001  # its callback prints and ends
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")

@@ -23,7 +23,7 @@ Within = Annotated[
     ),
 ]
 
-group = typer.Typer(no_args_is_help=True, help="Operate running roles over the network.")
+group = typer.Typer()
 
 
 @group.command()

@@ -11,7 +11,7 @@ from aeroloop.service.cli.common import Config, Overrides, fail, settings_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
-group = typer.Typer(no_args_is_help=True, help="Print the configuration, the wire, a DBC file, a layout, examples.")
+group = typer.Typer()
 
 
 @group.command("config")

@@ -1,8 +1,8 @@
 """Fork server: starts commands from a process that has already imported everything.
 
-Importing casadi, numpy and zenoh takes 1.5 s of a core, for each process of a loop. The server imports them once; each
-command is a fork of it that runs the command line with its own arguments. The server opens no session and runs no
-Python thread, so a fork inherits modules only.
+A process of a loop imports for over half a second of a core. The server does it once; each command is a fork of it
+that runs the command line with its own arguments. The server opens no session and runs no Python thread, so a fork
+inherits modules only.
 
     this process  → server   request: arguments, environment, folder; with it stderr and the writing end of a pipe
     server        → this     the child's process id
@@ -35,6 +35,7 @@ _COMMAND: Final = "aeroloop.service.cli.entry"
 _PRELOADED: Final = (
     _COMMAND,
     "aeroloop.service.cli.main",
+    "aeroloop.service.cli.run",
     "aeroloop.service.terminal.encoding",
     "aeroloop.service.daemon.daemon",
     "aeroloop.service.daemon.plants",

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 
-from aeroloop.service.cli.main import app
 from aeroloop.service.cli.main import execute as run
+from aeroloop.service.cli.main import root
 from aeroloop.service.config import load
 
 
@@ -143,10 +145,9 @@ def test_experiment_prints_the_designs_names_as_json(capfd: pytest.CaptureFixtur
 
 def commands() -> list[list[str]]:
     """Every command, as the words that call it."""
-    root = typer.main.get_command(app)
-    groups: dict[str, Any] = root.commands  # type: ignore[attr-defined]  # of a group
-    verbs = [[name, verb] for name, group in groups.items() for verb in getattr(group, "commands", ())]
-    return [[], *([name] for name in groups), *verbs]
+    command: Any = root()
+    verbs = [[name, verb] for name, group in command.commands.items() for verb in group.list_commands(None)]
+    return [[], *([name] for name in command.list_commands(None)), *verbs]
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
@@ -161,6 +162,15 @@ def test_h_is_help_everywhere_and_shows_no_type_beside_a_flag(
     assert "." in short
     assert "bool" not in short
     assert "…" not in short.replace("2…16", "").replace("…`", "")  # nothing is cut off
+
+
+def test_help_is_as_wide_as_its_frame_in_a_terminal_without_greek() -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "60"}
+    command = [sys.executable, "-P", "-m", "aeroloop", "lab", "certify", "--help"]
+    printed = subprocess.run(command, check=True, capture_output=True, encoding="ascii", env=environment).stdout
+    framed = [line for line in printed.splitlines() if line.startswith(("|", "+"))]
+    assert any("epsilon" in line for line in framed)
+    assert {len(line) for line in framed} == {60}
 
 
 def test_shells_can_complete_verbs_and_options(
