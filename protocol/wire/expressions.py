@@ -86,6 +86,13 @@ def encode(quantizer: Quantizer, y: ca.SX, held: ca.SX) -> ca.SX:
     return ca.if_else(_stays(quantizer, y, held), held, code) if isinstance(quantizer, HysteresisQuantizer) else code
 
 
+def saturates(quantizer: Quantizer, y: ca.SX) -> ca.SX:
+    """1 if a value is beyond the range, as `Quantizer.saturated` counts, else 0. Build it `as_written`. Shape (1,)."""
+    if isinstance(quantizer, UniformQuantizer):  # what a hysteresis holds is within the range
+        return (ca.fabs(y) - quantizer.deadzone) / quantizer.step * TIE > quantizer.top
+    return ca.fabs(y) * (1 if isinstance(quantizer, Continuous) else TIE) > quantizer.limit
+
+
 def _stays(quantizer: HysteresisQuantizer, y: ca.SX, held: ca.SX) -> ca.SX:
     """Whether a value is within the held code's interval, widened; false if nothing is held."""
     h = quantizer.hysteresis

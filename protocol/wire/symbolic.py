@@ -12,7 +12,9 @@ equal bit for bit.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
+from itertools import accumulate
 from math import prod
 from typing import Final, TypeAlias
 
@@ -30,6 +32,21 @@ def buffer(size: int) -> Buffer:
     return memoryview(bytearray(8 * size)).cast("d")
 
 
+def parts(memory: Buffer, sizes: Mapping[str, int]) -> dict[str, Buffer]:
+    """Consecutive parts of a memory, of these sizes, by name."""
+    ends = list(accumulate(sizes.values()))
+    return {name: memory[end - sizes[name] : end] for name, end in zip(sizes, ends, strict=True)}
+
+
+INTEGER: Final = 1.5 * 2.0**52
+"""Added to an integer of 32 bits, it gives a double whose low half is that integer."""
+
+
+def integers(memory: Buffer) -> memoryview[int]:
+    """The integers in a memory of doubles that each are an integer plus INTEGER. `tolist` reads them all at once."""
+    return memory.cast("B").cast("i")[0 if sys.byteorder == "little" else 1 :: 2]
+
+
 class Compiled:
     """A function whose named inputs and outputs are rows of doubles in memory.
 
@@ -39,18 +56,22 @@ class Compiled:
         function: The function; all its inputs and outputs must be dense and named.
         shared: Buffers to use instead of new ones, by the name of an input or output.
 
+    Attributes:
+        evaluate: What a call of the object does, without a Python function in between, for the loop. It does not keep
+            the object alive, whose memory it uses.
+
     Raises:
         ValueError: A shared buffer differs in size from its input or output.
     """
 
     inputs: dict[str, Buffer]
     outputs: dict[str, Buffer]
+    evaluate: Callable[[], None]
 
     def __init__(self, function: ca.Function, shared: Mapping[str, Buffer] | None = None) -> None:
         shared = shared or {}
         self.function = function
-        self._buffer, evaluate = function.buffer()
-        self._evaluate: Callable[[], None] = evaluate
+        self._buffer, self.evaluate = function.buffer()
         self.inputs = {}
         self.outputs = {}
         for i in range(function.n_in()):
@@ -73,7 +94,7 @@ class Compiled:
 
     def __call__(self) -> None:
         """Evaluate: read the inputs as they stand, write the outputs."""
-        self._evaluate()
+        self.evaluate()
 
 
 def in_columns(function: ca.Function, rows: int) -> ca.Function:

@@ -3,24 +3,28 @@
 It uses no socket, no clock and no log, so the daemon, the lockstep experiment, the review of a log and the tests all
 run this one code path. The law's time is k times the period. A frame that would repeat the last levels need not be
 sent; the controller then receives SILENCE and computes with the levels it holds.
+
+Between the two frames stands one call of `controller_function`, on memory that stays. Its outputs are one row of
+doubles; after a valid tick the row is copied, and the copy is what the next tick and the properties here read.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Sequence
+from math import isnan, nan
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector, received_quaternion
-from aeroloop.protocol.wire.quantizer import Quantizer
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.protocol.wire.symbolic import Buffer, Compiled, buffer, integers, parts
 from aeroloop.protocol.wire.transmit import SILENCE, Sender
-from aeroloop.service.control.law import LawSettings, law_function
+from aeroloop.service.control.law import LawSettings
 from aeroloop.service.control.motion import Motion
+from aeroloop.service.control.tick import CARRIED, REGARDLESS, controller_function
 
 Codes = tuple[float, ...]
 
@@ -51,14 +55,6 @@ class ControllerSnapshot(BaseModel):
     sent_tick: int | None = None
 
 
-def resume(quantizers: Sequence[Quantizer], codes: Sequence[float] | None) -> None:
-    """Set quantizers to the state after these codes, one each; to the initial state if None."""
-    for i, quantizer in enumerate(quantizers):
-        quantizer.reset()
-        if codes is not None:
-            quantizer.resume(codes[i])
-
-
 class Controller:
     """The adaptive law between a measurement frame and a command frame.
 
@@ -71,7 +67,6 @@ class Controller:
     Attributes:
         tick_index: k of the last measurement answered; −1 before the first.
         counter: Its counter.
-        voltages: The last u before quantization [V]. Shape (actuators,).
         motion: The reference as followed; may be changed between two ticks.
         refused: Malformed measurement frames so far.
         failed: Whether the law has returned NaN.
@@ -86,32 +81,30 @@ class Controller:
         self.period = period
         self.tick_index = -1
         self.counter = 0
-        self.voltages: list[float] = [0.0] * wire.actuators
         self.refused = 0
         self.invalid = 0
         self.failed = False
-        self._law = Compiled(law_function(law, period))
-        inputs, outputs = self._law.inputs, self._law.outputs
-        desired = {name: inputs[name] for name in ("q_d", "omega_d", "omega_d_dot")}
-        self.motion = Motion(reference, shared=desired)
-        self._eps, self._omega, self._sign = inputs["eps"], inputs["omega"], inputs["s"]
-        self._last, self._q = inputs["last"], outputs["q"]
-        self._theta, self._theta_next = inputs["theta"], outputs["theta_next"]
-        self._u, self._eta_e, self._eps_e = outputs["u"], outputs["eta_e"], outputs["eps_e"]
+        function = controller_function(wire, law, period)
+        sizes = {name: function.numel_out(name) for name in function.name_out()}
+        self._found, self._kept = buffer(function.nnz_out()), buffer(function.nnz_out())
+        found, self._last = parts(self._found, sizes), parts(self._kept, sizes)
+        self._tick = Compiled(function, found | {name: self._last[carried] for name, carried in CARRIED.items()})
+        self._evaluate, self._inputs, self._codes = self._tick.evaluate, self._tick.inputs, self._tick.inputs["codes"]
+        self._measured, self._computed = found["measured"], found["computed"]
+        self._command: memoryview[int] | Buffer
+        self._command = found["command"] if wire.voltage.bits is None else integers(found["words"])
+        self._no_command = [wire.voltage.quantizer().invalid] * wire.actuators
+        self._regardless = sum(sizes[name] for name in REGARDLESS)
+        self.motion = Motion(reference, shared=self._inputs)
         self.set_gains(Gains(C1=law.C1, C2=law.C2, Gamma=law.Gamma))
-        self._first_motor = 3 - wire.actuators
-        self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
-        self._encode = [q.encode for q in self._voltage]
-        self._no_command: list[float] = [q.invalid for q in self._voltage]
         self._counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), self._counters)
+        self._periodic = wire.transmit.command == "periodic"
         self._sender = Sender(wire.transmit.command, heartbeat, self._counters)
         self._silence_allowed = wire.transmit.measurement == "on_change"
         self._held: Sequence[float] | None  # codes of the last measurement
-        self._voltage_codes: Sequence[float] | None
-        self._read, self._write = wire.measurement.unpack, wire.command.pack
         self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
-        self._rate_level: Callable[[float], float] = wire.rate.quantizer().level
+        self._read, self._write = wire.measurement.unpack, wire.command.pack
         self.restore(ControllerSnapshot(damping_estimate=law.damping_estimate))
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
@@ -129,14 +122,35 @@ class Controller:
         """
         if frame is None:
             return None
-        if frame == SILENCE and self._silence_allowed and self._held is not None:
-            return self.answer(k % self._counters, self._held, k)
         read = self._read(frame)
-        if read is None:
+        if read is not None:
+            counter, self._held = read
+        elif frame == SILENCE and self._silence_allowed and self._held is not None:
+            counter = k % self._counters
+        else:
             self.refused += 1
             return None
-        self._held = read[1]
-        return self.answer(*read, k)
+        codes = self._codes
+        codes[0], codes[1], codes[2], codes[3], codes[4], codes[5] = self._held  # the quickest way for so few
+        self.motion.set(k * self.period)
+        self._evaluate()
+        if self._computed[0]:
+            self._kept[:] = self._found
+            self.tick_index, self.counter = k, counter
+            command: Sequence[float] = self._command.tolist()
+        else:
+            self._take_no_value(counter, k)
+            command = self._no_command
+        return self._write(counter, command) if self._periodic or self._sender.due(k, command) else SILENCE
+
+    def _take_no_value(self, counter: int, k: int) -> None:
+        """Count a measurement without a valid value, or keep what the law gives besides a voltage that is no number."""
+        if not self._measured[0]:
+            self.invalid += 1
+            return
+        self.failed = True
+        self._kept[: self._regardless] = self._found[: self._regardless]
+        self.tick_index, self.counter = k, counter
 
     def hold(self, frame: bytes) -> bool:
         """Hold the levels of a measurement that was received after its tick was over. False if it is malformed."""
@@ -147,37 +161,13 @@ class Controller:
         self._held = read[1]
         return True
 
-    def answer(self, counter: int, codes: Sequence[float], k: int) -> bytes:
-        """The command frame that answers a measurement with this counter and these codes; see `tick`."""
-        voltages = self.compute(counter, codes, k)
-        if voltages is None:
-            command = self._no_command
-        else:
-            command = self._voltage_codes = [encode(u) for encode, u in zip(self._encode, voltages, strict=True)]
-        return self._write(counter, command) if self._sender.due(k, command) else SILENCE
-
     def compute(self, counter: int, codes: Sequence[float], k: int) -> list[float] | None:
-        """The voltages of `answer` before quantization [V]; None if there is no valid value. Shape (actuators,)."""
-        attitude, rate = self._attitude_level, self._rate_level
-        x, y, z = attitude(codes[0]), attitude(codes[1]), attitude(codes[2])
-        wx, wy, wz = rate(codes[3]), rate(codes[4]), rate(codes[5])
-        if (total := x + y + z + wx + wy + wz) != total:  # NaN: no valid value
-            self.invalid += 1
-            return None
-        self._eps[0], self._eps[1], self._eps[2] = x, y, z
-        self._omega[0], self._omega[1], self._omega[2] = wx, wy, wz
-        self.motion.at(k * self.period)
-        if not self._sign[0]:
-            self._choose_sign()
-        self._law()
-        self._last[:], self._theta[:] = self._q, self._theta_next
-        self.tick_index, self.counter = k, counter
-        voltages: list[float] = self._u.tolist()[self._first_motor :]  # type: ignore[assignment]  # doubles
-        if (total := sum(voltages)) != total:
-            self.failed = True
-            return None
-        self.voltages = voltages
-        return voltages
+        """A tick by codes: the voltages before quantization [V]; None if there is no valid value.
+
+        Shapes (6,) and (actuators,).
+        """
+        self.tick(self.wire.measurement.pack(counter, codes), k)
+        return self.voltages if self._computed[0] else None
 
     def attitude_of(self, frame: bytes) -> Quaternion | None:
         """The attitude in a measurement; None if it is malformed or has no valid value."""
@@ -185,14 +175,14 @@ class Controller:
         codes = read[1] if read is not None else self._held if frame == SILENCE and self._silence_allowed else None
         if codes is None:
             return None
-        x, y, z = (self._attitude_level(code) for code in codes[:3])
+        x, y, z = map(self._attitude_level, codes[:3])
         return received_quaternion(x, y, z, IDENTITY) if x + y + z == x + y + z else None
 
     def set_gains(self, gains: Gains) -> None:
         """Use other gains from the next tick on; None leaves a gain unchanged."""
         for name in ("C1", "C2", "Gamma"):
             if (diagonal := getattr(gains, name)) is not None:
-                self._law.inputs[name][:] = memoryview(array("d", diagonal))
+                self._inputs[name][:] = memoryview(array("d", diagonal))
 
     def apply(self, change: Change) -> None:
         """Apply a recorded change; the next tick must be its first, or later."""
@@ -204,77 +194,75 @@ class Controller:
     def state(self) -> ControllerSnapshot:
         """State for the next tick, besides reference and gains."""
         sent_codes, sent_tick = self._sender.memory
-        held, encoded = self._held, self._voltage_codes
+        held, codes = self._held, tuple(self._last["command"])
         return ControllerSnapshot(
             attitude=self.attitude,
             sign=self.sign,  # type: ignore[arg-type]  # one of the three
             damping_estimate=self.damping_estimate,
             held=None if held is None else tuple(held),
-            voltage_codes=None if encoded is None else tuple(encoded),
+            voltage_codes=None if isnan(codes[0]) else codes,
             sent_codes=None if sent_codes is None else tuple(sent_codes),
             sent_tick=sent_tick,
         )
 
     def restore(self, state: ControllerSnapshot) -> None:
         """Continue bit for bit from this state, given the same reference and gains."""
-        self._last[:] = memoryview(array("d", state.attitude))
-        self._sign[0] = state.sign
-        self._theta[:] = memoryview(array("d", state.damping_estimate))
+        codes = state.voltage_codes or [nan] * self.wire.actuators
+        known = {"q": state.attitude, "s_next": [state.sign], "theta_next": state.damping_estimate, "command": codes}
+        for name, values in known.items():
+            self._last[name][:] = memoryview(array("d", values))
         widths = self.wire.measurement.widths
         self._held = state.held and [
             code if width is None else int(code) for code, width in zip(state.held, widths, strict=True)
         ]
-        self._voltage_codes = state.voltage_codes
-        resume(self._voltage, state.voltage_codes)
         self._sender.resume(state.sent_codes, state.sent_tick)
 
     @property
     def gains(self) -> Gains:
         """The gains now."""
-        return Gains.model_validate({name: tuple(self._law.inputs[name]) for name in ("C1", "C2", "Gamma")})
-
-    def _choose_sign(self) -> None:
-        """Choose z₁₊ or z₁₋ by the sign of η̃ at the first measurement, once per session (Assumption 3)."""
-        self._sign[0] = 1.0
-        self._law()
-        self._sign[0] = 1.0 if self._eta_e[0] >= 0 else -1.0
+        return Gains.model_validate({name: tuple(self._inputs[name]) for name in ("C1", "C2", "Gamma")})
 
     @property
     def sign(self) -> int:
         """±1, the equilibrium that is approached; 0 before the first measurement."""
-        return int(self._sign[0])
+        return int(self._last["s_next"][0])
 
     @property
     def attitude(self) -> Quaternion:
         """q^Q of the last measurement [1]."""
-        return tuple(self._last)  # type: ignore[return-value]  # four elements
+        return tuple(self._last["q"])  # type: ignore[return-value]  # four elements
 
     @property
     def rate(self) -> Vector:
         """ω^Q of the last measurement, body frame [rad/s]."""
-        return tuple(self._omega)  # type: ignore[return-value]  # three elements
+        return tuple(self._last["omega"])  # type: ignore[return-value]  # three elements
 
     @property
     def attitude_error(self) -> tuple[float, float, float]:
         """ε̃ at the last measurement [1]."""
-        return tuple(self._eps_e)  # type: ignore[return-value]  # three elements
+        return tuple(self._last["eps_e"])  # type: ignore[return-value]  # three elements
 
     @property
     def rate_error(self) -> tuple[float, float, float]:
         """ω_e at the last measurement, body frame [rad/s]."""
-        return tuple(self._law.outputs["omega_e"])  # type: ignore[return-value]  # three elements
+        return tuple(self._last["omega_e"])  # type: ignore[return-value]  # three elements
 
     @property
     def desired(self) -> Quaternion:
         """q_d at the last measurement [1]."""
-        return tuple(self._law.inputs["q_d"])  # type: ignore[return-value]  # four elements
+        return tuple(self._last["q_d"])  # type: ignore[return-value]  # four elements
 
     @property
     def damping_estimate(self) -> tuple[float, float, float]:
         """θ̂ after the last measurement [N·m·s/rad]."""
-        return tuple(self._theta)  # type: ignore[return-value]  # three elements
+        return tuple(self._last["theta_next"])  # type: ignore[return-value]  # three elements
+
+    @property
+    def voltages(self) -> list[float]:
+        """The last u before quantization [V]. Shape (actuators,)."""
+        return list(self._last["u"])
 
     @property
     def saturated(self) -> int:
         """Commanded voltages beyond the quantizer's range so far."""
-        return sum(q.saturated for q in self._voltage)
+        return int(self._last["saturated_next"][0])

@@ -32,6 +32,7 @@ from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.messages.operator import Gain
 from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.protocol.wire.symbolic import along_rows, in_columns
 
 
@@ -51,7 +52,7 @@ Diagonal = Annotated[tuple[float, float, float], AfterValidator(_positive)]
 class LawSettings(BaseModel):
     """Model of the plant and gains of the law. The default is the paper's experiment, Table C.1."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     inertia: Diagonal = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
     mass: float = Field(default=1.075, gt=0, description="m [kg]")
@@ -238,23 +239,27 @@ def law_function(p: LawSettings, period: float) -> ca.Function:
     """One tick of the law, for the loop. Raises as `law_steps` does.
 
     Inputs: last, theta, and eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma. `last` is the
-    previous q; of ±q the nearer one is taken. Outputs: q, u, theta_next, eta_e, eps_e, omega_e.
+    previous q; of ±q the nearer one is taken. s = 0, before the first tick, becomes the sign of η̃ (Assumption 3).
+    Outputs: q, u, theta_next, eta_e, eps_e, omega_e, s_next.
     """
     steps = law_steps(p, period)
     last, theta = ca.SX.sym("last", 4), ca.SX.sym("theta", 3)
     given = {name: ca.SX.sym(name, size) for name, size in _SIZES.items()}
     eps, omega, q_d, omega_d, omega_d_dot, s, C1, C2, Gamma = given.values()
-    q = steps.attitude(last, eps)
-    theta_next = steps.estimate(theta, steps.adaptation(q, omega, q_d, omega_d, s, C1, C2, Gamma), Gamma)
-    u, *errors = steps.command(q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2)
-    return ca.Function(
-        "law",
-        [last, theta, *given.values()],
-        [q, u, theta_next, *errors],
-        ["last", "theta", *given],
-        ["q", "u", "theta_next", "eta_e", "eps_e", "omega_e"],
-        {"cse": True},  # two parts need the errors
-    )
+    with as_written():
+        q = steps.attitude(last, eps)
+        _, eta_e, *_ = steps.command(q, omega, q_d, omega_d, omega_d_dot, theta, s, C1, C2)  # whatever s is
+        s_next = s + (s == 0) * (2 * (eta_e >= 0) - 1)
+        theta_next = steps.estimate(theta, steps.adaptation(q, omega, q_d, omega_d, s_next, C1, C2, Gamma), Gamma)
+        u, *errors = steps.command(q, omega, q_d, omega_d, omega_d_dot, theta, s_next, C1, C2)
+        return ca.Function(
+            "law",
+            [last, theta, *given.values()],
+            [q, u, theta_next, *errors, s_next],
+            ["last", "theta", *given],
+            ["q", "u", "theta_next", "eta_e", "eps_e", "omega_e", "s_next"],
+            {"cse": True},  # two parts need the errors
+        )
 
 
 def law_of_many(p: LawSettings, period: float, rows: int) -> ca.Function:
@@ -266,8 +271,9 @@ def law_of_many(p: LawSettings, period: float, rows: int) -> ca.Function:
         rows: How many ticks; a multiple of `aeroloop.protocol.wire.symbolic.UNROLLED`.
 
     Returns:
-        A function with the inputs and outputs of `law_function`. `last` and `theta` are those before the first tick;
-        all others have a row per tick, shape (rows, …). One more output: theta_before, the θ̂ of each u.
+        A function with the inputs of `law_function`, s being ±1, and its outputs without s_next. `last` and `theta` are
+        those before the first tick; all others have a row per tick, shape (rows, …). One more output: theta_before, the
+        θ̂ of each u.
     """
     steps = law_steps(p, period)
     last, first = ca.MX.sym("last", 4), ca.MX.sym("theta", 3)

@@ -32,7 +32,8 @@ class Motion:
 
     Args:
         reference: What to follow from t = 0 on.
-        shared: Memory for the outputs q_d, omega_d and omega_d_dot; own memory if None.
+        shared: Memory to use instead of its own, by the name of an input or output of `reference_function`: that of a
+            function with the same inputs, which then evaluates the reference at the time last set.
 
     Attributes:
         plan: The plan followed now.
@@ -44,11 +45,15 @@ class Motion:
         self.plan = Plan.of(reference)
         self._load(0)
 
-    def at(self, t: float) -> None:
-        """Write the desired motion at time t [s]; t never decreases between calls."""
+    def set(self, t: float) -> None:
+        """Write time t [s] and its piece to the inputs; t never decreases between calls."""
         if t >= self._until:
             self._load(self.plan.piece(t))
         self._time[0] = t
+
+    def at(self, t: float) -> None:
+        """Write the desired motion at time t [s] to the outputs."""
+        self.set(t)
         self._function()
 
     def follow(self, target: Plan, t: float, approach: Approach = JUMP) -> None:

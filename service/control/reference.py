@@ -8,6 +8,7 @@ its derivative follow by CasADi's own derivatives, so they are exact and consist
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from math import degrees, pi
 from typing import Final, NamedTuple
@@ -232,6 +233,7 @@ def join(here: Angles, there: Angles, length: Floats) -> Floats:
     )
 
 
+@cache
 def reference_function() -> ca.Function:
     """A piece at time t ↦ q_d, ω_d, ω̇_d: desired attitude [1], angular velocity [rad/s], acceleration [rad/s²].
 

@@ -19,7 +19,7 @@ from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.protocol.wire.transmit import Sender
-from aeroloop.service.control.controller import ControllerSnapshot, resume
+from aeroloop.service.control.controller import ControllerSnapshot
 from aeroloop.service.control.law import LawSettings, law_of_many
 from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import reference_function
@@ -99,7 +99,10 @@ class BatchController:
     def restore(self, state: ControllerSnapshot) -> None:
         """Continue from a recorded state; reference and gains stay as they are."""
         self._state = state
-        resume(self._voltage, state.voltage_codes)
+        for i, quantizer in enumerate(self._voltage):
+            quantizer.reset()
+            if state.voltage_codes is not None:
+                quantizer.resume(state.voltage_codes[i])
         self._sender.resume(state.sent_codes, state.sent_tick)
 
     def follow(self, other: BatchController) -> None:

@@ -10,7 +10,7 @@ from random import Random
 import casadi as ca
 import pytest
 
-from aeroloop.protocol.wire.expressions import as_written, encode, level
+from aeroloop.protocol.wire.expressions import as_written, encode, level, saturates
 from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
 from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
 from aeroloop.protocol.wire.quantizer import CodedQuantizer, Continuous, Quantizer, UniformQuantizer
@@ -30,11 +30,12 @@ EVERY: tuple[Quantizer, ...] = (
 
 @cache
 def compiled(which: int) -> Compiled:
-    """(y, held, code) ↦ (the code of y, the level of code) of one of EVERY."""
+    """(y, held, code) ↦ (the code of y, the level of code, whether y saturates) of one of EVERY."""
     y, held, code = (ca.SX.sym(name) for name in ("y", "held", "code"))
     with as_written():
-        found = [encode(EVERY[which], y, held), level(EVERY[which], code)]
-        return Compiled(ca.Function("both", [y, held, code], found, ["y", "held", "code"], ["encoded", "level"]))
+        found = [encode(EVERY[which], y, held), level(EVERY[which], code), saturates(EVERY[which], y)]
+        names = ["y", "held", "code"], ["encoded", "level", "saturates"]
+        return Compiled(ca.Function("every", [y, held, code], found, *names))
 
 
 def same(a: float, b: float) -> bool:
@@ -70,8 +71,9 @@ def test_codes_of_consecutive_values_are_the_quantizers(seed: int) -> None:
             y = value(quantizer, held, random)
             function.inputs["y"][0], function.inputs["held"][0] = y, held
             function()
-            held = function.outputs["encoded"][0]
+            held, before = function.outputs["encoded"][0], quantizer.saturated
             assert same(held, float(quantizer.encode(y))), (quantizer.__dict__, y)
+            assert function.outputs["saturates"][0] == quantizer.saturated - before, (quantizer.__dict__, y)
 
 
 def levels() -> Iterator[tuple[int, float]]:
