@@ -69,7 +69,7 @@ class Loop:
         self._initially = initially(mechanism)
         step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
         held = {"measured": 6, "commanded": wire.actuators, "numbers": 3 * len(NUMBERS), "zeros": 2}
-        sizes = {"x": step.numel_in("x"), "last": 4, "theta": 3, "sign": 1, "seen": 7, "filters": 4, **held}
+        sizes = {"x": step.numel_in("x"), "last": 4, "theta": 3, "s": 1, "seen": 7, "filters": 4, **held}
         self._still = [0.0] * (sizes["x"] - len(mechanism.initial))
         functions = law_function(law, period), step, sensor_function(plant.sensors, period)
         with as_written():
@@ -92,20 +92,15 @@ class Loop:
             for signal, part in zip(signals, ca.vertsplit(state["numbers"], len(NUMBERS)), strict=True)
         )
 
-        seen, sign = state["seen"], state["sign"]
+        seen = state["seen"]
         sent = ca.vertcat(ca.if_else(seen[0] >= 0, 1, -1) * seen[1:4], seen[4:7])
         kinds = [attitude] * 3 + [rate] * 3
         measured = [encode(kinds[i], sent[i], state["measured"][i]) for i in range(6)]
         levels = ca.vertcat(*(level(kinds[i], measured[i]) for i in range(6)))
 
-        def lawful(s: ca.SX) -> dict[str, ca.SX]:
-            parts = ca.vertsplit(wanted, [0, 4, 7, 10])
-            found = law.call([state["last"], state["theta"], levels[:3], levels[3:], *parts, s, *gains])
-            return dict(zip(law.name_out(), found, strict=True))
-
-        first = ca.if_else(lawful(ca.SX(1))["eta_e"] >= 0, 1, -1)
-        sign = ca.if_else(sign == 0, first, sign)
-        answer = lawful(sign)
+        parts = ca.vertsplit(wanted, [0, 4, 7, 10])
+        answers = law.call([state["last"], state["theta"], levels[:3], levels[3:], *parts, state["s"], *gains])
+        answer = dict(zip(law.name_out(), answers, strict=True))
         u = answer["u"][3 - wire.actuators :]
         commanded = [encode(voltage, u[i], state["commanded"][i]) for i in range(wire.actuators)]
         voltages = ca.vertcat(*(level(voltage, code) for code in commanded))
@@ -115,7 +110,7 @@ class Loop:
             true[2] = ca.SX.zeros(2)  # a free body has no joints, and so no encoders
         next_seen, filters = sensors.call([*true, state["filters"], state["zeros"], error])
         codes = {"measured": ca.vertcat(*measured), "commanded": ca.vertcat(*commanded)}
-        learned = {"last": answer["q"], "theta": answer["theta_next"], "sign": sign}
+        learned = {"last": answer["q"], "theta": answer["theta_next"], "s": answer["s_next"]}
         after = {**state, **codes, **learned, "x": x, "seen": next_seen, "filters": filters}
         out = {**codes, "voltages": voltages, "errors": answer["eps_e"], "u": u, "seen": seen}
         self._outputs = {name: part.numel() for name, part in out.items()}
