@@ -171,7 +171,8 @@ class Ring:
         return Arrival(sample.payload.to_bytes(), time.monotonic_ns()) if sample.attachment is None else None
 
     def _knock(self) -> None:
-        self._knocker.put(b"", attachment=b"knock")
+        with suppress(zenoh.ZError):  # the session is closed, which ends a wait, too
+            self._knocker.put(b"", attachment=b"knock")
 
     def _knock_when_due(self) -> None:
         while self._open:

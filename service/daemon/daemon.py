@@ -151,8 +151,7 @@ class Daemon:
             if now.received_as is Received.LATE or now.tick == k:
                 self._take_late(now)
                 continue
-            if timing:
-                timing.woke(now.due_ns)
+            woke_ns = time.monotonic_ns()
             changes.before_tick(now.tick, now.frame)
             if not self._may_continue():
                 break
@@ -161,6 +160,8 @@ class Daemon:
                 link.send(command)
             k = now.tick
             sent_ns = time.monotonic_ns()
+            if timing:
+                timing.woke(now.due_ns, woke_ns)
             self._age.add(sent_ns - now.at_ns)
             self._record(now, command, sent_ns)
             self._account(command, now)
