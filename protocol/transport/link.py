@@ -123,6 +123,7 @@ class Ring:
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self._subscriber = session.declare_subscriber(key, handlers.RingChannel(2))  # a frame and a knock
+        self._received = self._subscriber.handler
         self._knocker = session.declare_publisher(key, allowed_destination=zenoh.Locality.SESSION_LOCAL)
         self._newest: Arrival | None = None
         self._due = self._rings_at = time.monotonic() + _NEVER_S
@@ -141,7 +142,7 @@ class Ring:
     def take(self) -> Arrival | None:
         """Take the newest frame out of the slot, or None."""
         newest, self._newest = self._newest, None
-        while self._open and (sample := self._subscriber.try_recv()) is not None:
+        while self._open and (sample := self._received.try_recv()) is not None:
             newest = self._frame_of(sample) or newest
         return newest
 
@@ -153,26 +154,24 @@ class Ring:
             self._due = due
             if due < self._rings_at:
                 self._sooner.set()
-            arrival = self._frame_of(self._subscriber.recv())
+            try:
+                arrival = self._frame_of(self._received.recv())
+            except zenoh.ZError:  # closed
+                return None
             arrival = self.take() or arrival
         return arrival
 
     def close(self) -> None:
         """Stop receiving, and end a wait."""
         self._open = False
-        self._knock()
+        self._subscriber.undeclare()
         self._sooner.set()
         self._alarm.join()
-        self._subscriber.undeclare()
         self._knocker.undeclare()
 
     @staticmethod
     def _frame_of(sample: zenoh.Sample) -> Arrival | None:
         return Arrival(sample.payload.to_bytes(), time.monotonic_ns()) if sample.attachment is None else None
-
-    def _knock(self) -> None:
-        with suppress(zenoh.ZError):  # the session is closed, which ends a wait, too
-            self._knocker.put(b"", attachment=b"knock")
 
     def _knock_when_due(self) -> None:
         while self._open:
@@ -182,7 +181,8 @@ class Ring:
             self._sooner.wait(max(0.0, due - time.monotonic()))
             if time.monotonic() >= self._due:
                 self._due = time.monotonic() + _NEVER_S  # until the loop, woken, sets it again
-                self._knock()
+                with suppress(zenoh.ZError):  # the session is closed, which ends a wait, too
+                    self._knocker.put(b"", attachment=b"knock")
 
 
 class ZenohLink(Link):

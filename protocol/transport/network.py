@@ -49,13 +49,14 @@ POLL_S: Final = 0.005
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
-# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which
-# then carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14, with these threads 0 of 6.
-# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
+# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which then
+# carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14. One pool for all tasks, because a
+# frame otherwise wakes a thread of two pools: a bare round trip takes 359 µs with 16 threads in one pool, 318 with one
+# thread, 408 with the same number in five pools and 417 by default (p50 at 500 Hz, SCHED_FIFO).
+# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures what peers' troubles cost.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
-    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
-    "app: (worker_threads: 4))",
+    "(app: (worker_threads: 16), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))",
 )
 
 _PLACE = re.compile(r"(?P<protocol>[a-z]+)/(?P<host>[^/]+):(?P<port>\d+)(?P<rest>[?#].*)?")
