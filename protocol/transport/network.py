@@ -50,9 +50,9 @@ _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
 # A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which then
-# carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14. One pool for all tasks, because a
-# frame otherwise wakes a thread of two pools: a bare round trip takes 359 µs with 16 threads in one pool, 318 with one
-# thread, 408 with 22 threads in five pools and 417 by default (p50 at 500 Hz, SCHED_FIFO).
+# carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14. One pool for all tasks, because
+# otherwise a frame wakes a thread of two pools: p50 of a bare round trip at 500 Hz under SCHED_FIFO is 359 µs with 16
+# threads in one pool, 318 with one thread, 408 with 22 threads in five pools and 417 by default.
 # Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures what peers' troubles cost.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
