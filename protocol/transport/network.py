@@ -53,7 +53,7 @@ _RETRY_MS: Final = (50, 1000)
 # carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14. One pool for all tasks, because
 # otherwise a frame wakes a thread of two pools: p50 of a bare round trip at 500 Hz under SCHED_FIFO is 359 µs with 16
 # threads in one pool, 318 with one thread, 408 with 22 threads in five pools and 417 by default.
-# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures what peers' troubles cost.
+# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
     "(app: (worker_threads: 16), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))",
