@@ -1,10 +1,10 @@
 """Ping-pong over bare Zenoh between two processes: the floor of the loop's latency.
 
 Both ends are this file run as a program, with nothing but Zenoh in it. The pinging end sends on an absolute grid and
-takes the time of the answer in the receiving thread, as a plant does; the other waits in the ring, as a loop must; all
-of Zenoh runs in one thread. Slower were a Condition, a semaphore and a queue behind a callback, with and without a
-thread of Python in between, and 4 to 22 threads of Zenoh in one to five pools. Faster are two things that cost a loop its
-freedom: an answer from within the receiving thread (`answer`), and both processes on one CPU (`cpus`).
+takes the time of the answer in the receiving thread, as a plant does; the other waits in the ring, as a loop must;
+all of Zenoh runs in one thread. Slower were a Condition, a semaphore and a queue behind a callback, with and without
+a thread of Python in between, and 4 to 22 threads of Zenoh in one to five pools. Faster are two things that cost a
+loop its freedom: an answer from within the receiving thread (`answer`), and both processes on one CPU (`cpus`).
 """
 
 from __future__ import annotations
