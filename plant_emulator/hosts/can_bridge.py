@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import time
 from math import isfinite
-from threading import Condition
 from typing import Final, Literal
 
 from aeroloop.plant_emulator.endpoint.tenancy import Notice, Tenancy
@@ -25,7 +24,7 @@ from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.transport.link import Arrival, Wake
 from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
@@ -190,7 +189,7 @@ class Bridge:
         self._relay = Relay(
             wire, loop.period_ns, lockstep=loop.lockstep, watchdog_s=settings.watchdog_s, armed=settings.armed_at_start
         )
-        self._changed = Condition()
+        self._changed = Wake()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
         self._faults = NodeFaults(settings.parsed_faults, bus.node)
         self._front = ZenohFront(role, loop, self._relay, self._changed, self._faults.statuses)
@@ -209,8 +208,8 @@ class Bridge:
         front.serve()
         try:
             while not self._role.stop.is_set():
-                with self._changed:
-                    self._changed.wait_for(self._frame_pending, WAIT_S)
+                if not self._frame_pending():
+                    self._changed.wait(WAIT_S)
                 relay.unavailable = self._unavailable()
                 front.take_inbox()
                 self._follow()

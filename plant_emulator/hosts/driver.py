@@ -89,7 +89,8 @@ class Driver:
         while not self._stop.is_set():
             skipped = grid.skipped if grid else 0
             k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
-            timing.woke(grid.due_ns if grid else time.monotonic_ns())
+            woke_ns = time.monotonic_ns()
+            due_ns = grid.due_ns if grid else woke_ns
             before = self.endpoint.session
             front.take_inbox()
             if grid and self.endpoint.session not in (None, before):
@@ -98,6 +99,7 @@ class Driver:
             self._tick(self._command(), k)
             if self.endpoint.session:
                 front.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
+            timing.woke(due_ns, woke_ns)
             timing.done()
 
     def _command(self) -> Arrival | None:

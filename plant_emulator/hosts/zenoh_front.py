@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from threading import Condition
 from typing import Final
 
 import zenoh
@@ -27,7 +26,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
-from aeroloop.protocol.transport.link import Arrival, Mailbox, ZenohLink
+from aeroloop.protocol.transport.link import Arrival, Mailbox, Wake, ZenohLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.transmit import SILENCE
 
@@ -37,7 +36,7 @@ STATUS_PERIOD_NS: Final = 1_000_000_000
 class ZenohFront(Front):
     """A plant end, an Endpoint or the bridge's Relay, on the network.
 
-    `changed` is notified when a command arrives, for an owner that waits for more than one thing; `faults` returns the
+    `changed` is set when a command arrives, for an owner that waits for more than one thing; `faults` returns the
     status of an emulator's faults.
     """
 
@@ -46,7 +45,7 @@ class ZenohFront(Front):
         role: Role,
         loop: LoopSettings,
         endpoint: Tenancy,
-        changed: Condition | None = None,
+        changed: Wake | None = None,
         faults: Callable[[], list[FaultStatus]] = list,
     ) -> None:
         super().__init__()
@@ -184,7 +183,7 @@ class ZenohFront(Front):
             send_key=topics.key("measurement", vehicle, session=claim.session),
             receive_key=topics.key("command", vehicle, session=claim.session),
             lossless=self._loop.lockstep,
-            mailbox=Mailbox(self._changed),
+            mailbox=None if self._loop.lockstep and self._changed is None else Mailbox(self._changed),
         )
         return answer
 

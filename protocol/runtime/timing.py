@@ -100,9 +100,9 @@ class LoopTiming:
         self._faults_before: tuple[int, int] | None = None
         self._woke_at = 0
 
-    def woke(self, due_ns: int) -> None:
-        """Count the start of a tick that was due at `due_ns` on `time.monotonic_ns()`."""
-        now = time.monotonic_ns()
+    def woke(self, due_ns: int, woke_ns: int | None = None) -> None:
+        """Count the start of a tick, due at `due_ns`, at `woke_ns`, now if None; on `time.monotonic_ns()`."""
+        now = time.monotonic_ns() if woke_ns is None else woke_ns
         if self._warm_at is None:
             self._warm_at = now + self._warm_up_ns
         if now >= self._warm_at:

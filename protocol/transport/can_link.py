@@ -27,7 +27,7 @@ from aeroloop.protocol.transport.can_format import (
     carried_bytes,
     check_widths,
 )
-from aeroloop.protocol.transport.link import Link, Mailbox
+from aeroloop.protocol.transport.link import Link, Mailbox, Wake
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
@@ -45,7 +45,7 @@ End = Literal["plant", "controller"]
 class CanLink(Link):
     """One end's frames and heartbeats on a bus. A thread of its own receives.
 
-    `changed` is notified when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
+    `changed` is set when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
 
     Attributes:
         peer: The other end's last heartbeat, or None.
@@ -58,12 +58,14 @@ class CanLink(Link):
         CanError: The bus cannot be opened, or a frame does not fit it.
     """
 
+    _mailbox: Mailbox
+
     def __init__(
         self,
         settings: CanSettings,
         wire: WireSpec,
         end: End,
-        changed: threading.Condition | None = None,
+        changed: Wake | None = None,
         *,
         lockstep: bool = False,
     ) -> None:

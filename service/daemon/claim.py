@@ -37,8 +37,9 @@ class ClaimClient:
         last: Record of the vehicle's last session, from the last grant; None if the plant has none.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
+    def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool, own_grid: bool) -> None:
         self._role = role
+        self._own_grid = own_grid
         self._loop = loop
         self._wire = wire
         self.auto_arm = auto_arm
@@ -63,7 +64,7 @@ class ClaimClient:
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lossless=self._loop.lockstep,
-            mailbox=Mailbox(depth=MAILBOX if self._wire.transmit.measurement == "on_change" else 1),
+            mailbox=self._mailbox(),
         )
         answer = self._query(claim)
         if isinstance(answer, Grant):
@@ -107,6 +108,14 @@ class ClaimClient:
             )
             log_event(lost, self._role.vehicle)  # not published: Zenoh has just failed
         self.session = None
+
+    def _mailbox(self) -> Mailbox | None:
+        """A mailbox, for its times of arrival, where these decide on ticks; None for a loop that only waits."""
+        if self._loop.lockstep:
+            return None
+        if self._wire.transmit.measurement == "on_change":
+            return Mailbox(depth=MAILBOX)
+        return Mailbox() if self._own_grid else None
 
     def _query(self, claim: Claim) -> Grant | Refusal | None:
         """The plant's answer; None if no plant answers in time."""

@@ -68,7 +68,8 @@ class Daemon:
         self._settings = settings
         self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
-        self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
+        self._own_grid = settings.pace == "clock" and not loop.lockstep
+        self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm, own_grid=self._own_grid)
         begins = reference if settings.after_restart == "configured" else Hold()
         self._gate = CertificateGate(role, configured, begins)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
@@ -133,8 +134,7 @@ class Daemon:
     def _run(self, link: ZenohLink) -> bool:
         """Run one session. True once the duration is over, False if the session was lost."""
         controller, changes, timing, lockstep = self._controller, self._changes, self._timing, self._loop.lockstep
-        own_grid = self._settings.pace == "clock" and not lockstep
-        source = TickSource(link, self._loop, self._wire, own_grid=own_grid, stale_s=self._stale_s)
+        source = TickSource(link, self._loop, self._wire, own_grid=self._own_grid, stale_s=self._stale_s)
         k, last = -1, time.monotonic()
         while self._may_continue() and (self._last_tick is None or k < self._last_tick):
             now = source.next(min(WAIT_S, self._stale_s))
@@ -151,8 +151,7 @@ class Daemon:
             if now.received_as is Received.LATE or now.tick == k:
                 self._take_late(now)
                 continue
-            if timing:
-                timing.woke(now.due_ns)
+            woke_ns = time.monotonic_ns()
             changes.before_tick(now.tick, now.frame)
             if not self._may_continue():
                 break
@@ -161,6 +160,8 @@ class Daemon:
                 link.send(command)
             k = now.tick
             sent_ns = time.monotonic_ns()
+            if timing:
+                timing.woke(now.due_ns, woke_ns)
             self._age.add(sent_ns - now.at_ns)
             self._record(now, command, sent_ns)
             self._account(command, now)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from math import isinf
-from threading import Condition
 from typing import Any
 
 import pytest
@@ -14,6 +13,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, PLANT_HEARTBEAT_ID, CanError, CanSettings, Heartbeat
 from aeroloop.protocol.transport.can_link import CanLink
+from aeroloop.protocol.transport.link import Wake
 from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.can_in_process import PAPER, Stranger, both_ends, virtual
 from tests.support.wires import wire_of
@@ -110,13 +110,13 @@ def test_waiting_ends_when_a_frame_comes_and_at_the_timeout() -> None:
         assert controller.wait(PATIENCE_S) is not None
 
 
-def test_a_frame_notifies_a_shared_condition() -> None:
-    bus, changed = virtual(), Condition()
+def test_a_frame_wakes_a_reader_of_several_links() -> None:
+    bus, changed = virtual(), Wake()
     link = CanLink(bus, PAPER, "controller", changed)
     try:
-        with Stranger(bus) as stranger, changed:
+        with Stranger(bus) as stranger:
             stranger.say(MEASUREMENT_ID + 1, bytes(7))
-            assert changed.wait(PATIENCE_S)
+            changed.wait(PATIENCE_S)
         assert link.pending
     finally:
         link.close()

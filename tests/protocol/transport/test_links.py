@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 import zenoh
+from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.transport import link
 from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, ZenohLink
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
@@ -74,6 +74,10 @@ def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
     assert not thread.is_alive()
 
 
+SETTLE_S = 0.1
+"""What should not arrive would have arrived by then: a frame takes less than a millisecond."""
+
+
 @pytest.fixture
 def pair() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """Two sessions that see each other."""
@@ -128,31 +132,93 @@ def test_frames_arrive_both_ways_as_they_were_sent(pair: tuple[zenoh.Session, ze
     assert controller.take() is None
 
 
-def test_of_many_frames_only_the_newest_is_given(
-    pair: tuple[zenoh.Session, zenoh.Session], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    all_are_here = threading.Event()
-
-    class Watched(Mailbox):
-        def put(self, frame: bytes) -> None:
-            super().put(frame)
-            if frame == b"last":
-                all_are_here.set()
-
-    monkeypatch.setattr(link, "Mailbox", Watched)
+def test_of_many_frames_only_the_newest_is_given(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
     plant, controller = links(pair)
+    marker, marked = links(pair, "s2")
     for i in range(100):
         plant.send(bytes([i]))
     plant.send(b"last")
-    assert all_are_here.wait(PATIENCE_S)
+    marker.send(b"after it")
+    assert marked.wait(PATIENCE_S) is not None  # both links are of one connection, which keeps the order
     newest = controller.take()
     assert newest is not None
     assert newest.frame == b"last"
     assert controller.take() is None
 
 
-SETTLE_S = 0.1
-"""What should not arrive would have arrived by then: a frame takes less than a millisecond."""
+def test_a_frame_that_waits_is_pending_until_it_is_taken(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+    plant, controller = links(pair)
+    assert not controller.pending
+    plant.send(b"old")
+    eventually("the frame", lambda: controller.pending)
+    taken = controller.take()
+    assert taken is not None
+    assert taken.frame == b"old"
+    assert not controller.pending
+    plant.send(b"old")
+    eventually("the frame", lambda: controller.pending)
+    plant.send(b"new")
+    eventually("the newer frame", lambda: (got := controller.take()) is not None and got.frame == b"new")
+    assert not controller.pending
+
+
+def test_a_shorter_wait_ends_at_its_own_timeout(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+    plant, controller = links(pair)
+    plant.send(b"1")
+    assert controller.wait(60 * PATIENCE_S) is not None  # leaves its alarm behind, an hour ahead
+    started = time.monotonic()
+    assert controller.wait(0.02) is None
+    assert controller.wait(0.01) is None
+    assert 0.03 <= time.monotonic() - started < PATIENCE_S
+
+
+def test_what_ends_a_wait_is_no_frame_and_leaves_the_session_to_no_one(
+    pair: tuple[zenoh.Session, zenoh.Session],
+) -> None:
+    plant, controller = links(pair)
+    overheard = pair[0].declare_subscriber("t/s1/measurement", RingChannel(8))
+    assert controller.wait(0.0) is None
+    for _ in range(5):
+        assert controller.wait(0.01) is None
+        assert not controller.pending
+    plant.send(b"frame")
+    arrival = controller.wait(PATIENCE_S)
+    assert arrival is not None
+    assert arrival.frame == b"frame"
+    samples = iter(overheard.try_recv, None)
+    assert [sample.payload.to_bytes() for sample in samples] == [b"frame"]
+
+
+def test_closing_a_link_ends_a_wait_in_another_thread(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+    _, controller = links(pair)
+    ended = threading.Event()
+
+    def wait() -> None:
+        controller.wait(60 * PATIENCE_S)
+        ended.set()
+
+    thread = threading.Thread(target=wait, daemon=True)
+    thread.start()
+    time.sleep(SETTLE_S)
+    controller.close()
+    assert ended.wait(PATIENCE_S)
+
+
+def test_a_frame_that_was_taken_does_not_end_the_next_wait() -> None:
+    mailbox = Mailbox()
+    mailbox.put(b"1")
+    assert mailbox.take() is not None
+    started = time.monotonic()
+    assert mailbox.wait(0.05) is None
+    assert time.monotonic() - started >= 0.05
+
+
+def test_a_mailbox_holds_as_many_frames_as_its_depth_and_gives_the_oldest_first() -> None:
+    mailbox = Mailbox(depth=3)
+    for frame in (b"1", b"2", b"3", b"4"):
+        mailbox.put(frame)
+    taken = [arrival.frame for arrival in iter(mailbox.take, None)]
+    assert taken == [b"2", b"3", b"4"]
 
 
 def test_a_link_receives_only_its_own_session(pair: tuple[zenoh.Session, zenoh.Session]) -> None:

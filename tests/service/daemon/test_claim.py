@@ -39,7 +39,7 @@ def record(yaw: float) -> SessionRecord:
 def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_changes() -> None:
     queries = Queries()
     role = cast(Role, SimpleNamespace(zenoh=queries, vehicle="aero"))
-    claims = ClaimClient(role, LoopSettings(), WireSpec(), auto_arm=False)
+    claims = ClaimClient(role, LoopSettings(), WireSpec(), auto_arm=False, own_grid=False)
     first, second = record(1.0), record(2.0)
     claims.keep(first)
     assert queries.sent == []  # no session runs
