@@ -1,0 +1,23 @@
+"""Every item of the bench, with its aim and the margin of a comparison."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from aeroloop.service.bench.item import Item, Margin
+from aeroloop.service.bench.start_up import start_experiment, start_help, start_status
+from aeroloop.service.bench.tick import tick
+
+PROCESSOR: Final = Margin(1.5, "processor time in turns repeats to 10 %, between machines to 30 %")
+MEDIAN: Final = Margin(2.0, "a median of waiting repeats to 30 %; other work on shared cores doubles it")
+TAIL: Final = Margin(5.0, "a stolen millisecond of a shared core is in the last percent of either side")
+MEMORY: Final = Margin(1.15, "resident memory repeats to 2 %; kernels and libraries differ in what they map")
+FAULTS: Final = Margin(1.0, "a page that is first touched late", slack=0.01)
+
+ITEMS: Final = (
+    Item("tick", "µs", 1.6, PROCESSOR, tick, "a tick of the controller; bitstruct and bare calls of CasADi"),
+    Item("start-help", "s", 1.5, PROCESSOR, start_help, "`--help`; Python with typer, rich, pydantic-core"),
+    Item("start-experiment", "s", 2.0, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
+    Item("start-status", "s", 2.5, PROCESSOR, start_status, "`op status`; Python with zenoh"),
+)
+"""The table, in its order."""
