@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from aeroloop.service.bench.item import Item, Margin
+from aeroloop.service.bench.loop import latency, lockstep
 from aeroloop.service.bench.start_up import start_experiment, start_help, start_status
 from aeroloop.service.bench.tick import tick
 
@@ -16,6 +17,13 @@ FAULTS: Final = Margin(1.0, "a page that is first touched late", slack=0.01)
 
 ITEMS: Final = (
     Item("tick", "µs", 1.6, PROCESSOR, tick, "a tick of the controller; bitstruct and bare calls of CasADi"),
+    Item("loop-tcp-p50", "µs", 1.15, MEDIAN, lambda quick: latency("tcp", quick).p50, "the loop; bare Zenoh, by TCP"),
+    Item("loop-tcp-p99", "µs", 1.5, TAIL, lambda quick: latency("tcp", quick).p99, "the same"),
+    Item(
+        "loop-unix-p50", "µs", 1.15, MEDIAN, lambda quick: latency("unix", quick).p50, "over a Unix socket", quick=False
+    ),
+    Item("loop-unix-p99", "µs", 1.5, TAIL, lambda quick: latency("unix", quick).p99, "the same", quick=False),
+    Item("lockstep", "µs", 1.3, MEDIAN, lockstep, "a tick in lockstep over Zenoh; bare round trips back to back"),
     Item("start-help", "s", 1.5, PROCESSOR, start_help, "`--help`; Python with typer, rich, pydantic-core"),
     Item("start-experiment", "s", 2.0, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
     Item("start-status", "s", 2.5, PROCESSOR, start_status, "`op status`; Python with zenoh"),

@@ -89,7 +89,7 @@ def ping_pong(
     ]
     pipe = subprocess.PIPE
     ping, pong = (
-        subprocess.Popen(  # noqa: S603 - this file
+        subprocess.Popen(
             [sys.executable, __file__, name, json.dumps(asdict(end))], env=variables, stdin=pipe, stdout=pipe
         )
         for name, end in zip(("ping", "pong"), ends, strict=True)

@@ -72,7 +72,7 @@ def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[Item], No
         progress(item)
         try:
             if quick and not item.quick:
-                raise NotMeasuredError("a full run measures it")
+                raise NotMeasuredError("full runs only")
             ours, floor = item.measure(quick)
         except NotMeasuredError as error:
             found[item.name] = NotMeasured(aim=item.aim, unit=item.unit, reason=str(error))

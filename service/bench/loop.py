@@ -1,0 +1,142 @@
+"""The loop over Zenoh beside a bare ping-pong of the same payloads: latency in real time, and ticks in lockstep.
+
+The loop is an emulator and a controller, two processes with their default settings; its latency is the one in the
+plant's status, from a measurement sent to its command received. This process links to them for the statuses, one a
+second, and does nothing else meanwhile. Where the host refuses SCHED_FIFO, the ping-pong runs without it, too.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from statistics import median
+from typing import Final, Literal, NamedTuple
+
+import zenoh
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.service.bench.item import Figure, NotMeasuredError, in_turns
+from aeroloop.service.bench.ping_pong import ping_pong
+from aeroloop.service.config import Settings, load
+from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
+
+Transport = Literal["tcp", "unix"]
+
+STATUSES: Final = 11
+"""A status' recent latency is of ten windows of a second; with one more, the cold first one is not among them."""
+STATUS_WAIT_S: Final = 20.0
+FLOOR_S: Final = 5.0
+LOCKSTEP_S: Final = 2.0
+TURNS: Final = 5
+
+
+class Latency(NamedTuple):
+    """Medians over the turns, ours and the floor's."""
+
+    p50: Figure
+    p99: Figure
+
+
+@cache
+def latency(transport: Transport, quick: bool) -> Latency:
+    """From a measurement sent to its command received, at 500 Hz [µs]. Measured once, for two items."""
+    found = [_latency(transport) for _ in range(1 if quick else TURNS)]
+    ours, floor = zip(*found, strict=True)
+    p50, p99 = (Figure(median(o[i] for o in ours), median(f[i] for f in floor)) for i in range(2))
+    return Latency(p50, p99)
+
+
+def _latency(transport: Transport) -> tuple[tuple[float, float], tuple[float, float]]:
+    """50th and 99th percentile, ours and the floor's [µs]."""
+    with _places(transport) as network, _running(network) as (settings, statuses):
+        for _ in range(STATUSES):
+            status = statuses.next()
+        ours = status.recent_latency_us
+        assert ours is not None  # the plant is driven
+        priority = 0 if any("SCHED_FIFO" in note for note in status.notes) else settings.loop.priority
+    with _places(transport) as network:
+        trips = sorted(_ping_pong(network, settings, settings.loop.rate_hz, FLOOR_S, priority=priority))
+    return (ours.p50, ours.p99), (trips[len(trips) // 2], trips[len(trips) * 99 // 100])
+
+
+def lockstep(quick: bool) -> Figure:
+    """Time of a tick in lockstep; of a bare round trip, one after the other [µs]."""
+
+    def ours() -> float:
+        with _places("tcp") as network, _running(network, "loop.lockstep=true") as (_, statuses):
+            first = last = statuses.next()
+            while last.uptime_s < first.uptime_s + LOCKSTEP_S:
+                last = statuses.next()
+        return (last.uptime_s - first.uptime_s) / (last.ticks - first.ticks) * 1e6
+
+    def floor() -> float:
+        with _places("tcp") as network:
+            trips = _ping_pong(network, load(), 0, LOCKSTEP_S, priority=0, lossless=True)
+        return sum(trips) / len(trips)
+
+    return in_turns(ours, floor, 1 if quick else TURNS, median)
+
+
+def _ping_pong(
+    network: list[str], settings: Settings, rate_hz: float, seconds: float, *, priority: int, lossless: bool = False
+) -> list[float]:
+    payloads = settings.wire.measurement.size, settings.wire.command.size
+    try:
+        return ping_pong(network[0], rate_hz, seconds, payloads=payloads, priority=priority, lossless=lossless)
+    except RuntimeError as error:
+        raise NotMeasuredError(str(error)) from None
+
+
+class _Statuses:
+    """The plant's statuses, as they are published."""
+
+    def __init__(self, session: zenoh.Session, vehicle: str) -> None:
+        self._published = threading.Condition()
+        self._status: Status | None = None
+        session.declare_subscriber(topics.key("status", vehicle, role="plant"), self._receive)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        with self._published:
+            self._status = Status.model_validate_json(sample.payload.to_bytes())
+            self._published.notify()
+
+    def next(self) -> Status:
+        """The next one. Raises NotMeasuredError if none is published for long."""
+        with self._published:
+            if not self._published.wait_for(lambda: self._status, STATUS_WAIT_S):
+                raise NotMeasuredError(f"the plant published no status for {STATUS_WAIT_S:g} s")
+            assert self._status is not None
+            status, self._status = self._status, None
+            return status
+
+
+@contextmanager
+def _running(network: Sequence[str], *overrides: str) -> Iterator[tuple[Settings, _Statuses]]:
+    """An emulator and a controller that drives it."""
+    own = ["controller.auto_arm=true", "controller.after_restart=configured"]
+    settings = load(overrides=[*own, f"network.rendezvous={json.dumps(network)}", *overrides])
+    with ProcessGroup(settings) as processes:
+        statuses = _Statuses(processes.zenoh, settings.vehicle)
+        processes.start("plant")
+        processes.await_role("plant")
+        processes.start("controller")
+        while statuses.next().state != PlantState.DRIVEN:
+            processes.check()
+        yield settings, statuses
+        processes.check()
+
+
+@contextmanager
+def _places(transport: Transport) -> Iterator[list[str]]:
+    """Endpoints at which three processes can meet: on loopback, or sockets in a folder of their own."""
+    if transport == "tcp":
+        yield [free_rendezvous()]
+    else:
+        with tempfile.TemporaryDirectory(prefix="aeroloop-") as folder:
+            yield [f"unixsock-stream/{folder}/{i}" for i in range(3)]
