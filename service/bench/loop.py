@@ -33,7 +33,7 @@ STATUSES: Final = 11
 STATUS_WAIT_S: Final = 20.0
 FLOOR_S: Final = 5.0
 LOCKSTEP_S: Final = 2.0
-TURNS: Final = 5
+TURNS: Final = 3
 
 
 class Latency(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,7 +67,7 @@ def _is_in(item: Item, word: str) -> bool:
 
 
 def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[Item], None] = lambda _: None) -> Results:
-    """Measure items one after the other; `progress` is called with each one first."""
+    """Measure items one after the other; `progress` is called with each one first. One that fails costs no other."""
     found: dict[str, Measured | NotMeasured] = {}
     for item in items:
         progress(item)
@@ -74,7 +75,9 @@ def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[Item], No
             if quick and not item.quick:
                 raise NotMeasuredError("full runs only")
             ours, floor = item.measure(quick)
-        except NotMeasuredError as error:
+            if not (isfinite(ours) and floor > 0):
+                raise NotMeasuredError(f"{ours:g} over {floor:g}")
+        except AeroloopError as error:  # such as a process that ended
             found[item.name] = NotMeasured(aim=item.aim, unit=item.unit, reason=str(error))
         else:
             line = Measured(
