@@ -49,8 +49,8 @@ ITEMS: Final = (
     Item("wake-1000-idle", "µs", WAKE_UP_AIM, TAIL, _wake_up(1000, False), "99.9 % of wake-ups; cyclictest"),
     Item("wake-1000-loaded", "µs", WAKE_UP_AIM, TAIL, _wake_up(1000, True), "all cores busy"),
     Item("lockstep", "µs", 1.3, MEDIAN, lockstep, "a tick in lockstep over Zenoh; bare round trips back to back"),
-    Item("start-help", "s", 1.5, PROCESSOR, start_help, "`--help`; Python with typer, rich, pydantic-core"),
-    Item("start-experiment", "s", 2.0, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
-    Item("start-status", "s", 2.5, PROCESSOR, start_status, "`op status`; Python with zenoh"),
+    Item("start-help", "s", 1.2, PROCESSOR, start_help, "`--help`; Python with typer, rich, pydantic-core"),
+    Item("start-experiment", "s", 1.8, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
+    Item("start-status", "s", 2.2, PROCESSOR, start_status, "`op status`; Python with zenoh"),
 )
 """The table, in its order."""

@@ -90,7 +90,11 @@ def ping_pong(
     pipe = subprocess.PIPE
     ping, pong = (
         subprocess.Popen(
-            [sys.executable, __file__, name, json.dumps(asdict(end))], env=variables, stdin=pipe, stdout=pipe
+            [sys.executable, __file__, name, json.dumps(asdict(end))],
+            env=variables,
+            stdin=pipe,
+            stdout=pipe,
+            start_new_session=True,  # ^C is this process's
         )
         for name, end in zip(("ping", "pong"), ends, strict=True)
     )

@@ -70,10 +70,10 @@ def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[Item], No
     """Measure items one after the other; `progress` is called with each one first. One that fails costs no other."""
     found: dict[str, Measured | NotMeasured] = {}
     for item in items:
-        progress(item)
         try:
             if quick and not item.quick:
                 raise NotMeasuredError("full runs only")
+            progress(item)
             ours, floor = item.measure(quick)
             if not (isfinite(ours) and floor > 0):
                 raise NotMeasuredError(f"{ours:g} over {floor:g}")
