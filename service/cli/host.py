@@ -20,9 +20,7 @@ from aeroloop.service.cli.common import (
     show,
 )
 
-group = typer.Typer(
-    no_args_is_help=True, help="Check this machine, soak and measure the loop on it, install its daemons."
-)
+group = typer.Typer(no_args_is_help=True, help="Check this machine, soak the loop on it, install its daemons.")
 
 
 @group.command()
