@@ -17,10 +17,11 @@ class NotMeasuredError(AeroloopError):
 
 
 class Figure(NamedTuple):
-    """A figure of ours and its floor, in the item's unit."""
+    """A figure of ours and its floor, in the item's unit; a note stands below the table."""
 
     ours: float
     floor: float
+    note: str = ""
 
 
 class Margin(NamedTuple):
@@ -75,4 +76,5 @@ def in_turns(
     median.
     """
     pairs = [(ours(), floor()) for _ in range(rounds)]
-    return Figure(*(of(each) for each in zip(*pairs, strict=True)))
+    each_ours, each_floor = zip(*pairs, strict=True)
+    return Figure(of(each_ours), of(each_floor))

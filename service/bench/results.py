@@ -26,6 +26,7 @@ class Measured(BaseModel, frozen=True, extra="forbid"):
     ratio: float = Field(description="ours over floor")
     aim: float = Field(description="the largest ratio wanted")
     unit: str = Field(description="of ours and floor")
+    note: str = Field(default="", exclude=True, description="for the table")
 
 
 class NotMeasured(BaseModel, frozen=True, extra="forbid"):
@@ -74,16 +75,13 @@ def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[Item], No
             if quick and not item.quick:
                 raise NotMeasuredError("full runs only")
             progress(item)
-            ours, floor = item.measure(quick)
+            ours, floor, note = item.measure(quick)
             if not (isfinite(ours) and floor > 0):
                 raise NotMeasuredError(f"{ours:g} over {floor:g}")
+            figures = {"ours": _short(ours), "floor": _short(floor), "ratio": _short(ours / floor)}
+            found[item.name] = Measured(aim=item.aim, unit=item.unit, note=note, **figures)
         except AeroloopError as error:  # such as a process that ended
             found[item.name] = NotMeasured(aim=item.aim, unit=item.unit, reason=str(error))
-        else:
-            line = Measured(
-                ours=_short(ours), floor=_short(floor), ratio=_short(ours / floor), aim=item.aim, unit=item.unit
-            )
-            found[item.name] = line
     return Results(found)
 
 

@@ -53,11 +53,13 @@ def _two(ratio: float | None) -> str:
 
 
 def _notes(results: Results, changes: Sequence[Change]) -> Iterator[str]:
-    """What was not measured and why, what the earlier run lacks, and the machine."""
+    """Notes of items, what was not measured and why, what the earlier run lacks, and the machine."""
     lacking: dict[str, list[str]] = {}
     for name, line in results.root.items():
         if isinstance(line, NotMeasured):
             lacking.setdefault(f"not measured ({line.reason})", []).append(name)
+        elif line.note:
+            yield f"{name}: {line.note}"
     lacking["not measured before"] = [change.name for change in changes if change.now and change.before is None]
     for what, names in lacking.items():
         if names:

@@ -75,13 +75,15 @@ def test_json_holds_the_five_figures_of_each_item_and_a_reason_where_there_are_n
 
 @pytest.mark.parametrize("form", [(), ("--markdown",)], ids=["terminal", "markdown"])
 def test_the_table_says_of_each_item_whether_its_aim_is_met(bench: Made, form: tuple[str, ...]) -> None:
-    code, out, _ = bench([item("a", 3.0, 1.5), item("b", 2.1), lacking("c"), lacking("d")], *form)
+    noted = item("e", 1.0)._replace(measure=lambda _: Figure(1.0, 1.0, "at most so"))
+    code, out, _ = bench([item("a", 3.0, 1.5), item("b", 2.1), lacking("c"), lacking("d"), noted], *form)
     assert code == 0
     rows = {words[0]: words[1:] for line in out.splitlines() if (words := line.replace("|", " ").split())}
     assert rows["a"] == ["3", "µs", "1.5", "µs", "2.00", "2", "met"]
     assert rows["b"] == ["2.1", "µs", "1", "µs", "2.10", "2", "missed"]
     assert "not measured (no cyclictest): c, d\n" in out
     assert "c" not in rows
+    assert "e: at most so\n" in out
     assert "CPUs" in out.splitlines()[-1]  # the machine
 
 
