@@ -100,20 +100,34 @@ class PlantSettings(BaseModel, extra="forbid"):
             )
         return self
 
+    @property
+    def effective(self) -> PlantSettings:
+        """These settings with `ideal` replaced by the parts that it stands for."""
+        if not self.ideal:
+            return self
+        rotor, friction = IDEAL_ROTOR, IDEAL_FRICTION
+        parts = {"aero": IDEAL_AERO, "rotor": rotor, "friction": friction, "wind": WindSettings()}
+        return self.model_copy(update={**parts, "sensors": IDEAL_SENSORS, "ideal": False})
+
+    @property
+    def actuators(self) -> int:
+        """Number of motors of the emulated plant."""
+        return RigidBody.actuators if self.kind == "rigid_body" else Aero.actuators
+
+    def mechanism(self) -> Mechanism:
+        """The body, of `effective` settings."""
+        return RigidBody(self.rigid_body) if self.kind == "rigid_body" else Aero(self.aero)
+
     def build(self, period: float) -> EmulatedPlant:
         """Build the emulated plant; `advance` integrates one `period` [s]."""
-        mechanism: Mechanism
-        if self.kind == "rigid_body":
-            mechanism = RigidBody(self.rigid_body)
-        else:
-            mechanism = Aero(IDEAL_AERO if self.ideal else self.aero)
-        wind = WindSettings() if self.ideal else self.wind
+        parts = self.effective
+        mechanism = parts.mechanism()
         return EmulatedPlant(
             mechanism,
-            IDEAL_ROTOR if self.ideal else self.rotor,
-            IDEAL_FRICTION if self.ideal else self.friction,
-            Wind(wind, mechanism.axes, period),
-            Sensors(IDEAL_SENSORS if self.ideal else self.sensors, period),
+            parts.rotor,
+            parts.friction,
+            Wind(parts.wind, mechanism.axes, period),
+            Sensors(parts.sensors, period),
             period=period,
             voltage_limit=self.voltage_limit,
             substeps=self.substeps,

@@ -65,6 +65,14 @@ def step_function(
     )
 
 
+def initially(mechanism: Mechanism) -> tuple[Quaternion, Vector, list[float]]:
+    """q [1], ω [rad/s] and joint angles [rad] of a mechanism's initial state."""
+    start = ca.SX(mechanism.initial)
+    parts = mechanism.attitude(start), mechanism.rate(start), mechanism.axis_angles(start)
+    attitude, rate, angles = (ca.evalf(part).elements() for part in parts)
+    return tuple(attitude), tuple(rate), angles  # type: ignore[return-value]  # four and three elements
+
+
 class EmulatedPlant(Plant):
     """A computed plant with an accessible true state.
 
@@ -92,10 +100,7 @@ class EmulatedPlant(Plant):
         )
         for i, value in enumerate(mechanism.initial):
             self._x[i] = value
-        start = ca.SX(mechanism.initial)
-        self._attitude: Quaternion = tuple(ca.evalf(mechanism.attitude(start)).elements())  # type: ignore[assignment]  # 4
-        self._rate: Vector = tuple(ca.evalf(mechanism.rate(start)).elements())  # type: ignore[assignment]  # 3
-        angles = ca.evalf(mechanism.axis_angles(start)).elements()
+        self._attitude, self._rate, angles = initially(mechanism)
         self._measurement = sensors.read(self._attitude, self._rate, angles)
 
     def actuate(self, voltages: Sequence[float]) -> None:

@@ -2,19 +2,28 @@
 
 Attitude: encoders that count steps of the joints, with a random zero within a step, or perfect. Angular velocity: the
 filtered derivative of the encoders' angles, a gyro with noise and bias, or perfect.
+
+A sample is one CasADi function, which a loop that is compiled as a whole contains as well; random numbers are inputs.
 """
 
 from __future__ import annotations
 
+import math
+from array import array
 from collections.abc import Sequence
-from math import cos, exp, floor, nan, pi, sin, sqrt
-from typing import Literal
+from math import cos, exp, isfinite, nan, pi, sin, sqrt
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.plant import Measurement
+from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.expressions import as_written
+from aeroloop.protocol.wire.symbolic import Compiled
+
+Scalar = TypeVar("Scalar", float, "ca.SX")
 
 NO_MEASUREMENT = Measurement((nan, nan, nan, nan), (nan, nan, nan))
 """Measurement without a valid value, such as of a state that is not finite."""
@@ -58,57 +67,103 @@ class FilteredDerivative:
 
     def update(self, angle: float) -> float:
         """Filter a sample [rad] and return the rate [rad/s]. The filter starts at the first sample, at rest."""
-        if self._angle is None:
-            self._angle = angle
-        lag = self._angle - angle
-        self._angle = angle + self._from_lag * lag + self._from_rate * self._rate
-        self._rate = self._rate_from_lag * lag + self._rate_from_rate * self._rate
+        held = angle if self._angle is None else self._angle
+        self._angle, self._rate = self.after(held, self._rate, angle)
         return self._rate
+
+    def after(self, held: Scalar, rate: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
+        """Filtered angle [rad] and rate [rad/s] after a sample [rad], from those before it."""
+        lag = held - angle
+        return (
+            angle + self._from_lag * lag + self._from_rate * rate,
+            self._rate_from_lag * lag + self._rate_from_rate * rate,
+        )
 
 
 class Sensors:
-    """Sensors of one plant, sampled once a `period` [s]."""
+    """Sensors of one plant, sampled once a `period` [s].
+
+    Attributes:
+        function: A sample as CasADi function. Inputs: true attitude q [1], rate ω [rad/s], joint angles [rad]; held
+            (filtered angle [rad] and rate [rad/s] of pitch, then of yaw; a NaN angle starts the filter), zeros (of
+            the encoders, within a step [1]), error (of the gyro [rad/s]). Outputs: seen (q and ω as measured), after
+            (`held` of the next sample).
+        zeros: Of pitch and yaw encoders, within a step [1].
+    """
 
     def __init__(self, settings: SensorSettings, period: float) -> None:
         self._settings = settings
-        self._attitude, self._rate = settings.attitude, settings.rate
         self._encoders = settings.attitude == "encoders" or settings.rate == "derivative"
-        self._steps = [2 * pi / counts for counts in settings.counts]
-        self._filters = [FilteredDerivative(settings.bandwidth, settings.damping_ratio, period) for _ in self._steps]
+        self.function = sensor_function(settings, period)
         self._random = np.random.default_rng(settings.seed)
-        self._zeros: list[float] = self._random.random(len(self._steps)).tolist()
+        self.zeros: list[float] = self._random.random(len(settings.counts)).tolist()
         self._noise: list[Vector] = []
+        self._sample = Compiled(self.function)
+        self._given, self._seen = self._sample.inputs, self._sample.outputs["seen"]
+        self._given["zeros"][:] = memoryview(array("d", self.zeros))
+        self._given["held"][:] = memoryview(array("d", [nan, 0.0, nan, 0.0]))
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
+        given = self._given
         if self._encoders:
-            (pitch_step, yaw_step), (pitch_zero, yaw_zero) = self._steps, self._zeros
-            try:
-                pitch = pitch_step * floor(angles[0] / pitch_step + pitch_zero)
-                yaw = yaw_step * floor(angles[1] / yaw_step + yaw_zero)
-            except (OverflowError, ValueError):  # an infinite or undefined angle has no count
+            if not isfinite(angles[0] + angles[1]):
                 return NO_MEASUREMENT
-            if self._attitude == "encoders":
-                attitude = attitude_of(pitch, yaw)
-            if self._rate == "derivative":
-                pitch_rate, yaw_rate = self._filters[0].update(pitch), self._filters[1].update(yaw)
-                return Measurement(attitude, rate_of(pitch, pitch_rate, yaw_rate))
-        return Measurement(attitude, self._gyro(rate) if self._rate == "gyro" else rate)
+            given["angles"][0], given["angles"][1] = angles
+        true = given["attitude"]
+        true[0], true[1], true[2], true[3] = attitude
+        given["rate"][0], given["rate"][1], given["rate"][2] = rate
+        if self._settings.rate == "gyro":
+            given["error"][0], given["error"][1], given["error"][2] = self.error()
+        self._sample()
+        given["held"][:] = self._sample.outputs["after"]
+        w, x, y, z, a, b, c = self._seen
+        return Measurement((w, x, y, z), (a, b, c))
 
-    def _gyro(self, rate: Vector) -> Vector:
+    @property
+    def held(self) -> list[float]:
+        """Memory of the filters; see `function`."""
+        return self._given["held"].tolist()  # type: ignore[return-value]  # doubles
+
+    def error(self) -> Vector:
+        """Draw a gyro's next error, noise and bias [rad/s]."""
         if not self._noise:
             drawn = self._random.standard_normal((_BLOCK, 3)) * self._settings.gyro_noise + self._settings.gyro_bias
             self._noise = [tuple(row) for row in drawn.tolist()]
-        error = self._noise.pop()
-        return rate[0] + error[0], rate[1] + error[1], rate[2] + error[2]
+        return self._noise.pop()
 
 
-def attitude_of(pitch: float, yaw: float) -> Quaternion:
-    """q of a body that first yaws, then pitches by these joint angles [rad]."""
-    cp, sp, cy, sy = cos(pitch / 2), sin(pitch / 2), cos(yaw / 2), sin(yaw / 2)
+def sensor_function(settings: SensorSettings, period: float) -> ca.Function:
+    """A sample; see `Sensors.function`."""
+    sizes = {"attitude": 4, "rate": 3, "angles": 2, "held": 4, "zeros": 2, "error": 3}
+    given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    attitude, rate, angles, held, zeros, error = given.values()
+    after = held
+    with as_written():
+        steps = [2 * pi / counts for counts in settings.counts]
+        pitch, yaw = (step * ca.floor(angles[i] / step + zeros[i]) for i, step in enumerate(steps))
+        if settings.attitude == "encoders":
+            attitude = ca.vertcat(*attitude_of(pitch, yaw, ca))
+        if settings.rate == "derivative":
+            derivative = FilteredDerivative(settings.bandwidth, settings.damping_ratio, period)
+            last = [
+                ca.if_else(filtered == filtered, filtered, now) for filtered, now in ((held[0], pitch), (held[2], yaw))
+            ]
+            of_pitch = derivative.after(last[0], held[1], pitch)
+            of_yaw = derivative.after(last[1], held[3], yaw)
+            rate, after = ca.vertcat(*rate_of(pitch, of_pitch[1], of_yaw[1], ca)), ca.vertcat(*of_pitch, *of_yaw)
+        elif settings.rate == "gyro":
+            rate = rate + error
+        seen = ca.vertcat(attitude, rate)
+        return ca.Function("sensors", [*given.values()], [seen, after], [*given], ["seen", "after"])
+
+
+def attitude_of(pitch: Scalar, yaw: Scalar, use: Any = math) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """q of a body that first yaws, then pitches by these joint angles [rad]; `use` is casadi for expressions."""
+    cp, sp, cy, sy = use.cos(pitch / 2), use.sin(pitch / 2), use.cos(yaw / 2), use.sin(yaw / 2)
     return cy * cp, -sy * sp, cy * sp, sy * cp
 
 
-def rate_of(pitch: float, pitch_rate: float, yaw_rate: float) -> Vector:
-    """ω in the body frame [rad/s] of joints that turn at these rates [rad/s], at this pitch [rad]."""
-    return -sin(pitch) * yaw_rate, pitch_rate, cos(pitch) * yaw_rate
+def rate_of(pitch: Scalar, pitch_rate: Scalar, yaw_rate: Scalar, use: Any = math) -> tuple[Scalar, Scalar, Scalar]:
+    """ω in the body frame [rad/s] of joints that turn at these rates [rad/s], at this pitch [rad]; `use` as above."""
+    return -use.sin(pitch) * yaw_rate, pitch_rate, use.cos(pitch) * yaw_rate

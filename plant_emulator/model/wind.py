@@ -7,6 +7,7 @@ stepped exactly, so that its statistics do not depend on the period.
 
 from __future__ import annotations
 
+from itertools import accumulate
 from math import exp, hypot, sqrt
 
 from pydantic import BaseModel, Field
@@ -49,16 +50,26 @@ class Wind:
         self._keep = exp(-period / settings.gust_time_s)
         self._kick = deviation * sqrt(1 - self._keep**2)
         self._random = np.random.default_rng(settings.seed)
-        self._gust = deviation * self._random.standard_normal(axes)
+        self._gust: list[float] = (deviation * self._random.standard_normal(axes)).tolist()
         self._block: list[list[float]] = []
 
     def sample(self) -> list[float]:
         """Torque about each axis for the next period [N·m]. Shape (axes,)."""
         if not self._block:
-            torques = np.tile(self._steady, (_BLOCK, 1))
-            if self._kick:
-                for row, kick in zip(torques, self._random.standard_normal(torques.shape) * self._kick, strict=True):
-                    self._gust = self._keep * self._gust + kick
-                    row += self._gust
-            self._block = torques[::-1].tolist()
+            self._block = self._draw()[::-1]
         return self._block.pop()
+
+    def _draw(self) -> list[list[float]]:
+        torques = np.tile(self._steady, (_BLOCK, 1))
+        if self._kick:
+            kicks = (self._random.standard_normal(torques.shape) * self._kick).T.tolist()
+            gusts = [
+                list(accumulate(each, self._next, initial=gust)) for each, gust in zip(kicks, self._gust, strict=True)
+            ]
+            self._gust = [each[-1] for each in gusts]
+            torques += np.array(gusts).T[1:]
+        block: list[list[float]] = torques.tolist()
+        return block
+
+    def _next(self, gust: float, kick: float) -> float:
+        return self._keep * gust + kick

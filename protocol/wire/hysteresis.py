@@ -17,7 +17,7 @@ from typing import Final
 
 from aeroloop.protocol.wire.quantizer import TIE, UniformQuantizer
 
-_SLACK: Final[float] = 1 - TIE
+SLACK: Final[float] = 1 - TIE
 
 
 class HysteresisQuantizer(UniformQuantizer):
@@ -66,10 +66,10 @@ class HysteresisQuantizer(UniformQuantizer):
         # A value within a few units in the last place of an edge lies on it. Beyond the limit a value saturates.
         h, i = self.hysteresis, abs(code)
         outer = self.deadzone + i * self.step
-        high = min(self.limit, outer + h + _SLACK * (outer + h))
+        high = min(self.limit, outer + h + SLACK * (outer + h))
         if code:
             inner = outer - self.step
-            low = inner - h - _SLACK * (inner + h)
+            low = inner - h - SLACK * (inner + h)
         else:
             low = -high
         self._held = code

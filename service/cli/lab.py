@@ -46,12 +46,12 @@ def experiment(
 ) -> None:
     """Run the closed loop in this process, in lockstep through real frames, without a network."""
     settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
-    from aeroloop.service.lab.experiment import run_experiment
+    from aeroloop.service.lab.experiment import experiment_figures
     from aeroloop.service.terminal.display import figures_table, progress_bar
 
     with guarded(), progress_bar("experiment", duration, hidden=json) as update:
-        figures = run_experiment(settings, duration, update)
-    show(figures, json, figures_table)
+        figures = experiment_figures(settings, duration, update)
+    show(figures, json, lambda found: figures_table(found, path=found.path))
 
 
 @group.command()

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
 from aeroloop.protocol.wire import attitude
+from aeroloop.protocol.wire.symbolic import Compiled, in_columns
 
 Floats = NDArray[np.float64]
 
@@ -254,3 +255,16 @@ def reference_function() -> ca.Function:
         ["q_d", "omega_d", "omega_d_dot"],
         {"cse": True},  # the derivatives repeat sines and cosines: 12 instead of 36, and the same numbers
     )
+
+
+def desired(reference: Reference, period: float, ticks: int) -> Floats:
+    """q_d, ω_d, ω̇_d of a reference at each tick of a `period` [s], as `Motion` has them. Shape (ticks, 10)."""
+    plan = Plan.of(reference)
+    t = np.arange(ticks) * period
+    piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
+    function = Compiled(in_columns(reference_function(), ticks))
+    given = {"t": t, "start": plan.starts[piece], "quintic": plan.quintic[piece].reshape(ticks, -1)}
+    for name, rows in {**given, "amplitude": plan.amplitude[piece], "frequency": plan.frequency[piece]}.items():
+        np.asarray(function.inputs[name]).reshape(-1, ticks)[:] = rows.T
+    function()
+    return np.concatenate([np.asarray(memory).reshape(-1, ticks) for memory in function.outputs.values()]).T

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 
 from aeroloop.service.config import Settings
-from aeroloop.service.control.reference import Floats
-from aeroloop.service.lab.attacked_loops import desired, span, turned
+from aeroloop.service.control.reference import Floats, desired
+from aeroloop.service.lab.attacked_loops import span, turned
 from aeroloop.service.lab.search_points import ball
 from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.lemma import Samples, lemma_inequalities, rotation, times
@@ -29,7 +29,8 @@ class Instants:
 
     def __init__(self, settings: Settings, e: Evaluated) -> None:
         self._settings, self._e = settings, e
-        self._desired = desired(settings, round(span(settings.reference) / settings.loop.period) + 1)
+        period = settings.loop.period
+        self._desired = desired(settings.reference, period, round(span(settings.reference) / period) + 1)
 
     def shares(self, points: Floats) -> dict[str, Floats]:
         """Left over right side of each inequality, by its number; 0 where both are 0. Points of shape (n, SIZE)."""

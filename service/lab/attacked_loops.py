@@ -25,7 +25,7 @@ from aeroloop.protocol.wire.quantizer import TIE, Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.service.config import Settings
 from aeroloop.service.control.law import build_law, law_function
-from aeroloop.service.control.reference import Floats, Plan, reference_function
+from aeroloop.service.control.reference import Floats, desired
 from aeroloop.service.theorem.lemma import coordinates, lyapunov, rotation, times
 
 WAVES: Final = ("square", "sinusoid", "constant", "bang-bang")
@@ -117,7 +117,7 @@ class Loops:
     def __init__(self, settings: Settings, rows: int, ticks: int) -> None:
         self.settings = settings
         self._starts = round(span(settings.reference) / settings.loop.period)
-        self._desired = desired(settings, self._starts + ticks)
+        self._desired = desired(settings.reference, settings.loop.period, self._starts + ticks)
         self._tick = Compiled(in_columns(tick_function(settings), rows))
         self._inputs = {name: _columns(memory, rows) for name, memory in self._tick.inputs.items()}
         self._after = _columns(self._tick.outputs["after"], rows)
@@ -280,17 +280,6 @@ def _columns(memory: Buffer, rows: int) -> Floats:
     """A view of what CasADi holds column by column. Shape (rows, m)."""
     view: Floats = np.asarray(memory).reshape(-1, rows).T
     return view
-
-
-def desired(settings: Settings, ticks: int) -> Floats:
-    """q_d, ω_d, ω̇_d at each tick of the reference. Shape (ticks, 10)."""
-    plan = Plan.of(settings.reference)
-    t = np.arange(ticks) * settings.loop.period
-    piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1)
-    found = in_columns(reference_function(), ticks)(
-        t, plan.starts[piece], plan.quintic[piece].reshape(ticks, -1), plan.amplitude[piece], plan.frequency[piece]
-    )
-    return np.hstack([part.full() for part in found])
 
 
 def span(reference: Reference) -> float:

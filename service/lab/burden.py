@@ -1,7 +1,7 @@
 """Burden of a loop: error against bits over a grid of bits, quantizers, transmit policies and sensors.
 
-Each cell is one lockstep experiment through real frames. Both policies give the same run to the last bit, because an
-end that receives no frame holds its last levels; so a cell runs once, and its frames give the traffic of both policies.
+Each cell is one lockstep experiment. Both policies give the same run to the last bit, because an
+end that receives no frame holds its last levels; so a cell runs once, and its codes give the traffic of both policies.
 Every figure is compared with that of float64 at every tick under the same sensors. The Pareto front of the points under
 the same sensors holds those that no other point beats in error without more bits, or in bits without more error.
 """
@@ -17,8 +17,8 @@ from aeroloop.protocol.wire.transmit import Policy
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.burden_grid import SENSORS, BurdenCell, BurdenError, cell_settings
-from aeroloop.service.lab.experiment import LoopEndedError, run_experiment
-from aeroloop.service.lab.traffic import Traffic, codes_of, sent_ticks, traffic
+from aeroloop.service.lab.experiment import PATH, LoopEndedError, experiment, heartbeat_of, paths
+from aeroloop.service.lab.traffic import Traffic, codes_of, frames_of, sent_ticks, traffic
 from aeroloop.service.lab.workers import Workers
 from aeroloop.service.lab.zenoh_bytes import LinkBytes, count_bytes
 
@@ -96,6 +96,7 @@ class Burden(BaseModel):
     heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
     counter_bits: int = Field(description="bits of the counter in each frame")
     sensors: dict[str, str] = Field(description="meaning of each name")
+    path: str = Field(description=PATH)
     points: list[Point]
 
     def under(self, sensors: str) -> list[Point]:
@@ -109,6 +110,7 @@ class Observation(NamedTuple):
     figures: Figures | None
     traffic: dict[Policy, tuple[Traffic, Traffic]]  # measurements and commands
     zenoh: dict[Policy, LinkBytes]  # bytes on a Zenoh link, if they were counted
+    path: str
     reason: str | None = None
 
 
@@ -140,9 +142,10 @@ def measure_burden(
     return Burden(
         duration_s=duration_s,
         rate_hz=settings.loop.rate_hz,
-        heartbeat_s=_heartbeat(settings) * settings.loop.period,
+        heartbeat_s=heartbeat_of(settings) * settings.loop.period,
         counter_bits=settings.wire.counter_bits,
         sensors={name: SENSORS[name].text for name in sensors},
+        path=paths(result.path for result in results),
         points=[point for name in sensors for point in _beside_float64(points, name)],
     )
 
@@ -150,39 +153,33 @@ def measure_burden(
 def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observation:
     """Run one cell for `duration_s` [s]; `config` dumps a configuration that sends at every tick."""
     settings = Settings.model_validate(config)
-    measurements: list[bytes] = []
-    commands: list[bytes] = []
-
-    def watch(_k: int, measurement: bytes, command: bytes) -> None:
-        measurements.append(measurement)
-        commands.append(command)
-
+    wire, period, heartbeat = settings.wire, settings.loop.period, heartbeat_of(settings)
+    kinds = wire.measurement, wire.command
+    frames: list[tuple[bytes, bytes]] = []
     try:
-        figures = run_experiment(settings, duration_s, watch=watch)
+        found = experiment(settings, duration_s, watch=lambda _k, *both: frames.append(both))
     except LoopEndedError as error:
-        return Observation(None, {}, {}, str(error))
-    wire, period = settings.wire, settings.loop.period
-    heartbeat, counters = _heartbeat(settings), wire.measurement.counters
-    measured, commanded = codes_of(measurements, wire.measurement), codes_of(commands, wire.command)
+        return Observation(None, {}, {}, "frames", str(error))
+    if found.course is not None:
+        codes = [found.course.measured, found.course.commanded]
+    else:
+        codes = [codes_of(each, kind) for each, kind in zip(zip(*frames, strict=True), kinds, strict=True)]
     rates: dict[Policy, tuple[Traffic, Traffic]] = {}
     zenoh: dict[Policy, LinkBytes] = {}
     for policy in POLICIES:
-        out, inp = (sent_ticks(codes, policy, heartbeat, counters) for codes in (measured, commanded))
-        measurement = traffic(measured, wire.measurement, out, period)
-        rates[policy] = measurement, traffic(commanded, wire.command, inp, period)
+        out, inp = sent = [sent_ticks(each, policy, heartbeat) for each in codes]
+        measurement, command = (traffic(*each, period) for each in zip(codes, kinds, sent, strict=True))
+        rates[policy] = measurement, command
         if counted:
+            measurements, commands = (frames_of(each, kind) for each, kind in zip(codes, kinds, strict=True))
             zenoh[policy] = count_bytes(settings.network, [measurements[k] for k in out], [commands[k] for k in inp])
-    return Observation(figures, rates, zenoh)
+    return Observation(found.figures, rates, zenoh, found.path)
 
 
 def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
     """Which pairs no other pair beats: as low in both and lower in one."""
     pairs = list(costs)
     return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in pairs) for x, y in pairs]
-
-
-def _heartbeat(settings: Settings) -> int:
-    return settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns, settings.wire.measurement.counters)
 
 
 def _points(cell: BurdenCell, found: Observation) -> list[Point]:

@@ -168,8 +168,8 @@ def _name(point: Point) -> str:
 def _notes(burden: Burden) -> Iterator[str]:
     rate, bits, saved = burden.rate_hz, burden.counter_bits, STAMP_BYTES * burden.rate_hz / 1e3
     yield (
-        f"{burden.duration_s:g} s each; of two numbers the first is measurements, the second commands; × and % are of "
-        "float64 at every tick; ★ is on the Pareto front of z_track against payload bits."
+        f"{burden.duration_s:g} s each, path: {burden.path}; of two numbers the first is measurements, the second "
+        "commands; × and % are of float64 at every tick; ★ is on the Pareto front of z_track against payload bits."
     )
     yield (
         f"Every tick: {rate:g} + {rate:g} frames/s, {1e3 / rate:g} ms apart. On change: at least every "

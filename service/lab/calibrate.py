@@ -23,6 +23,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings
 from aeroloop.service.lab import paper
 from aeroloop.service.lab.cells import Cell, Pool
+from aeroloop.service.lab.experiment import PATH
 from aeroloop.service.lab.identification import Identification, Named, identify
 from aeroloop.service.lab.tables import CASES
 
@@ -54,6 +55,7 @@ class Calibration(BaseModel):
     residuals: dict[str, float] = Field(description="relative residual of each of the four figures")
     identification: Identification
     runs: int = Field(description="number of experiments")
+    path: str = Field(description=PATH)
 
 
 class CalibrationError(AeroloopError):
@@ -110,6 +112,7 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
         },
         identification=identification,
         runs=runs,
+        path=pool.path,
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from aeroloop.service.config import Settings
-from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.experiment import experiment, paths
 from aeroloop.service.lab.paper import DURATION_S
 from aeroloop.service.lab.workers import Workers
 
@@ -30,8 +30,8 @@ class Result(NamedTuple):
     u_total: float  # [V²·s]
 
 
-def run_cell(config: dict[str, Any], cell: Cell) -> Result:
-    """Run one cell of a configuration's dump."""
+def run_cell(config: dict[str, Any], cell: Cell) -> tuple[Result, str]:
+    """Run one cell of a configuration's dump. Returns its figures and the path that it took."""
     settings = Settings.model_validate(config)
     plant = settings.plant.model_copy(
         update={
@@ -40,15 +40,26 @@ def run_cell(config: dict[str, Any], cell: Cell) -> Result:
         }
     )
     wire = settings.wire.with_bits(cell.bits_out, cell.bits_in)
-    figures = run_experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S)
+    figures, path, _ = experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S)
     assert figures.z_track is not None
     assert figures.u_total is not None
-    return Result(figures.z_track * 1e4, figures.u_total)
+    return Result(figures.z_track * 1e4, figures.u_total), path
 
 
 class Pool(Workers):
     """Processes that run cells, one a core. A context."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._paths: set[str] = set()
+
     def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:
         """Results of cells in their order; `progress` is called with the number done."""
-        return self.each(run_cell, ((settings.description(), cell) for settings, cell in jobs), progress)
+        done = self.each(run_cell, ((settings.description(), cell) for settings, cell in jobs), progress)
+        self._paths |= {path for _, path in done}
+        return [result for result, _ in done]
+
+    @property
+    def path(self) -> str:
+        """The paths that the cells took so far."""
+        return paths(self._paths)

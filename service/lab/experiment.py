@@ -1,14 +1,18 @@
-"""Experiment: runs controller and plant end in one process, in lockstep, through real frames.
+"""Experiment: runs controller and plant end in one process, in lockstep, by one of two paths with the same bits.
 
-A `for` loop over the two ticks, without network or clock. It repeats bit for bit, and a demo in lockstep over Zenoh
-gives the same figures.
+*compiled*: the whole loop is one function, `loop_function`. *frames*: a `for` loop over the two ends, through real
+frames, for what that function cannot express: faults, a user's own plant or controller, `watch`, a run that trips.
+Without network or clock it repeats bit for bit, and a demo in lockstep over Zenoh gives the same figures.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
-from typing import TypeAlias
+from collections.abc import Callable, Iterable, Iterator
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from pydantic import Field
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Plant
@@ -17,8 +21,12 @@ from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.figures import Figures, Score
+from aeroloop.service.lab.loop_function import Run, loop_of
+from aeroloop.service.lab.traffic import sent_ticks
 
-NO_CLOCK = "lockstep without a network has no latency"
+REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
+Path: TypeAlias = Literal["compiled", "frames"]
+PATH = "how the loop ran: compiled, as one function; frames, frame by frame; or both, in a batch"
 
 Watch: TypeAlias = Callable[[int, bytes, bytes], None]
 """Called at every tick with k, the measurement and the command that answers it; SILENCE where none is sent."""
@@ -26,6 +34,72 @@ Watch: TypeAlias = Callable[[int, bytes, bytes], None]
 
 class LoopEndedError(ValueError):
     """The plant tripped before the end; one line with time and cause."""
+
+
+class Experiment(NamedTuple):
+    """Figures of an experiment, the path that it took, and the loop's course if that was *compiled*."""
+
+    figures: Figures
+    path: Path
+    course: Run | None = None
+
+
+def experiment(
+    settings: Settings,
+    duration_s: float,
+    progress: Callable[[float], None] | None = None,
+    watch: Watch | None = None,
+) -> Experiment:
+    """Run the closed loop as one function if that is possible, else `through_frames`, which then calls `watch`."""
+    loop, wire, ticks = settings.loop, settings.wire, settings.loop.ticks(duration_s)
+    report_every = loop.ticks(1.0)
+    reported = 0
+
+    def report(done: int) -> None:
+        nonlocal reported
+        while progress is not None and reported < done:
+            progress(reported * loop.period)
+            reported += max(1, report_every)
+
+    course = None
+    if ticks and settings.plant.actuators == wire.actuators and not settings.plant.faults:
+        course = loop_of(settings).run(settings, ticks, report)
+    if course is None:
+        return Experiment(through_frames(settings, duration_s, progress, watch), "frames")
+    score = Score(wire, loop.period, settings.plant.watchdog_s)
+    score.errors(np.arange(ticks), course.errors)
+    score.commands(np.arange(ticks), course.voltages)
+    transmit, heartbeat = wire.transmit, heartbeat_of(settings)
+    unsent = (
+        ticks - len(sent_ticks(codes, policy, heartbeat))
+        for codes, policy in ((course.measured, transmit.measurement), (course.commanded, transmit.command))
+    )
+    score.unsent(*unsent)
+    return Experiment(score.figures(reasons=REASONS), "compiled", course)
+
+
+class ExperimentFigures(Figures):
+    """Figures, and the path that the loop took."""
+
+    path: Path = Field(description=PATH)
+
+
+def experiment_figures(
+    settings: Settings, duration_s: float, progress: Callable[[float], None] | None = None
+) -> ExperimentFigures:
+    """The figures of `experiment`, for a command's output."""
+    found = experiment(settings, duration_s, progress)
+    return ExperimentFigures(**found.figures.model_dump(), path=found.path)
+
+
+def paths(each: Iterable[str]) -> str:
+    """The paths that a batch took, in one line."""
+    return ", ".join(sorted(set(each)))
+
+
+def heartbeat_of(settings: Settings) -> int:
+    """The most ticks from one frame to the next where frames are sent on change."""
+    return settings.wire.transmit.heartbeat_ticks(settings.loop.period_ns, settings.wire.measurement.counters)
 
 
 def run_experiment(
@@ -37,7 +111,25 @@ def run_experiment(
     plant: Plant | None = None,
     controller: Controller | None = None,
 ) -> Figures:
-    """Run the closed loop for `duration_s` of the law's time and return its figures.
+    """Run the closed loop and return its figures: by the faster path, if there is nothing to watch or to replace.
+
+    Arguments and errors as `through_frames`.
+    """
+    if watch is None and plant is None and controller is None:
+        return experiment(settings, duration_s, progress).figures
+    return through_frames(settings, duration_s, progress, watch, plant=plant, controller=controller)
+
+
+def through_frames(
+    settings: Settings,
+    duration_s: float,
+    progress: Callable[[float], None] | None = None,
+    watch: Watch | None = None,
+    *,
+    plant: Plant | None = None,
+    controller: Controller | None = None,
+) -> Figures:
+    """Run the closed loop for `duration_s` of the law's time, frame by frame, and return its figures.
 
     Args:
         settings: The configuration.
@@ -82,7 +174,7 @@ def run_experiment(
         measurement = endpoint.tick(command, k + 1)
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
-    return score.figures(reasons={"latency_us": NO_CLOCK, "log": "nothing crossed a network"})
+    return score.figures(reasons=REASONS)
 
 
 def _plant(settings: Settings) -> Plant:

@@ -18,6 +18,7 @@ from aeroloop.service.config import Settings, as_overrides, load_over
 from aeroloop.service.lab import paper
 from aeroloop.service.lab.calibrate import MEASURED_YAW_COULOMB, TABLE_C1_HEIGHT
 from aeroloop.service.lab.cells import Cell, Pool
+from aeroloop.service.lab.experiment import PATH
 from aeroloop.service.lab.tables import CASES
 
 ROW: Final = 7
@@ -42,6 +43,7 @@ class Sensitivity(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     changes: list[Change]
+    path: str = Field(description=PATH)
 
 
 def measure_sensitivity(
@@ -60,10 +62,11 @@ def measure_sensitivity(
         results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
     figures = np.array(results).reshape(len(changes), len(cells), seeds, 2).mean(axis=2)
     return Sensitivity(
+        path=pool.path,
         changes=[
             Change(name=name, overrides=overrides, **_errors(found))
             for (name, overrides), found in zip(changes.items(), figures, strict=True)
-        ]
+        ],
     )
 
 

@@ -16,6 +16,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.lab import paper
 from aeroloop.service.lab.baselines import Baseline, baselines
 from aeroloop.service.lab.cells import Cell, Pool, Result
+from aeroloop.service.lab.experiment import PATH
 
 CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
 _FIGURES: Final = {"z_track_1e-4": "z_track", "u_total": "u_total"}
@@ -50,6 +51,7 @@ class Tables(BaseModel):
     C2: Table = Field(description="z_track [1e-4 s]; rows: bits of the input, columns: bits of the output")
     C3: Table = Field(description="u_total [V²·s]")
     C4: Table = Field(description="both, calm and windy; mare over the quantized windy cell's two figures")
+    path: str = Field(description=PATH)
 
 
 def predict(settings: Settings, seeds: int = 1, progress: Callable[[int, int], None] | None = None) -> Tables:
@@ -66,7 +68,8 @@ def predict(settings: Settings, seeds: int = 1, progress: Callable[[int, int], N
     with Pool() as pool:
         results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
     runs = {cell: results[i * seeds : (i + 1) * seeds] for i, cell in enumerate((*calm, *windy))}
-    return Tables(C2=_grid(runs, "z_track", paper.Z_TRACK), C3=_grid(runs, "u_total", paper.U_TOTAL), C4=_wind(runs))
+    grids = _grid(runs, "z_track", paper.Z_TRACK), _grid(runs, "u_total", paper.U_TOTAL)
+    return Tables(C2=grids[0], C3=grids[1], C4=_wind(runs), path=pool.path)
 
 
 _Runs = dict[tuple[int | None, int | None, bool], list[Result]]

@@ -7,17 +7,14 @@ holds the same levels, so one run gives the traffic of either policy.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
 from pydantic import Field
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.transmit import Policy, Sender
-from aeroloop.service.figures import StreamFigures
+from aeroloop.protocol.wire.transmit import Policy
+from aeroloop.service.figures import Floats, Integers, StreamFigures
 from aeroloop.service.lab.bus import BITRATE, bus_bits, classic_frames
-
-Codes: TypeAlias = tuple[float, ...]
 
 
 class Traffic(StreamFigures):
@@ -37,8 +34,8 @@ class Traffic(StreamFigures):
     can_load: float = Field(description="share of a classic bus of 1 Mbit/s; above 1 it does not fit")
 
 
-def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> list[Codes]:
-    """Codes of frames.
+def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> Floats:
+    """Codes of frames. Shape (frames, components).
 
     Raises:
         ValueError: A frame is malformed.
@@ -46,23 +43,38 @@ def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> list[Codes]:
     unpacked = [kind.unpack(frame) for frame in frames]
     if None in unpacked:
         raise ValueError("a frame is malformed")
-    return [content[1] for content in unpacked if content is not None]
+    return np.array([content[1] for content in unpacked if content is not None], float)
 
 
-def sent_ticks(codes: Sequence[Codes], policy: Policy, heartbeat: int, counters: int) -> list[int]:
-    """The ticks at which a policy sends.
+def frames_of(codes: Floats, kind: FrameFormat) -> list[bytes]:
+    """The frames of every tick from 0 on. Shape of the codes: (ticks, components)."""
+    columns = [
+        column.tolist() if width is None else column.astype(int).tolist()
+        for column, width in zip(codes.T, kind.widths, strict=True)
+    ]
+    return [kind.pack(k % kind.counters, row) for k, row in enumerate(zip(*columns, strict=True))]
+
+
+def sent_ticks(codes: Floats, policy: Policy, heartbeat: int) -> Integers:
+    """The ticks at which a policy sends; as a `Sender` decides where no tick is missed.
 
     Args:
         codes: Codes at every tick from 0 on. Shape (ticks, components).
         policy: The transmit policy.
         heartbeat: The most ticks from one frame to the next.
-        counters: Number of values of the frame counter.
     """
-    sender = Sender(policy, heartbeat, counters)
-    return [k for k, current in enumerate(codes) if sender.due(k, current)]
+    ticks = np.arange(len(codes))
+    if policy == "periodic":
+        return ticks
+    now, before = codes[1:], codes[:-1]
+    alike = (now == before) & (np.signbit(now) == np.signbit(before)) | np.isnan(now) & np.isnan(before)
+    changed = np.concatenate([[True], ~alike.all(axis=1)])
+    since = ticks - np.maximum.accumulate(np.where(changed, ticks, 0))
+    sent: Integers = ticks[since % heartbeat == 0]
+    return sent
 
 
-def traffic(codes: Sequence[Codes], kind: FrameFormat, sent: Sequence[int], period: float) -> Traffic:
+def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Traffic:
     """The traffic of one direction.
 
     Args:
@@ -74,10 +86,10 @@ def traffic(codes: Sequence[Codes], kind: FrameFormat, sent: Sequence[int], peri
     Raises:
         ValueError: There are no ticks.
     """
-    if not codes:
+    if not len(codes):
         raise ValueError("no ticks, no traffic")
     duration = len(codes) * period
-    changes = np.count_nonzero(np.diff(np.array(codes), axis=0), axis=0) / duration
+    changes = np.count_nonzero(np.diff(codes, axis=0), axis=0) / duration
     intervals = np.diff(sent) * (period * 1e3)
     on_bus = len(sent) * bus_bits(kind.size) / duration
     return Traffic(

@@ -45,8 +45,8 @@ LABELS: Final = 22
 _stderr = Console(stderr=True)
 
 
-def figures_table(figures: Figures) -> None:
-    """Print figures of merit."""
+def figures_table(figures: Figures, **further: str) -> None:
+    """Print figures of merit, and further rows of label and text."""
 
     def shown(name: str, text: Callable[[Any], str]) -> str:
         value = getattr(figures, name)
@@ -69,6 +69,8 @@ def figures_table(figures: Figures) -> None:
         table.add_row("not read", damage)
     if figures.log:
         table.add_row("log", figures.log)
+    for label, text in further.items():
+        table.add_row(label, text)
     Console().print(table)
 
 
@@ -146,6 +148,7 @@ def paper_tables(tables: Tables) -> None:
     console.print(grid)
     rows_table(comparison(tables), f"\n{ERRORS}")
     console.print(f"\n{NOT_IDENTIFIED}")
+    console.print(f"\npath: {tables.path}")
 
 
 def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> str:
@@ -184,7 +187,7 @@ def calibration_table(fit: Calibration) -> None:
     rows_table(rows, "\nidentified by the figures of Table C.4, given the published cells' scatter")
     values = ", ".join(f"{value:.3g}" for value in found.singular_values)
     Console().print(f"singular values {values}; weakest together: {found.weakest}")
-    Console().print(f"{fit.runs} experiments")
+    Console().print(f"{fit.runs} experiments, path: {fit.path}")
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from aeroloop.protocol.wire.spec import Kind
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import ConfigError, Settings, load, load_over, with_bits
 from aeroloop.service.lab.cells import Cell, run_cell
-from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.lab.experiment import experiment, run_experiment
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.replay import SessionReplay, replay
 from aeroloop.service.logs.runs import Run
@@ -76,9 +76,9 @@ def test_a_cell_of_the_tables_has_other_bits_and_the_same_kind(kind: str, monkey
 
     def instead(settings: Settings, duration_s: float) -> object:
         seen.append(settings)
-        return run_experiment(settings, duration_s / 500)
+        return experiment(settings, duration_s / 500)
 
-    monkeypatch.setattr("aeroloop.service.lab.cells.run_experiment", instead)
+    monkeypatch.setattr("aeroloop.service.lab.cells.experiment", instead)
     run_cell(throughout(kind).description(), Cell(bits_out=9, bits_in=7))
     wire = seen[0].wire
     assert [(signal.kind, signal.bits) for signal in (wire.attitude, wire.rate, wire.voltage)] == [

@@ -19,11 +19,12 @@ from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import Settings, load, with_bits
+from aeroloop.service.control.reference import desired
 from aeroloop.service.lab import attack as attacks
 from aeroloop.service.lab.attack import ROUND, Attack, attack, experiments
 from aeroloop.service.lab.attack_rounds import AttackError
 from aeroloop.service.lab.attacked_lemma import SIZE, Instants
-from aeroloop.service.lab.attacked_loops import Experiments, Loops, Outcome, balance, desired, quantized
+from aeroloop.service.lab.attacked_loops import Experiments, Loops, Outcome, balance, quantized
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.theorem.bounds import Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.evaluation import evaluate
@@ -92,7 +93,7 @@ def test_a_row_of_the_batch_is_the_loop_that_runs_through_real_frames(bits: str)
         omega.append(truth.rate)
 
     run_experiment(settings, ticks * settings.loop.period, watch=watch, plant=plant)
-    wanted = desired(settings, ticks)
+    wanted = desired(settings.reference, settings.loop.period, ticks)
     q_d, omega_d = wanted[:, :4], wanted[:, 4:7]
     c = coordinates(np.array(q), np.array(omega), q_d, omega_d, np.ones(ticks), np.array(law.C1))
 

@@ -1,0 +1,237 @@
+"""The closed loop in lockstep as one function: measurement, law, command and plant of a tick, mapped over the ticks.
+
+It contains the functions of law, plant and sensors as the two ends evaluate them, and the quantizers as expressions,
+all `as_written`: so every bit is that of the loop through frames. Bits, limits, and zeros of the encoders are part of
+its state; reference, wind and a gyro's errors are computed beforehand. One function serves all that differ in these.
+
+A run near a limit of the guard, or with a value that is no number, is abnormal: it is to be run through frames, which
+gives its exact reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
+from aeroloop.plant_emulator.model.emulated import initially, step_function
+from aeroloop.plant_emulator.model.sensors import Sensors, sensor_function
+from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.protocol.wire.attitude import IDENTITY
+from aeroloop.protocol.wire.expressions import NUMBERS, as_written, encode, level, numbers, with_numbers
+from aeroloop.protocol.wire.spec import SignalSpec
+from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.service.config import Settings
+from aeroloop.service.control.law import law_function
+from aeroloop.service.control.reference import Floats, desired
+from aeroloop.service.lab.c_code import in_c
+
+BLOCK: Final = 512
+"""Ticks of one call."""
+COMPILED_FROM: Final = 20_000
+"""Ticks of a run from which on its function is compiled to C, which takes as long as some 30 000 ticks without."""
+_LOOPS: Final = 8
+_NEAR: Final = 1e-9
+"""A value this close to a limit, as a part of it, is left to the frames: sums and roots round differently."""
+
+
+class Run(NamedTuple):
+    """What a loop did at each tick, all of it finite.
+
+    Attributes:
+        measured: Codes of the measurements. Shape (ticks, 6).
+        commanded: Codes of the commands. Shape (ticks, actuators).
+        voltages: Their levels [V]. Shape (ticks, actuators).
+        errors: ε̃ [1]. Shape (ticks, 3).
+    """
+
+    measured: Floats
+    commanded: Floats
+    voltages: Floats
+    errors: Floats
+
+
+class Loop:
+    """The closed loop of a configuration, and of all that differ from it in the function's inputs.
+
+    Attributes:
+        tick: One tick. Inputs: state; desired (q_d, ω_d, ω̇_d), wind [N·m], error of the gyro [rad/s]. Outputs: after,
+            the next state; out, what was measured, commanded and seen.
+        in_c: Whether it runs as compiled C.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        law, wire, period, plant = settings.law, settings.wire, settings.loop.period, settings.plant.effective
+        self._mechanism = mechanism = plant.mechanism()
+        self._initially = initially(mechanism)
+        step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
+        self._sizes = {
+            "x": step.numel_in("x"),
+            "last": 4,
+            "theta": 3,
+            "sign": 1,
+            "seen": 7,
+            "filters": 4,
+            "measured": 6,
+            "commanded": wire.actuators,
+            "numbers": 3 * len(NUMBERS),
+            "zeros": 2,
+        }
+        self._outputs = {"measured": 6, "commanded": wire.actuators, "voltages": wire.actuators, "errors": 3}
+        self._outputs |= {"u": wire.actuators, "seen": 7}
+        functions = law_function(law, period), step, sensor_function(plant.sensors, period)
+        gains = [ca.SX(gain) for gain in (law.C1, law.C2, law.Gamma)]
+        with as_written():
+            self.tick = self._tick(settings, functions, gains)
+        self.in_c = self._tried_c = False
+        self._map(self.tick)
+        self._desired: tuple[object, Floats] = None, np.empty(0)
+
+    def _tick(
+        self, settings: Settings, functions: tuple[ca.Function, ca.Function, ca.Function], gains: list[ca.SX]
+    ) -> ca.Function:
+        law, step, sensors = functions
+        wire, limit = settings.wire, settings.plant.voltage_limit
+        state = {name: ca.SX.sym(name, size) for name, size in self._sizes.items()}
+        wanted, wind, error = ca.SX.sym("desired", 10), ca.SX.sym("wind", step.numel_in("wind")), ca.SX.sym("error", 3)
+        signals: list[SignalSpec] = [wire.attitude, wire.rate, wire.voltage]
+        attitude, rate, voltage = (
+            with_numbers(signal.quantizer(), part)
+            for signal, part in zip(signals, ca.vertsplit(state["numbers"], len(NUMBERS)), strict=True)
+        )
+
+        seen, sign = state["seen"], state["sign"]
+        sent = ca.vertcat(ca.if_else(seen[0] >= 0, 1, -1) * seen[1:4], seen[4:7])
+        kinds = [attitude] * 3 + [rate] * 3
+        measured = [encode(kinds[i], sent[i], state["measured"][i]) for i in range(6)]
+        levels = ca.vertcat(*(level(kinds[i], measured[i]) for i in range(6)))
+
+        def lawful(s: ca.SX) -> dict[str, ca.SX]:
+            parts = ca.vertsplit(wanted, [0, 4, 7, 10])
+            found = law.call([state["last"], state["theta"], levels[:3], levels[3:], *parts, s, *gains])
+            return dict(zip(law.name_out(), found, strict=True))
+
+        first = ca.if_else(lawful(ca.SX(1))["eta_e"] >= 0, 1, -1)
+        sign = ca.if_else(sign == 0, first, sign)
+        answer = lawful(sign)
+        u = answer["u"][3 - wire.actuators :]
+        commanded = [encode(voltage, u[i], state["commanded"][i]) for i in range(wire.actuators)]
+        voltages = ca.vertcat(*(level(voltage, code) for code in commanded))
+
+        x, *true = step.call([state["x"], ca.fmax(-limit, ca.fmin(limit, voltages)), wind])
+        if not true[2].numel():
+            true[2] = ca.SX.zeros(2)  # a free body has no joints, and so no encoders
+        next_seen, filters = sensors.call([*true, state["filters"], state["zeros"], error])
+        codes = ca.vertcat(*measured), ca.vertcat(*commanded)
+        after = [
+            x,
+            answer["q"],
+            answer["theta_next"],
+            sign,
+            next_seen,
+            filters,
+            *codes,
+            state["numbers"],
+            state["zeros"],
+        ]
+        out = [*codes, voltages, answer["eps_e"], u, seen]
+        return ca.Function(
+            "tick",
+            [ca.vertcat(*state.values()), wanted, wind, error],
+            [ca.densify(ca.vertcat(*after)), ca.densify(ca.vertcat(*out))],
+            ["state", "desired", "wind", "error"],
+            ["after", "out"],
+            {"cse": True},
+        )
+
+    def _map(self, tick: ca.Function) -> None:
+        self._block = Compiled(tick.mapaccum("loop", BLOCK))
+        inputs, outputs = self._block.inputs, self._block.outputs
+        self._state = np.asarray(inputs["state"])
+        self._rows = {name: np.asarray(inputs[name]).reshape(BLOCK, -1) for name in ("desired", "wind", "error")}
+        self._after, self._out = (np.asarray(outputs[name]).reshape(BLOCK, -1) for name in ("after", "out"))
+
+    def run(self, settings: Settings, ticks: int, report: Callable[[int], None] = lambda _: None) -> Run | None:
+        """Run so many ticks, at least one; None if anything is abnormal. `report` is called with the ticks done."""
+        if ticks >= COMPILED_FROM and not self._tried_c:
+            self._tried_c = True
+            if (compiled := in_c(self.tick)) is not None:
+                self.in_c = True
+                self._map(compiled)
+        given = {"desired": self._wanted(settings, ticks)}
+        self._state[:], given["wind"], given["error"] = self._begin(settings, ticks)
+        out = np.empty((ticks, sum(self._outputs.values())))
+        for start in range(0, ticks, BLOCK):
+            rows = min(BLOCK, ticks - start)  # of the last block the rest is computed in vain
+            for name, column in given.items():
+                self._rows[name][:rows] = column[start : start + rows]
+            self._block()
+            self._state[:] = self._after[-1]
+            out[start : start + rows] = self._out[:rows]
+            report(start + rows)
+        ends = np.cumsum(list(self._outputs.values()))
+        parts = dict(zip(self._outputs, np.split(out, ends[:-1], axis=1), strict=True))
+        u, seen = parts.pop("u"), parts.pop("seen")
+        run = Run(**parts)
+        return run if _normal(settings, run.voltages, u, seen) else None
+
+    def _begin(self, settings: Settings, ticks: int) -> tuple[Floats, Floats, Floats]:
+        """The state at the first measurement; wind and gyro's error of every period, drawn as the plant draws them."""
+        plant, wire, period = settings.plant.effective, settings.wire, settings.loop.period
+        wind, sensors = Wind(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
+        seen = sensors.read(*self._initially)
+        x = [*self._mechanism.initial, *([0.0] * (self._sizes["x"] - len(self._mechanism.initial)))]
+        held = [np.nan] * (6 + wire.actuators)
+        quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
+        first = [*x, *IDENTITY, *settings.law.damping_estimate, 0.0, *seen.attitude, *seen.rate, *sensors.held, *held]
+        state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros])
+        torque, error = np.zeros((ticks, self._mechanism.axes)), np.zeros((ticks, 3))
+        if not wind.calm:
+            torque[:] = [wind.sample() for _ in range(ticks)]
+        if plant.sensors.rate == "gyro":
+            error[:] = [sensors.error() for _ in range(ticks)]
+        return state, torque, error
+
+    def _wanted(self, settings: Settings, ticks: int) -> Floats:
+        """The desired motion; the last one is kept, as the cells of a table share it."""
+        key = settings.reference, ticks
+        if self._desired[0] != key:
+            self._desired = key, desired(settings.reference, settings.loop.period, ticks)
+        return self._desired[1]
+
+
+def _normal(settings: Settings, voltages: Floats, u: Floats, seen: Floats) -> bool:
+    """Whether every value is finite, and none so near to a limit that the plant might trip."""
+    limits = settings.plant.limits
+    if not (np.abs(u).max() < 1e100 and np.abs(seen).max() < 1e100):
+        return False
+    cosine = np.cos(np.radians(limits.max_tilt_deg))
+    upright = 1 - 2 * (seen[:, 1] ** 2 + seen[:, 2] ** 2)
+    speed = np.sqrt((seen[:, 4:] ** 2).sum(axis=1))
+    if upright.min() < cosine + _NEAR or speed.max() > limits.max_rate * (1 - _NEAR):
+        return False
+    full = min(settings.plant.voltage_limit, settings.wire.voltage.quantizer().outermost)
+    saturated = np.concatenate([[False], np.abs(voltages).max(axis=1) >= full, [False]])
+    ends = np.flatnonzero(np.diff(saturated))
+    longest = (ends[1::2] - ends[::2]).max(initial=0) * settings.loop.period
+    return bool(longest < limits.max_saturated_s * (1 - _NEAR))
+
+
+_loops: dict[str, Loop] = {}
+
+
+def loop_of(settings: Settings) -> Loop:
+    """The loop of a configuration; the last few are kept."""
+    plant, wire = settings.plant, settings.wire
+    sensors = plant.sensors.model_copy(update={"seed": 0, "gyro_noise": 0.0, "gyro_bias": (0.0, 0.0, 0.0)})
+    alike = plant.model_copy(update={"wind": WindSettings(), "sensors": sensors, "limits": LimitSettings()})
+    kinds = [(signal.bits is None, signal.kind) for signal in (wire.attitude, wire.rate, wire.voltage)]
+    key = f"{alike.model_dump_json()}{settings.law.model_dump_json()}{settings.loop.period_ns}{wire.actuators}{kinds}"
+    if key not in _loops:
+        while len(_loops) >= _LOOPS:
+            del _loops[next(iter(_loops))]
+        _loops[key] = Loop(settings)
+    return _loops[key]

@@ -1,0 +1,217 @@
+"""The closed loop as one function: every frame and every figure as through frames, to the last bit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.service.config import ConfigError, Settings, as_overrides, load
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab import c_code, experiment, loop_function
+from aeroloop.service.lab.experiment import LoopEndedError, experiment_figures, through_frames
+from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
+from aeroloop.service.lab.traffic import frames_of, sent_ticks
+
+TICKS = BLOCK + 90
+"""More than a block, and not a whole number of blocks."""
+
+needs_a_compiler = pytest.mark.skipif(not (shutil.which("cc") or shutil.which("gcc")), reason="no C compiler on PATH")
+
+BODY = {"kind": "rigid_body", "rigid_body": {"allocation": [[0.002, 0, 0], [0, 0.002, 0], [0, 0, 0.002]]}}
+LAW = {"allocation": [[0.002, 0, 0], [0, 0.002, 0], [0, 0, 0.002]]}
+SIGNAL = st.fixed_dictionaries(
+    {
+        "bits": st.sampled_from(["cont", 3, 5, 8, 12, 16]),
+        "kind": st.sampled_from(["uniform", "hysteresis-uniform", "logarithmic-uniform"]),
+    }
+)
+SENSORS: dict[str, Any] = {
+    "attitude": st.sampled_from(["encoders", "perfect"]),
+    "rate": st.sampled_from(["derivative", "gyro", "perfect"]),
+    "gyro_noise": st.sampled_from([0.0, 0.02]),
+    "gyro_bias": st.sampled_from([[0.0, 0.0, 0.0], [0.01, -0.02, 0.0]]),
+    "seed": st.integers(0, 3),
+}
+REFERENCES = (
+    {"kind": "sinusoid"},
+    {"kind": "hold", "attitude": [0.0, -20.0, 170.0]},
+    {"kind": "points", "times": [0.0, 0.4, 0.9], "attitudes": [[0, 0, 0], [0, 10, -20], [0, -5, 30]]},
+    {"kind": "stream"},
+)
+CONFIGURATIONS = st.fixed_dictionaries(
+    {
+        "wire": st.fixed_dictionaries(
+            {
+                "attitude": SIGNAL,
+                "rate": SIGNAL,
+                "voltage": SIGNAL,
+                "transmit": st.fixed_dictionaries(
+                    {side: st.sampled_from(["periodic", "on_change"]) for side in ("measurement", "command")}
+                ),
+            }
+        ),
+        "reference": st.sampled_from(REFERENCES),
+        "plant": st.one_of(
+            st.fixed_dictionaries({"sensors": st.fixed_dictionaries(SENSORS)}),
+            st.just(BODY | {"sensors": {"attitude": "perfect", "rate": "gyro", "gyro_noise": 0.01}}),
+            st.just({"ideal": True}),
+        ),
+        "wind": st.fixed_dictionaries({"blowing": st.booleans(), "gust": st.sampled_from([0.0, 0.2])}),
+        "dead_zone_v": st.sampled_from([0.0, 2.5]),
+        "rate_hz": st.sampled_from([500.0, 250.0]),
+    }
+)  # fmt: skip
+
+
+def configured(chosen: dict[str, Any]) -> Settings:
+    plant = {**chosen["plant"], "wind": chosen["wind"], "rotor": {"dead_zone_v": chosen["dead_zone_v"]}}
+    tree = {"wire": chosen["wire"], "plant": plant, "loop": {"rate_hz": chosen["rate_hz"]}}
+    if "kind" in plant:
+        tree |= {"law": LAW, "wire": {**chosen["wire"], "actuators": 3}}
+    tree["reference"] = chosen["reference"]
+    return load(overrides=as_overrides(tree))
+
+
+def through(settings: Settings, ticks: int = TICKS) -> tuple[Figures, list[tuple[bytes, bytes]]]:
+    """Figures and frames of the loop through frames."""
+    frames: list[tuple[bytes, bytes]] = []
+    figures = through_frames(settings, ticks * settings.loop.period, watch=lambda _k, *both: frames.append(both))
+    return figures, frames
+
+
+def assert_the_same(settings: Settings, loop: Loop | None = None, ticks: int = TICKS) -> None:
+    """Figures, and every frame that is sent."""
+    figures, frames = through(settings, ticks)
+    course = (loop or loop_of(settings)).run(settings, ticks)
+    assert course is not None
+    wire, heartbeat = settings.wire, experiment.heartbeat_of(settings)
+    directions = (
+        (course.measured, wire.measurement, wire.transmit.measurement),
+        (course.commanded, wire.command, wire.transmit.command),
+    )
+    for (codes, kind, policy), sent in zip(directions, zip(*frames, strict=True), strict=True):
+        due = set(sent_ticks(codes, policy, heartbeat).tolist())
+        assert [frame if k in due else SILENCE for k, frame in enumerate(frames_of(codes, kind))] == list(sent)
+    found = experiment.experiment(settings, ticks * settings.loop.period)
+    assert (found.figures, found.path) == (figures, "compiled")
+
+
+@given(CONFIGURATIONS)
+@examples(max_examples=20)
+def test_frames_and_figures_are_those_of_the_loop_through_frames(chosen: dict[str, Any]) -> None:
+    try:
+        settings = configured(chosen)
+    except ConfigError:  # too few bits for a logarithmic quantizer
+        return
+    try:
+        assert_the_same(settings)
+    except LoopEndedError:  # see below
+        return
+
+
+VARIED = (
+    (),
+    ("plant.wind.blowing=true", "wire.attitude.kind=hysteresis-uniform", "plant.sensors.rate=gyro"),
+    ('wire.voltage.bits="cont"', "wire.rate.kind=logarithmic-uniform", "wire.transmit=on_change"),
+)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("overrides", VARIED)
+def test_c_gives_the_same_bits_and_is_compiled_once(
+    overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(loop_function, "COMPILED_FROM", 1)
+    settings = load(overrides=overrides)
+    for _ in range(2):  # the second finds the first one's library
+        loop = Loop(settings)
+        assert_the_same(settings, loop)
+        assert loop.in_c
+        (library,) = (tmp_path / "aeroloop").glob("*.so")
+        assert list((tmp_path / "aeroloop").iterdir()) == [library]  # and nothing half-written beside it
+
+
+@pytest.mark.parametrize("compiler", [None, "#!/bin/sh\nexit 1\n", "#!/bin/sh\nexit 0\n"])
+def test_without_a_compiler_or_with_a_broken_one_the_virtual_machine_runs_it(
+    compiler: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(loop_function, "COMPILED_FROM", 1)
+    if compiler is not None:
+        (tmp_path / "cc").write_text(compiler)
+        (tmp_path / "cc").chmod(0o755)
+    loop = Loop(load())
+    assert_the_same(load(), loop)
+    assert not loop.in_c
+
+
+@needs_a_compiler
+def test_only_the_newest_libraries_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "aeroloop").mkdir()
+    for i in range(c_code.KEPT + 3):
+        (tmp_path / "aeroloop" / f"{i}.so").touch()
+        os.utime(tmp_path / "aeroloop" / f"{i}.so", (i, i))
+    assert c_code.in_c(loop_of(load()).tick) is not None
+    left = {path.stem for path in (tmp_path / "aeroloop").iterdir()}
+    assert len(left) == c_code.KEPT
+    assert not left & {"0", "1", "2", "3"}
+
+
+def test_one_function_serves_all_cells_that_differ_in_bits_seeds_and_wind() -> None:
+    coarse = load(overrides=["wire.attitude.bits=5", "wire.voltage.bits=4", "plant.wind.blowing=true"])
+    assert loop_of(load()) is loop_of(coarse)
+    assert loop_of(load()) is not loop_of(load(overrides=["plant.friction.width=0.02"]))
+    assert_the_same(coarse, loop_of(load()))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["plant.limits.max_rate=0.3"],
+        ["plant.limits.max_tilt_deg=5"],
+        ["plant.voltage_limit=2", "plant.limits.max_saturated_s=0.1"],
+        ["wire.voltage.limit=2", "plant.limits.max_saturated_s=0.1"],
+        ["loop.rate_hz=10", "plant.substeps=1", "plant.limits.max_rate=1e300", "plant.limits.max_tilt_deg=180",
+         "plant.friction.viscous=[90, 90]"],  # diverges until no number is left
+    ],
+    ids=["rate", "tilt", "supply", "quantizer", "not a number"],
+)  # fmt: skip
+def test_a_run_that_trips_ends_as_through_frames_with_its_reason(overrides: list[str]) -> None:
+    settings = load(overrides=overrides)
+    with pytest.raises(LoopEndedError) as known:
+        through_frames(settings, 4.0)
+    assert loop_of(settings).run(settings, settings.loop.ticks(4.0)) is None
+    with pytest.raises(LoopEndedError) as found:
+        experiment.experiment(settings, 4.0)
+    assert str(found.value) == str(known.value)
+
+
+def test_a_value_within_a_rounding_of_a_limit_is_left_to_the_frames() -> None:
+    speeds = []
+    settings = load(overrides=["plant.sensors.rate=gyro"])
+    plant = settings.plant.build(settings.loop.period)
+    through_frames(settings, 1.0, watch=lambda *_: speeds.append(np.linalg.norm(plant.measure().rate)), plant=plant)
+    limits = settings.plant.limits
+    for excess, path in ((1e-12, "frames"), (1e-6, "compiled")):
+        near = limits.model_copy(update={"max_rate": max(speeds) * (1 + excess)})
+        changed = settings.model_copy(update={"plant": settings.plant.model_copy(update={"limits": near})})
+        assert experiment_figures(changed, 1.0).path == path
+
+
+def test_a_fault_runs_frame_by_frame_and_the_figures_say_so() -> None:
+    faulty = load(overrides=['plant.faults=["rate:bias=0.1@0.1"]'])
+    found = experiment_figures(faulty, 0.3)
+    assert (found.path, found.z_track) == ("frames", through_frames(faulty, 0.3).z_track)
+    assert experiment_figures(load(), 0.3).path == "compiled"
