@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Final
 
+from aeroloop.service.bench.experiments import burden, experiment, tables
 from aeroloop.service.bench.item import Figure, Item, Margin, NotMeasuredError
 from aeroloop.service.bench.loop import latency, lockstep
 from aeroloop.service.bench.start_up import start_experiment, start_help, start_status
@@ -49,6 +50,9 @@ ITEMS: Final = (
     Item("wake-1000-idle", "µs", WAKE_UP_AIM, TAIL, _wake_up(1000, False), "99.9 % of wake-ups; cyclictest"),
     Item("wake-1000-loaded", "µs", WAKE_UP_AIM, TAIL, _wake_up(1000, True), "all cores busy"),
     Item("lockstep", "µs", 1.3, MEDIAN, lockstep, "a tick in lockstep over Zenoh; bare round trips back to back"),
+    Item("experiment", "s", 2.5, PROCESSOR, experiment, "50 s in lockstep; the same loop in C, by cc -O2"),
+    Item("tables", "s", 7.0, MEDIAN, tables, "28 such cells on all cores; as many in C", quick=False),
+    Item("burden", "s", 14.0, MEDIAN, burden, "the grid of `lab burden`; as many in C", quick=False),
     Item("start-help", "s", 1.2, PROCESSOR, start_help, "`--help`; Python with typer, rich, pydantic-core"),
     Item("start-experiment", "s", 1.8, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
     Item("start-status", "s", 2.2, PROCESSOR, start_status, "`op status`; Python with zenoh"),
