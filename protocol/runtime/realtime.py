@@ -3,6 +3,9 @@
 Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
 second, which is warm-up, and stay. Without `MCL_ONFAULT`, every thread's stack and malloc's arenas are made resident in
 full, three times what is used.
+
+An idle CPU that sleeps takes long to wake; on a virtual machine, until the host schedules it again. While a process
+keeps /dev/cpu_dma_latency open with 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface.rst).
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import ctypes
 import gc
 import os
 from errno import EINVAL
+from pathlib import Path
 from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
@@ -21,6 +25,9 @@ _PR_SET_TIMERSLACK: Final = 29
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 _MCL_ONFAULT: Final = 4
+_CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
+_NO_LATENCY: Final = bytes(4)
+"""0 µs, as the s32 that the kernel reads."""
 
 
 class RealtimeError(AeroloopError):
@@ -31,13 +38,13 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     """Prepare this process for a loop: build the parsers of messages, apply the real-time settings.
 
     The garbage collector is switched off (the loop makes no cycles), the timer slack set to its minimum, memory locked,
-    the process bound to `cpus`, SCHED_FIFO requested.
+    the process bound to `cpus`, SCHED_FIFO requested, idle CPUs kept awake.
 
     Returns:
         One line for each setting that this host refused; nothing is requested with `realtime = "off"`.
 
     Raises:
-        RealtimeError: A setting was refused, and `realtime` is strict.
+        RealtimeError: A setting other than awake CPUs was refused, and `realtime` is strict.
     """
     build_messages()
     if settings.realtime == "off":
@@ -66,4 +73,9 @@ def prepare_process(settings: LoopSettings) -> list[str]:
         refused.append(f"SCHED_FIFO {settings.priority}: {error.strerror} (raise LimitRTPRIO)")
     if refused and settings.realtime == "strict":
         raise RealtimeError(f"loop.realtime is strict, but this machine refuses: {'; '.join(refused)}")
+    try:
+        # Never closed: the kernel drops the request with the last descriptor, at the end of this process.
+        os.write(os.open(_CPU_LATENCY, os.O_WRONLY), _NO_LATENCY)
+    except OSError as error:
+        refused.append(f"idle CPUs sleep: {_CPU_LATENCY}: {error.strerror}")
     return refused

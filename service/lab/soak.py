@@ -113,11 +113,12 @@ def _sample(processes: ProcessGroup, statuses: dict[str, Status], at_s: float) -
         unanswered=plant.sent - plant.received if plant else 0,
         latency_us=plant.recent_latency_us if plant else None,
         wake_us=plant.timing.recent_wake if plant and plant.timing else None,
-        usage={role: _usage(processes.pid(role)) for role in ROLES},
+        usage={role: usage_of(processes.pid(role)) for role in ROLES},
     )
 
 
-def _usage(pid: int) -> Usage:
+def usage_of(pid: int) -> Usage:
+    """Usage of a process now, from /proc."""
     proc = Path(f"/proc/{pid}")
     pages = int((proc / "statm").read_text().split()[1])
     fields = (proc / "stat").read_text().rpartition(")")[2].split()

@@ -13,6 +13,7 @@ import sys
 import time
 from itertools import pairwise
 from math import isnan
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from aeroloop.protocol.runtime import tick_grid, timing
+from aeroloop.protocol.runtime import realtime, tick_grid, timing
 from aeroloop.protocol.runtime.realtime import RealtimeError, prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, report
@@ -47,6 +48,15 @@ class FakeTime:
         assert seconds > 0
         self.slept.append(seconds)
         self.now += round(seconds * 1e9) + self.oversleep
+
+
+@pytest.fixture
+def cpu_latency(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A file in place of the kernel's, which would keep this machine's CPUs awake until the tests end."""
+    file = tmp_path / "cpu_dma_latency"
+    file.touch()
+    monkeypatch.setattr(realtime, "_CPU_LATENCY", file)
+    return file
 
 
 @pytest.fixture
@@ -244,22 +254,24 @@ before = kilobytes("VmRSS")
 untouched = mmap.mmap(-1, 64 << 20)
 memory = [kilobytes("VmLck"), kilobytes("VmRSS") - before]
 realtime = os.sched_getscheduler(0) == os.SCHED_FIFO
-print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, realtime, memory]))
+awake = "/dev/cpu_dma_latency" in [os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")]
+print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, realtime, memory, awake]))
 """
 
 
 def test_a_prepared_process_is_as_it_reports() -> None:
     # In a process of its own: collector and scheduler are the process's, and pytest needs its own as they are.
     done = subprocess.run([sys.executable, "-c", PREPARED], capture_output=True, text=True, timeout=60, check=True)
-    refused, collects, frozen, slack, realtime, (locked_kb, grown_kb) = json.loads(done.stdout)
+    refused, collects, frozen, slack, fifo, (locked_kb, grown_kb), awake = json.loads(done.stdout)
     assert not collects
     assert frozen > 0
     reported = "\n".join(refused)
     assert ("timer slack" in reported) == (slack > 1)  # a real-time process may be shown 0
-    assert ("SCHED_FIFO" in reported) == (not realtime)
+    assert ("SCHED_FIFO" in reported) == (not fifo)
     assert ("memory lock" in reported) == (locked_kb == 0)
     assert grown_kb < 32 << 10  # half of what was mapped and not touched: locked, but not resident
-    assert len(refused) == (slack > 1) + (not realtime) + ("memory lock" in reported)
+    assert len(refused) == (slack > 1) + (not fifo) + ("memory lock" in reported) + (not awake)
+    assert ("idle CPUs sleep" in reported) == (not awake)
 
 
 def test_a_rolling_histogram_keeps_all_and_forgets_what_is_ten_windows_old() -> None:
@@ -326,7 +338,7 @@ def test_a_pause_is_no_period(fake: FakeTime) -> None:
 
 @pytest.mark.parametrize(("known", "called"), [(True, [7]), (False, [7, 3])])
 def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_than_4_4(
-    monkeypatch: pytest.MonkeyPatch, known: bool, called: list[int]
+    monkeypatch: pytest.MonkeyPatch, cpu_latency: Path, known: bool, called: list[int]
 ) -> None:
     flags: list[int] = []
 
@@ -345,9 +357,12 @@ def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_
     monkeypatch.setattr(gc, "freeze", lambda: None)
     assert prepare_process(LoopSettings(realtime="try")) == []
     assert flags == called
+    assert cpu_latency.read_bytes() == bytes(4)
 
 
-def test_strict_names_what_is_refused_and_off_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strict_names_what_is_refused_and_off_asks_for_nothing(
+    monkeypatch: pytest.MonkeyPatch, cpu_latency: Path
+) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
@@ -360,7 +375,25 @@ def test_strict_names_what_is_refused_and_off_asks_for_nothing(monkeypatch: pyte
     monkeypatch.setattr(gc, "disable", lambda: None)
     monkeypatch.setattr(gc, "freeze", lambda: None)
     assert prepare_process(LoopSettings(realtime="off")) == []
+    assert cpu_latency.read_bytes() == b""
+    cpu_latency.unlink()
     refused = prepare_process(LoopSettings(realtime="try"))
-    assert [line.split(":")[0] for line in refused] == ["memory lock", "SCHED_FIFO 10"]
+    assert [line.split(":")[0] for line in refused] == ["memory lock", "SCHED_FIFO 10", "idle CPUs sleep"]
     with pytest.raises(RealtimeError, match="SCHED_FIFO"):
         prepare_process(LoopSettings(realtime="strict"))
+
+
+def test_a_strict_process_starts_although_idle_cpus_may_sleep(
+    monkeypatch: pytest.MonkeyPatch, cpu_latency: Path
+) -> None:
+    cpu_latency.unlink()
+
+    class Libc:
+        prctl = mlockall = staticmethod(lambda *_: 0)
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
+    monkeypatch.setattr(gc, "disable", lambda: None)
+    monkeypatch.setattr(gc, "freeze", lambda: None)
+    [line] = prepare_process(LoopSettings(realtime="strict"))
+    assert "idle CPUs sleep" in line

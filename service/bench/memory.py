@@ -1,0 +1,105 @@
+"""Memory of each daemon while a loop runs, with memory locked and not; page faults of the loops after their warm-up.
+
+The floor is an interpreter that has imported the libraries of the daemons and opened a Zenoh session, and does nothing.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from aeroloop.service.bench.running import ROLES, running_loop
+from aeroloop.service.config import Settings, load
+
+AIM_MB: Final = 130.0
+"""Most memory that a daemon should have resident [MB], locked or not."""
+SETTLED_S: Final = 20.0
+QUICK_SETTLED_S: Final = 4.0
+
+_FLOOR: Final = """
+import casadi, numpy, pydantic, rich, typer, zenoh
+config = zenoh.Config()
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config):
+    print(open("/proc/self/status").read())
+"""
+
+
+class Memory(NamedTuple):
+    """Memory of one daemon.
+
+    Attributes:
+        role: Which.
+        locked: Whether it was asked to lock its memory (`loop.realtime` = try); the recorder never does.
+        resident_mb: Resident memory [MB].
+        proportional_mb: The same, with what processes share divided among them [MB].
+        floor_mb: Resident memory of an idle interpreter with the same libraries [MB].
+        minor_faults: Page faults of the loop's thread since its warm-up; None of the recorder.
+        major_faults: Those of them that read a file.
+        refused: What the host refused, a line each.
+    """
+
+    role: str
+    locked: bool
+    resident_mb: float
+    proportional_mb: float
+    floor_mb: float
+    minor_faults: int | None
+    major_faults: int | None
+    refused: list[str]
+
+
+def measure(settings: Settings | None = None, *, quick: bool = False) -> Iterator[Memory]:
+    """Memory of controller, plant and recorder, locked and then not, after 20 s of the loop or, if `quick`, 4 s.
+
+    Raises:
+        ProcessGroupError: A process did not start, or failed.
+    """
+    settings = settings or load()
+    floor_mb = megabytes(_run(_FLOOR), "VmRSS")
+    for locked in (True, False):
+        loop = settings.loop.model_copy(update={"realtime": "try" if locked else "off"})
+        yield from _measure(settings.model_copy(update={"loop": loop}), locked, floor_mb, quick)
+
+
+def _measure(settings: Settings, locked: bool, floor_mb: float, quick: bool) -> Iterator[Memory]:
+    with running_loop(settings, own_interpreters=True) as running:
+        running.await_drive()
+        time.sleep(QUICK_SETTLED_S if quick else SETTLED_S)
+        statuses = running.statuses()
+        for role in ROLES:
+            timing = statuses[role].timing
+            proc = Path(f"/proc/{running.processes.pid(role)}")
+            yield Memory(
+                role=role,
+                locked=locked and role != "recorder",
+                resident_mb=megabytes((proc / "status").read_text(), "VmRSS"),
+                proportional_mb=megabytes((proc / "smaps_rollup").read_text(), "Pss"),
+                floor_mb=floor_mb,
+                minor_faults=timing.minor_faults if timing else None,
+                major_faults=timing.major_faults if timing else None,
+                refused=statuses[role].notes if timing else [],
+            )
+
+
+def megabytes(text: str, name: str) -> float:
+    """A quantity of /proc/PID/status or smaps_rollup [MB], see proc(5); the kernel's kB are 1024 bytes.
+
+    Raises:
+        ValueError: It is not there.
+    """
+    found = re.search(rf"^{name}:\s+(\d+) kB$", text, re.MULTILINE)
+    if found is None:
+        raise ValueError(f"{name} is not in {text[:40]!r}…")
+    return int(found[1]) * 1024e-6
+
+
+def _run(code: str) -> str:
+    return subprocess.run(  # noqa: S603 - our own code
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
+    ).stdout
