@@ -100,6 +100,4 @@ def megabytes(text: str, name: str) -> float:
 
 
 def _run(code: str) -> str:
-    return subprocess.run(  # noqa: S603 - our own code
-        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    return subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True).stdout

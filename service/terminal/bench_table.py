@@ -43,7 +43,7 @@ def _rows(results: Results, changes: Sequence[Change]) -> list[list[str]]:
             change = by_name.get(name)
             beside = [_two(change.before), _two(change.limit)] if change else []
             verdict = "worse" if change and change.worse else "met" if line.ratio <= line.aim else "missed"
-            figures = [f"{line.ours:g} {line.unit}", f"{line.floor:g} {line.unit}", _two(line.ratio)]
+            figures = [f"{line.ours:g} {line.unit}".strip(), f"{line.floor:g} {line.unit}".strip(), _two(line.ratio)]
             rows.append([name, *figures, *beside, f"{line.aim:g}", verdict])
     return rows
 
