@@ -24,12 +24,26 @@ _COMPILE_S: Final = 120.0
 
 def in_c(function: ca.Function) -> ca.Function | None:
     """The same function in C, compiled now or before; None where that fails."""
+    library = library_of(source_of(function))
+    try:
+        return ca.external(function.name(), str(library)) if library is not None else None
+    except RuntimeError:  # not a library
+        return None
+
+
+def source_of(function: ca.Function) -> str:
+    """C code of a function, which has its name."""
+    generator = ca.CodeGenerator(function.name())
+    generator.add(function)
+    source: str = generator.dump()
+    return source
+
+
+def library_of(source: str) -> Path | None:
+    """The library of C code, compiled now or before; None where that fails."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         return None
-    generator = ca.CodeGenerator(function.name())
-    generator.add(function)
-    source = generator.dump()
     built = Path(compiler).resolve().stat()
     identity = f"{compiler} {built.st_size} {built.st_mtime_ns} {FLAGS}\n{source}"
     try:
@@ -40,9 +54,9 @@ def in_c(function: ca.Function) -> ca.Function | None:
             os.utime(library)
         else:
             _compile(compiler, source, library)
-        return ca.external(function.name(), str(library))
-    except (OSError, RuntimeError, subprocess.SubprocessError):
+    except (OSError, subprocess.SubprocessError):
         return None
+    return library
 
 
 def _compile(compiler: str, source: str, library: Path) -> None:

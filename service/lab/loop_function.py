@@ -161,8 +161,8 @@ class Loop:
             if (compiled := in_c(self.tick)) is not None:
                 self.in_c = True
                 self._map(compiled)
-        given = {"desired": self._wanted(settings, ticks)}
-        self._state[:], given["wind"], given["error"] = self._begin(settings, ticks)
+        given = self.inputs(settings, ticks)
+        self._state[:] = given.pop("state")
         out = np.empty((ticks, sum(self._outputs.values())))
         for start in range(0, ticks, BLOCK):
             rows = min(BLOCK, ticks - start)  # of the last block the rest is computed in vain
@@ -178,8 +178,8 @@ class Loop:
         run = Run(**parts)
         return run if _normal(settings, run.voltages, u, seen) else None
 
-    def _begin(self, settings: Settings, ticks: int) -> tuple[Floats, Floats, Floats]:
-        """The state at the first measurement; wind and gyro's error of every period, drawn as the plant draws them."""
+    def inputs(self, settings: Settings, ticks: int) -> dict[str, Floats]:
+        """Inputs of every tick, by name, a row each; the state at the first. Random numbers as the plant draws them."""
         plant, wire, period = settings.plant.effective, settings.wire, settings.loop.period
         wind, sensors = Wind(plant.wind, self._mechanism.axes, period), Sensors(plant.sensors, period)
         seen = sensors.read(*self._initially)
@@ -193,13 +193,14 @@ class Loop:
             torque[:] = [wind.sample() for _ in range(ticks)]
         if plant.sensors.rate == "gyro":
             error[:] = [sensors.error() for _ in range(ticks)]
-        return state, torque, error
+        return {"state": state, "desired": self._wanted(settings, ticks), "wind": torque, "error": error}
 
     def _wanted(self, settings: Settings, ticks: int) -> Floats:
         """The desired motion; the last one is kept, as the cells of a table share it."""
         key = settings.reference, ticks
         if self._desired[0] != key:
-            self._desired = key, desired(settings.reference, settings.loop.period, ticks)
+            rows = desired(settings.reference, settings.loop.period, ticks)
+            self._desired = key, np.ascontiguousarray(rows)
         return self._desired[1]
 
 

@@ -17,6 +17,7 @@ from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import ConfigError, Settings, as_overrides, load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import c_code, experiment, loop_function
+from aeroloop.service.lab.bare_loop import bare_loop
 from aeroloop.service.lab.experiment import LoopEndedError, experiment_figures, through_frames
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
 from aeroloop.service.lab.traffic import frames_of, sent_ticks
@@ -43,7 +44,7 @@ SENSORS: dict[str, Any] = {
 }
 REFERENCES = (
     {"kind": "sinusoid"},
-    {"kind": "hold", "attitude": [0.0, -20.0, 170.0]},
+    {"kind": "hold", "attitude": [0.0, -20.0, 250.0]},
     {"kind": "points", "times": [0.0, 0.4, 0.9], "attitudes": [[0, 0, 0], [0, 10, -20], [0, -5, 30]]},
     {"kind": "stream"},
 )
@@ -66,6 +67,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
             st.just({"ideal": True}),
         ),
         "wind": st.fixed_dictionaries({"blowing": st.booleans(), "gust": st.sampled_from([0.0, 0.2])}),
+        "voltage_limit": st.sampled_from([24.0, 5.0]),
         "dead_zone_v": st.sampled_from([0.0, 2.5]),
         "rate_hz": st.sampled_from([500.0, 250.0]),
     }
@@ -73,7 +75,8 @@ CONFIGURATIONS = st.fixed_dictionaries(
 
 
 def configured(chosen: dict[str, Any]) -> Settings:
-    plant = {**chosen["plant"], "wind": chosen["wind"], "rotor": {"dead_zone_v": chosen["dead_zone_v"]}}
+    plant = {**chosen["plant"], "wind": chosen["wind"], "voltage_limit": chosen["voltage_limit"]}
+    plant["rotor"] = {"dead_zone_v": chosen["dead_zone_v"]}
     tree = {"wire": chosen["wire"], "plant": plant, "loop": {"rate_hz": chosen["rate_hz"]}}
     if "kind" in plant:
         tree |= {"law": LAW, "wire": {**chosen["wire"], "actuators": 3}}
@@ -215,3 +218,23 @@ def test_a_fault_runs_frame_by_frame_and_the_figures_say_so() -> None:
     found = experiment_figures(faulty, 0.3)
     assert (found.path, found.z_track) == ("frames", through_frames(faulty, 0.3).z_track)
     assert experiment_figures(load(), 0.3).path == "compiled"
+
+
+def test_nothing_is_held_before_the_first_measurement() -> None:
+    """A rate within 0's widened interval, and beyond 0's own, at the start."""
+    body = {**BODY["rigid_body"], "rate": [0.006, -0.006, 0.0]}  # type: ignore[dict-item]
+    plant = {"kind": "rigid_body", "rigid_body": body, "sensors": {"attitude": "perfect", "rate": "perfect"}}
+    wire = {"actuators": 3, "rate": {"kind": "hysteresis-uniform"}}
+    settings = load(overrides=as_overrides({"plant": plant, "wire": wire, "law": LAW}))
+    assert_the_same(settings, ticks=20)
+
+
+@needs_a_compiler
+def test_the_floor_that_time_is_compared_with_is_the_same_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    settings = load(overrides=VARIED[1])
+    floor, course = bare_loop(settings, TICKS), loop_of(settings).run(settings, TICKS)
+    assert floor is not None
+    assert course is not None
+    for _ in range(2):  # it can be timed again
+        assert np.array_equal(floor()[:, :8], np.hstack([course.measured, course.commanded]))
