@@ -30,9 +30,7 @@ ITEMS: Final = (
     Item("wake-1000-idle", "µs", 1.5, TAIL, lateness(1000, False), "99.9 % of wake-ups; cyclictest"),
     Item("wake-1000-loaded", "µs", 1.5, TAIL, lateness(1000, True), "all cores busy"),
     Item("lockstep", "µs", 1.3, MEDIAN, lockstep, "a tick in lockstep over Zenoh; bare round trips back to back"),
-    Item(
-        "memory-controller", "MB", 1.7, MEMORY, resident("controller", True), "locked; Python with the same libraries"
-    ),
+    Item("memory-controller", "MB", 1.7, MEMORY, resident("controller", True), "locked; Python and the libraries"),
     Item("memory-plant", "MB", 1.7, MEMORY, resident("plant", True), "the same"),
     Item("memory-recorder", "MB", 1.7, MEMORY, resident("recorder", False), "never locked"),
     Item("memory-unlocked-controller", "MB", 1.7, MEMORY, resident("controller", False), "not locked", quick=False),

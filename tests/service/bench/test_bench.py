@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.bench.experiments import compiled_loop, loop_inputs
 from aeroloop.service.bench.item import Figure, Item, Margin, NotMeasuredError, in_turns
 from aeroloop.service.bench.items import ITEMS
 from aeroloop.service.bench.results import Change, Results, chosen
 from aeroloop.service.bench.tick import bare_tick
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.lab.loop_function import loop_of
 
 MARGIN = Margin(1.5, "made")
 Made = Callable[..., tuple[int, str, str]]
@@ -168,17 +164,6 @@ def test_the_floor_of_a_tick_answers_a_measurement_with_a_command() -> None:
     assert isinstance(command, bytes)
     assert len(command) == wire.command.size
     assert wire.command.counter(command) == 7
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_the_floor_of_an_experiment_computes_the_same_loop() -> None:
-    settings, ticks = load(), 200
-    loop = loop_of(settings)
-    run, given = loop.run(settings, ticks), loop_inputs(settings, ticks)
-    assert run is not None
-    compiled_loop(loop.tick)(ticks, *given)
-    last = np.concatenate([column[-1] for column in run])
-    np.testing.assert_allclose(given[-1][: len(last)], last, rtol=1e-9)
 
 
 def test_the_reference_of_ci_is_of_items_that_exist() -> None:
