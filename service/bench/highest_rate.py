@@ -25,10 +25,11 @@ MOST_SKIPPED: Final = 1e-3
 LOWEST_HZ: Final = 100.0
 HIGHEST_HZ: Final = 10_000.0
 """The highest that `loop.rate_hz` may be."""
-FULL_CPU: Final = 0.9
-"""From this share of all cores on, the processor is the limit."""
+SATURATED: Final = 0.8
+"""From this share of all cores on, used by the three processes, the processor is the limit."""
 _SETTLE_S: Final = 1.0
 """The first second of a session is warm-up."""
+_CORES: Final = os.cpu_count() or 1
 _LOWER: Final = 0.9
 """Factor on the rate after a long run that failed."""
 
@@ -47,7 +48,7 @@ class Plan(NamedTuple):
     resolution: float
 
 
-FULL: Final = Plan(try_s=5.0, confirm_s=60.0, resolution=1.05)
+LONG: Final = Plan(try_s=5.0, confirm_s=60.0, resolution=1.05)
 QUICK: Final = Plan(try_s=2.0, confirm_s=5.0, resolution=1.25)
 
 
@@ -59,8 +60,8 @@ class Run(NamedTuple):
         plant_skipped: Share of ticks that the plant's grid missed.
         controller_skipped: Share of the plant's ticks that the controller did not answer in time.
         trouble: Why the rate is not held besides, such as a session that was lost; empty if nothing else happened.
-        busy: Share of all cores that was in use, by whatever.
         cpu: Processor time of each process, as a share of a core.
+        stolen: Time that a virtual machine's host ran something else, as a share of all cores.
         wake_us: p99.9 of each end's wake-ups [µs]: from the deadline, or the arrival of a measurement, to the tick.
         tick_us: p99.9 of the duration of each end's ticks [µs].
     """
@@ -69,8 +70,8 @@ class Run(NamedTuple):
     plant_skipped: float
     controller_skipped: float
     trouble: str
-    busy: float
     cpu: dict[str, float]
+    stolen: float
     wake_us: dict[str, float]
     tick_us: dict[str, float]
 
@@ -82,16 +83,16 @@ class Run(NamedTuple):
     @property
     def limit(self) -> str:
         """What stands in the way of a higher rate, in words."""
-        shares = ", ".join(f"{role} {share:.0%}" for role, share in self.cpu.items())
-        if self.busy >= FULL_CPU:
-            return f"the processor: cores {self.busy:.0%} busy, of a core: {shares}"
-        period_us = 1e6 / self.rate_hz
-        end = max(self.tick_us, key=lambda role: self.wake_us[role] + self.tick_us[role], default="")
-        if not end:
+        if not self.tick_us:
             return self.trouble
+        shares = ", ".join(f"{role} {share:.0%}" for role, share in self.cpu.items())
+        cores = f"of a core {shares}; {self.stolen:.1%} of all cores stolen by the host"
+        if sum(self.cpu.values()) >= SATURATED * _CORES:
+            return f"the processor: {cores}"
+        end = max(self.tick_us, key=lambda role: self.wake_us[role] + self.tick_us[role])
         return (
             f"the {end}: 99.9 % of its wake-ups within {self.wake_us[end]:.0f} µs and of its ticks within "
-            f"{self.tick_us[end]:.0f} µs, of {period_us:.0f} µs; cores {self.busy:.0%} busy, of a core: {shares}"
+            f"{self.tick_us[end]:.0f} µs, of {1e6 / self.rate_hz:.0f} µs; {cores}"
         )
 
 
@@ -110,8 +111,8 @@ class HighestRate(NamedTuple):
 
 
 def measure(settings: Settings | None = None, *, quick: bool = False) -> HighestRate:
-    """Search from the configured rate on: three minutes, or one if `quick`."""
-    settings, plan = settings or load(), QUICK if quick else FULL
+    """Search from the configured rate on: some minutes, or one or two if `quick`."""
+    settings, plan = settings or load(), QUICK if quick else LONG
     missed: list[Run] = []
 
     def holds(rate_hz: float) -> bool:
@@ -172,7 +173,7 @@ def run_at(settings: Settings, rate_hz: float, seconds: float) -> Run:
             time.sleep(seconds)
             return _run(rate_hz, before, _Sample.of(running))
     except ProcessGroupError as error:
-        return Run(rate_hz, 1.0, 1.0, str(error), float("nan"), {}, {}, {})
+        return Run(rate_hz, 1.0, 1.0, str(error), {}, 0.0, {}, {})
 
 
 class _Sample(NamedTuple):
@@ -182,25 +183,24 @@ class _Sample(NamedTuple):
         at_s: When, on the monotonic clock.
         statuses: Of each role.
         cpu_s: Processor time of each role.
-        idle_s: Time that the cores of this machine were idle, summed.
+        stolen_s: Time that the host ran something else, all cores summed.
     """
 
     at_s: float
     statuses: dict[str, Status]
     cpu_s: dict[str, float]
-    idle_s: float
+    stolen_s: float
 
     @classmethod
     def of(cls, running: RunningLoop) -> Self:
         statuses = running.statuses()
         cpu_s: dict[str, float] = {role: usage_of(running.processes.pid(role)).cpu_s for role in ROLES}
-        return cls(time.monotonic(), statuses, cpu_s, idle_s(Path("/proc/stat").read_text()))
+        return cls(time.monotonic(), statuses, cpu_s, stolen_s(Path("/proc/stat").read_text()))
 
 
-def idle_s(stat: str) -> float:
-    """Idle time of all cores [s], from /proc/stat; see proc(5). Waiting for a disk is idle, too."""
-    _, _, _, _, idle, waiting, *_ = stat.splitlines()[0].split()
-    return (int(idle) + int(waiting)) / os.sysconf("SC_CLK_TCK")
+def stolen_s(stat: str) -> float:
+    """Time that the host ran something else than this virtual machine, all cores summed [s]; of /proc/stat, proc(5)."""
+    return int(stat.split()[8]) / os.sysconf("SC_CLK_TCK")
 
 
 def _run(rate_hz: float, before: _Sample, after: _Sample) -> Run:
@@ -217,8 +217,8 @@ def _run(rate_hz: float, before: _Sample, after: _Sample) -> Run:
         plant_skipped=(plant.skipped - before.statuses["plant"].skipped) / ticks,
         controller_skipped=(controller.skipped - before.statuses["controller"].skipped) / ticks,
         trouble="; ".join(trouble),
-        busy=1.0 - (after.idle_s - before.idle_s) / (elapsed_s * (os.cpu_count() or 1)),
         cpu={role: (after.cpu_s[role] - before.cpu_s[role]) / elapsed_s for role in ROLES},
+        stolen=(after.stolen_s - before.stolen_s) / (elapsed_s * _CORES),
         wake_us={role: timing.recent_wake.p999 for role, timing in timings.items() if timing.recent_wake},
         tick_us={role: timing.recent_busy.p999 for role, timing in timings.items() if timing.recent_busy},
     )

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from aeroloop.protocol.messages.models import Status
 from aeroloop.service.bench.running import ROLES, running_loop
 from aeroloop.service.config import Settings, load
 
@@ -39,8 +40,9 @@ class Memory(NamedTuple):
         resident_mb: Resident memory [MB].
         proportional_mb: The same, with what processes share divided among them [MB].
         floor_mb: Resident memory of an idle interpreter with the same libraries [MB].
-        minor_faults: Page faults of the loop's thread since its warm-up; None of the recorder.
-        major_faults: Those of them that read a file.
+        faults: Page faults of the loop's thread, minor and major, after the first seconds of the session; 0 of the
+            recorder, which has no loop.
+        ticks: Ticks of the loop meanwhile.
         refused: What the host refused, a line each.
     """
 
@@ -49,8 +51,8 @@ class Memory(NamedTuple):
     resident_mb: float
     proportional_mb: float
     floor_mb: float
-    minor_faults: int | None
-    major_faults: int | None
+    faults: int
+    ticks: int
     refused: list[str]
 
 
@@ -70,10 +72,11 @@ def measure(settings: Settings | None = None, *, quick: bool = False) -> Iterato
 def _measure(settings: Settings, locked: bool, floor_mb: float, quick: bool) -> Iterator[Memory]:
     with running_loop(settings, own_interpreters=True) as running:
         running.await_drive()
+        running.statuses()
+        before = running.statuses()
         time.sleep(QUICK_SETTLED_S if quick else SETTLED_S)
-        statuses = running.statuses()
+        after = running.statuses()
         for role in ROLES:
-            timing = statuses[role].timing
             proc = Path(f"/proc/{running.processes.pid(role)}")
             yield Memory(
                 role=role,
@@ -81,10 +84,14 @@ def _measure(settings: Settings, locked: bool, floor_mb: float, quick: bool) -> 
                 resident_mb=megabytes((proc / "status").read_text(), "VmRSS"),
                 proportional_mb=megabytes((proc / "smaps_rollup").read_text(), "Pss"),
                 floor_mb=floor_mb,
-                minor_faults=timing.minor_faults if timing else None,
-                major_faults=timing.major_faults if timing else None,
-                refused=statuses[role].notes if timing else [],
+                faults=_faults(after[role]) - _faults(before[role]),
+                ticks=after[role].ticks - before[role].ticks,
+                refused=after[role].notes if role != "recorder" else [],
             )
+
+
+def _faults(status: Status) -> int:
+    return status.timing.minor_faults + status.timing.major_faults if status.timing else 0
 
 
 def megabytes(text: str, name: str) -> float:
