@@ -49,7 +49,7 @@ class Plan(NamedTuple):
     seconds: float
 
 
-FULL: Final = Plan(rates_hz=(500.0, 1000.0), turns=7, seconds=4.0)
+FULL: Final = Plan(rates_hz=(500.0, 1000.0), turns=5, seconds=3.0)
 QUICK: Final = Plan(rates_hz=(1000.0,), turns=3, seconds=1.5)
 
 
@@ -72,7 +72,7 @@ class WakeUp(NamedTuple):
 
 
 def measure(*, quick: bool = False) -> Iterator[WakeUp]:
-    """Compare at each rate, idle and loaded. A comparison takes a minute, or 10 s if `quick`."""
+    """Compare at each rate, idle and loaded. A comparison takes half a minute, or 10 s if `quick`."""
     plan = QUICK if quick else FULL
     for rate_hz in plan.rates_hz:
         for loaded in (False, True):
