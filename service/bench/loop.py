@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import json
 import tempfile
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from statistics import median
 from typing import Final, Literal, NamedTuple
 
-import zenoh
-
-from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.states import PlantState
 from aeroloop.service.bench.item import Figure, NotMeasuredError, in_turns
 from aeroloop.service.bench.ping_pong import ping_pong
+from aeroloop.service.bench.running import RunningLoop
 from aeroloop.service.config import Settings, load
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
 
@@ -30,7 +26,6 @@ Transport = Literal["tcp", "unix"]
 
 STATUSES: Final = 11
 """A status' recent latency is of ten windows of a second; with one more, the cold first one is not among them."""
-STATUS_WAIT_S: Final = 20.0
 FLOOR_S: Final = 5.0
 LOCKSTEP_S: Final = 2.0
 TURNS: Final = 3
@@ -54,9 +49,9 @@ def latency(transport: Transport, quick: bool) -> Latency:
 
 def _latency(transport: Transport) -> tuple[tuple[float, float], tuple[float, float]]:
     """50th and 99th percentile, ours and the floor's [µs]."""
-    with _places(transport) as network, _running(network) as (settings, statuses):
+    with _places(transport) as network, _running(network) as (settings, next_status):
         for _ in range(STATUSES):
-            status = statuses.next()
+            status = next_status()
         ours = status.recent_latency_us
         assert ours is not None  # the plant is driven
         priority = 0 if any("SCHED_FIFO" in note for note in status.notes) else settings.loop.priority
@@ -69,10 +64,10 @@ def lockstep(quick: bool) -> Figure:
     """Time of a tick in lockstep; of a bare round trip, one after the other [µs]."""
 
     def ours() -> float:
-        with _places("tcp") as network, _running(network, "loop.lockstep=true") as (_, statuses):
-            first = last = statuses.next()
+        with _places("tcp") as network, _running(network, "loop.lockstep=true") as (_, next_status):
+            first = last = next_status()
             while last.uptime_s < first.uptime_s + LOCKSTEP_S:
-                last = statuses.next()
+                last = next_status()
         return (last.uptime_s - first.uptime_s) / (last.ticks - first.ticks) * 1e6
 
     return in_turns(ours, round_trip_us, 1 if quick else TURNS, median)
@@ -95,43 +90,18 @@ def _ping_pong(
         raise NotMeasuredError(str(error)) from None
 
 
-class _Statuses:
-    """The plant's statuses, as they are published."""
-
-    def __init__(self, session: zenoh.Session, vehicle: str) -> None:
-        self._published = threading.Condition()
-        self._status: Status | None = None
-        session.declare_subscriber(topics.key("status", vehicle, role="plant"), self._receive)
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        with self._published:
-            self._status = Status.model_validate_json(sample.payload.to_bytes())
-            self._published.notify()
-
-    def next(self) -> Status:
-        """The next one. Raises NotMeasuredError if none is published for long."""
-        with self._published:
-            if not self._published.wait_for(lambda: self._status, STATUS_WAIT_S):
-                raise NotMeasuredError(f"the plant published no status for {STATUS_WAIT_S:g} s")
-            assert self._status is not None
-            status, self._status = self._status, None
-            return status
-
-
 @contextmanager
-def _running(network: Sequence[str], *overrides: str) -> Iterator[tuple[Settings, _Statuses]]:
-    """An emulator and a controller that drives it."""
+def _running(network: Sequence[str], *overrides: str) -> Iterator[tuple[Settings, Callable[[], Status]]]:
+    """An emulator and a controller that drives it; their settings, and a function that waits for a plant's status."""
     own = ["controller.auto_arm=true", "controller.after_restart=configured"]
     settings = load(overrides=[*own, f"network.rendezvous={json.dumps(network)}", *overrides])
     with ProcessGroup(settings) as processes:
-        statuses = _Statuses(processes.zenoh, settings.vehicle)
+        running = RunningLoop(processes, settings.vehicle, ["plant"])
         processes.start("plant")
         processes.await_role("plant")
         processes.start("controller")
-        while statuses.next().state != PlantState.DRIVEN:
-            processes.check()
-        yield settings, statuses
-        processes.check()
+        running.await_drive()
+        yield settings, lambda: running.statuses()["plant"]
 
 
 @contextmanager
