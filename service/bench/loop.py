@@ -49,13 +49,13 @@ def latency(transport: Transport, quick: bool) -> Latency:
 
 def _latency(transport: Transport) -> tuple[tuple[float, float], tuple[float, float]]:
     """50th and 99th percentile, ours and the floor's [µs]."""
-    with _places(transport) as network, _running(network) as (settings, next_status):
+    with meeting_places(transport) as network, driven_loop(network) as (settings, next_status):
         for _ in range(STATUSES):
             status = next_status()
         ours = status.recent_latency_us
         assert ours is not None  # the plant is driven
         priority = 0 if any("SCHED_FIFO" in note for note in status.notes) else settings.loop.priority
-    with _places(transport) as network:
+    with meeting_places(transport) as network:
         trips = sorted(_ping_pong(network, settings, settings.loop.rate_hz, FLOOR_S, priority=priority))
     return (ours.p50, ours.p99), (trips[len(trips) // 2], trips[len(trips) * 99 // 100])
 
@@ -64,7 +64,7 @@ def lockstep(quick: bool) -> Figure:
     """Time of a tick in lockstep; of a bare round trip, one after the other [µs]."""
 
     def ours() -> float:
-        with _places("tcp") as network, _running(network, "loop.lockstep=true") as (_, next_status):
+        with meeting_places("tcp") as network, driven_loop(network, "loop.lockstep=true") as (_, next_status):
             first = last = next_status()
             while last.uptime_s < first.uptime_s + LOCKSTEP_S:
                 last = next_status()
@@ -75,7 +75,7 @@ def lockstep(quick: bool) -> Figure:
 
 def round_trip_us() -> float:
     """Mean of bare round trips, one after the other [µs]. Raises NotMeasuredError."""
-    with _places("tcp") as network:
+    with meeting_places("tcp") as network:
         trips = _ping_pong(network, load(), 0, LOCKSTEP_S, priority=0, lossless=True)
     return sum(trips) / len(trips)
 
@@ -91,7 +91,7 @@ def _ping_pong(
 
 
 @contextmanager
-def _running(network: Sequence[str], *overrides: str) -> Iterator[tuple[Settings, Callable[[], Status]]]:
+def driven_loop(network: Sequence[str], *overrides: str) -> Iterator[tuple[Settings, Callable[[], Status]]]:
     """An emulator and a controller that drives it; their settings, and a function that waits for a plant's status."""
     own = ["controller.auto_arm=true", "controller.after_restart=configured"]
     settings = load(overrides=[*own, f"network.rendezvous={json.dumps(network)}", *overrides])
@@ -105,7 +105,7 @@ def _running(network: Sequence[str], *overrides: str) -> Iterator[tuple[Settings
 
 
 @contextmanager
-def _places(transport: Transport) -> Iterator[list[str]]:
+def meeting_places(transport: Transport) -> Iterator[list[str]]:
     """Endpoints at which three processes can meet: on loopback, or sockets in a folder of their own."""
     if transport == "tcp":
         yield [free_rendezvous()]
