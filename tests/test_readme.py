@@ -32,9 +32,7 @@ def test_the_python_example_prints_what_the_experiment_gives(capfd: pytest.Captu
 
 def test_the_table_of_the_bench_has_every_item() -> None:
     table = (ROOT / "README.md").read_text(encoding="utf-8").split("<!-- bench")[1].split("<!-- end of bench -->")[0]
-    assert [row.split(" ")[1] for row in table.splitlines() if row.startswith("| ")][1:] == [
-        item.name for item in ITEMS
-    ]
+    assert {item.name for item in ITEMS} <= {*table.replace(",", "").split()}
 
 
 @pytest.mark.processes
