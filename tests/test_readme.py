@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from aeroloop.service.bench.items import ITEMS
 from aeroloop.service.cli.main import execute
 from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.config import load
@@ -27,6 +28,11 @@ def test_the_python_example_prints_what_the_experiment_gives(capfd: pytest.Captu
     exec(compile(example, "README.md", "exec"), {})  # noqa: S102  # our own text
     settings = load(overrides=["wire.voltage.bits=8"])
     assert capfd.readouterr().out == f"{run_experiment(settings, 10).z_track}\n"
+
+
+def test_the_table_of_the_bench_has_every_item() -> None:
+    table = (ROOT / "README.md").read_text(encoding="utf-8").split("<!-- bench")[1].split("<!-- end of bench -->")[0]
+    assert {item.name for item in ITEMS} <= {*table.replace(",", "").split()}
 
 
 @pytest.mark.processes

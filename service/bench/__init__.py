@@ -1,1 +1,1 @@
-"""Measurements of this machine and this program, each a ratio to a floor measured in the same run."""
+"""Bench: what this project takes beside what the machine gives, item by item, in one run."""

@@ -48,7 +48,7 @@ class Plan(NamedTuple):
     resolution: float
 
 
-LONG: Final = Plan(try_s=5.0, confirm_s=60.0, resolution=1.05)
+LONG: Final = Plan(try_s=3.0, confirm_s=60.0, resolution=1.1)
 QUICK: Final = Plan(try_s=2.0, confirm_s=5.0, resolution=1.25)
 
 

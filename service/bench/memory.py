@@ -57,14 +57,14 @@ class Memory(NamedTuple):
 
 
 def measure(settings: Settings | None = None, *, quick: bool = False) -> Iterator[Memory]:
-    """Memory of controller, plant and recorder, locked and then not, after 20 s of the loop or, if `quick`, 4 s.
+    """Memory of controller, plant and recorder, locked and then not, after 20 s of the loop; if `quick`, 4 s, locked.
 
     Raises:
         ProcessGroupError: A process did not start, or failed.
     """
     settings = settings or load()
     floor_mb = megabytes(_run(_FLOOR), "VmRSS")
-    for locked in (True, False):
+    for locked in (True,) if quick else (True, False):
         loop = settings.loop.model_copy(update={"realtime": "try" if locked else "off"})
         yield from _measure(settings.model_copy(update={"loop": loop}), locked, floor_mb, quick)
 
@@ -107,6 +107,4 @@ def megabytes(text: str, name: str) -> float:
 
 
 def _run(code: str) -> str:
-    return subprocess.run(  # noqa: S603 - our own code
-        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    return subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True).stdout

@@ -92,8 +92,12 @@ def ping_pong(
     ]
     pipe = subprocess.PIPE
     ping, pong = (
-        subprocess.Popen(  # noqa: S603 - this file
-            [sys.executable, __file__, name, json.dumps(asdict(end))], env=variables, stdin=pipe, stdout=pipe
+        subprocess.Popen(
+            [sys.executable, __file__, name, json.dumps(asdict(end))],
+            env=variables,
+            stdin=pipe,
+            stdout=pipe,
+            start_new_session=True,  # ^C is this process's
         )
         for name, end in zip(("ping", "pong"), ends, strict=True)
     )

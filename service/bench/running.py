@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -27,14 +27,15 @@ _OWN_INTERPRETER: Final = {"PYTHONUNBUFFERED": "1"}
 
 
 class RunningLoop:
-    """A loop that drives its plant.
+    """A loop that drives its plant, and the statuses of some of its roles.
 
     Attributes:
         processes: Its processes.
     """
 
-    def __init__(self, processes: ProcessGroup, vehicle: str) -> None:
+    def __init__(self, processes: ProcessGroup, vehicle: str, roles: Sequence[str] = ROLES) -> None:
         self.processes = processes
+        self._roles = roles
         self._received: dict[str, Status] = {}
         self._changed = threading.Condition()
         processes.zenoh.declare_subscriber(topics.key("status", vehicle), self._receive)
@@ -55,11 +56,11 @@ class RunningLoop:
         deadline = time.monotonic() + STATUS_WAIT_S
         with self._changed:
             self._received.clear()
-            while len(self._received) < len(ROLES):
+            while not self._received.keys() >= {*self._roles}:
                 self._changed.wait(_CHECK_S)
                 self.processes.check()
                 if time.monotonic() > deadline:
-                    silent = ", ".join(role for role in ROLES if role not in self._received)
+                    silent = ", ".join(role for role in self._roles if role not in self._received)
                     raise ProcessGroupError(f"no status of {silent} within {STATUS_WAIT_S:g} s")
             return dict(self._received)
 

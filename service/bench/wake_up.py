@@ -49,7 +49,7 @@ class Plan(NamedTuple):
     seconds: float
 
 
-FULL: Final = Plan(rates_hz=(500.0, 1000.0), turns=7, seconds=4.0)
+FULL: Final = Plan(rates_hz=(500.0, 1000.0), turns=5, seconds=3.0)
 QUICK: Final = Plan(rates_hz=(1000.0,), turns=3, seconds=1.5)
 
 
@@ -72,7 +72,7 @@ class WakeUp(NamedTuple):
 
 
 def measure(*, quick: bool = False) -> Iterator[WakeUp]:
-    """Compare at each rate, idle and loaded. A comparison takes a minute, or 10 s if `quick`."""
+    """Compare at each rate, idle and loaded. A comparison takes half a minute, or 10 s if `quick`."""
     plan = QUICK if quick else FULL
     for rate_hz in plan.rates_hz:
         for loaded in (False, True):
@@ -130,7 +130,7 @@ def cyclictest_us(loop: LoopSettings, seconds: float) -> float | None:
         return None
     interval_us, loops = round(loop.period_ns / 1000), max(1, loop.ticks(seconds))
     options = f"--quiet --mlockall --priority={loop.priority} --interval={interval_us} --loops={loops}"
-    done = subprocess.run(  # noqa: S603 - arguments of our own
+    done = subprocess.run(
         [program, *options.split(), f"--histogram={_LONGEST_US}"], capture_output=True, text=True, check=False
     )
     return None if done.returncode else percentile_of_cyclictest(done.stdout, PERCENT)
@@ -168,7 +168,7 @@ def _in_a_process(work: Callable[[LoopSettings, float], float]) -> Callable[[Loo
 def _busy(processes: int, longest_s: float) -> Iterator[None]:
     """So many busy processes of normal priority, which end by themselves should this process be killed."""
     code = f"import time\nend = time.monotonic() + {longest_s}\nwhile time.monotonic() < end: pass"
-    started = [subprocess.Popen([sys.executable, "-S", "-c", code]) for _ in range(processes)]  # noqa: S603 - as above
+    started = [subprocess.Popen([sys.executable, "-S", "-c", code]) for _ in range(processes)]
     try:
         yield
     finally:

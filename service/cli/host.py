@@ -1,4 +1,4 @@
-"""`aeroloop host`: checks this machine, soaks the loop on it, installs its daemons."""
+"""`aeroloop host`: checks this machine, measures and soaks the loop on it, installs its daemons."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Json, NewLog, Overrides, guarded, settings_of, show
+from aeroloop.service.cli.common import (
+    Config,
+    Json,
+    Markdown,
+    NewLog,
+    Overrides,
+    checked,
+    guarded,
+    report,
+    settings_of,
+    show,
+)
 
 group = typer.Typer()
 
@@ -46,6 +57,46 @@ def soak(
     show(result, json, soak_table)
     if result.findings:
         raise typer.Exit(1)
+
+
+@group.command()
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer turns and items: 90 s.")] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ITEM", help="An item, or a group such as loop; may be repeated.", show_default=False),
+    ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="What --json printed earlier: exit with 1 if a ratio is worse by more than its margin.",
+            show_default=False,
+        ),
+    ] = None,
+    markdown: Markdown = False,
+    json: Json = False,
+) -> None:
+    """Measure what this project takes beside what the machine gives, in turns: item, ours, floor, ratio, aim."""
+    from aeroloop.service.bench.items import ITEMS
+    from aeroloop.service.bench.results import chosen, compared, measure, read_results
+    from aeroloop.service.terminal.bench_table import bench_markdown, bench_table
+
+    with checked():
+        items = chosen(ITEMS, only or ())
+        earlier = read_results(compare) if compare else None
+    with guarded():
+        results = measure(items, quick=quick, progress=lambda item: typer.echo(f"{item.name}: {item.what}", err=True))
+    changes = compared(results, earlier, items) if earlier else []
+    show(
+        results,
+        json,
+        lambda _: typer.echo(bench_markdown(results, changes)) if markdown else bench_table(results, changes),
+    )
+    worse = [change for change in changes if change.worse]
+    for change in worse:
+        report(str(change))
+    raise typer.Exit(1 if worse else 0)
 
 
 @group.command()

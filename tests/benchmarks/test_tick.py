@@ -1,6 +1,7 @@
-"""Tick benchmark: a controller tick from frame bytes to frame bytes, and the same law in plain NumPy.
+"""Tick benchmark: the law in plain NumPy from frame bytes to frame bytes, and a row of the plant's trace.
 
-Run with `uv run pytest tests/benchmarks --benchmark-enable`. No time is asserted.
+Run with `uv run pytest tests/benchmarks --benchmark-enable`; `aeroloop host bench --only tick` measures the
+controller's own tick. No time is asserted.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import time
 from itertools import cycle
 
 import numpy as np
-import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
@@ -20,8 +20,9 @@ from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.service.control.controller import Controller
+from aeroloop.service.config import load
 from aeroloop.service.control.law import LawSettings
+from aeroloop.service.lab.experiment import run_experiment
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of
 
@@ -29,46 +30,15 @@ PERIOD = 0.002
 TICKS = 2000
 
 
-def _controller() -> Controller:
-    return Controller(WireSpec(), LawSettings(), Sinusoid(), PERIOD)
-
-
-@pytest.fixture(scope="module")
-def measurements() -> list[bytes]:
-    """Measurement frames of four seconds of the paper's experiment."""
-    wire = WireSpec()
-    endpoint = Endpoint(PlantSettings(ideal=True).build(PERIOD), wire, round(PERIOD * 1e9))
-    endpoint.claim(
-        Claim(controller="c", session="s", period_ns=round(PERIOD * 1e9), lockstep=False, auto_arm=True, wire=wire)
-    )
-    controller = _controller()
-    frames = []
-    frame = endpoint.tick(None, 0)
-    for k in range(TICKS):
-        assert frame is not None
-        frames.append(frame)
-        frame = endpoint.tick(controller.tick(frame, k), k + 1)
-    return frames
-
-
-def test_controller_tick(benchmark: BenchmarkFixture, measurements: list[bytes]) -> None:
-    controller = _controller()
-    frames = cycle(enumerate(measurements))
-
-    def tick() -> bytes | None:
-        k, frame = next(frames)
-        return controller.tick(frame, k)
-
-    assert benchmark(tick) is not None
-
-
-def test_the_same_tick_in_plain_numpy(benchmark: BenchmarkFixture, measurements: list[bytes]) -> None:
+def test_a_tick_in_plain_numpy(benchmark: BenchmarkFixture) -> None:
     """The tests' NumPy twin of the law and the reference, between the project's own frames and quantizers."""
     wire, p, paper = WireSpec(), LawSettings(), Sinusoid()
     body = body_of(p)
     reference = twin.Sinusoids(np.radians(paper.amplitude), np.array(paper.frequency))
     level, quantizer = wire.attitude.quantizer().level, wire.voltage.quantizer()
     theta, last = np.array(p.damping_estimate), np.array([1.0, 0.0, 0.0, 0.0])
+    measurements: list[bytes] = []
+    run_experiment(load(), TICKS * PERIOD, watch=lambda _, measurement, __: measurements.append(measurement))
     frames = cycle(enumerate(measurements))
 
     def tick() -> bytes:
