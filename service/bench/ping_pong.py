@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Final, Literal
 
@@ -141,6 +142,8 @@ def _prepare(end: _End) -> None:
     """Scheduling as of a loop's process, on every thread."""
     gc.disable()
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    with suppress(OSError):  # idle CPUs stay awake until this process ends
+        os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), bytes(4))
     for thread in os.listdir("/proc/self/task"):
         if end.cpus:
             os.sched_setaffinity(int(thread), end.cpus)
