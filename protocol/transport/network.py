@@ -49,14 +49,14 @@ POLL_S: Final = 0.005
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
-# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which then
-# carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14. One pool for all tasks, because
-# otherwise a frame wakes a thread of two pools: p50 of a bare round trip at 500 Hz under SCHED_FIFO is 359 µs with 16
-# threads in one pool, 318 with one thread, 408 with 22 threads in five pools and 417 by default.
+# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which
+# then carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14, with these threads 0 of 6.
+# One pool for all tasks would save a fifth of the loop's latency, but after such a link later joins cost sessions.
 # Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
-    "(app: (worker_threads: 16), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))",
+    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
+    "app: (worker_threads: 4))",
 )
 
 _PLACE = re.compile(r"(?P<protocol>[a-z]+)/(?P<host>[^/]+):(?P<port>\d+)(?P<rest>[?#].*)?")
