@@ -39,7 +39,7 @@ def experiment(quick: bool) -> Figure:
 
 
 def tables(_: bool) -> Figure:
-    """Processor time of the 28 cells of the paper's tables, over the cores [s]."""
+    """Processor time of the cells of the paper's tables, over the cores [s]."""
     return _on_all_cores(lambda progress: predict(load(), progress=progress))
 
 

@@ -48,7 +48,7 @@ class Item(NamedTuple):
     Attributes:
         name: Its key in JSON. Items that share a first word are a group, which `--only` takes, too.
         unit: Of ours and floor.
-        aim: The largest ratio that is wanted.
+        aim: The largest ratio that is wanted; None where there is none.
         margin: See `Margin`.
         measure: Measures it; its argument is whether the run is a quick one. Raises NotMeasuredError.
         what: Ours; the floor.
@@ -57,7 +57,7 @@ class Item(NamedTuple):
 
     name: str
     unit: str
-    aim: float
+    aim: float | None
     margin: Margin
     measure: Callable[[bool], Figure]
     what: str

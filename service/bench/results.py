@@ -24,7 +24,7 @@ class Measured(BaseModel, frozen=True, extra="forbid"):
     ours: float
     floor: float
     ratio: float = Field(description="ours over floor")
-    aim: float = Field(description="the largest ratio wanted")
+    aim: float | None = Field(description="the largest ratio wanted; null where there is none")
     unit: str = Field(description="of ours and floor")
     note: str = Field(default="", exclude=True, description="for the table")
 
@@ -35,7 +35,7 @@ class NotMeasured(BaseModel, frozen=True, extra="forbid"):
     ours: None = None
     floor: None = None
     ratio: None = None
-    aim: float
+    aim: float | None
     unit: str
     reason: str
 

@@ -42,9 +42,9 @@ def _rows(results: Results, changes: Sequence[Change]) -> list[list[str]]:
         if isinstance(line, Measured):
             change = by_name.get(name)
             beside = [_two(change.before), _two(change.limit)] if change else []
-            verdict = "worse" if change and change.worse else "met" if line.ratio <= line.aim else "missed"
+            verdict = "worse" if change and change.worse else _verdict(line.ratio, line.aim)
             figures = [f"{line.ours:g} {line.unit}".strip(), f"{line.floor:g} {line.unit}".strip(), _two(line.ratio)]
-            rows.append([name, *figures, *beside, f"{line.aim:g}", verdict])
+            rows.append([name, *figures, *beside, "–" if line.aim is None else f"{line.aim:g}", verdict])
     return rows
 
 
@@ -67,3 +67,7 @@ def _notes(results: Results, changes: Sequence[Change]) -> Iterator[str]:
     facts, found = host_facts(), versions()
     host = [f"{facts.get('cpus', '?')} CPUs", facts.get("cpu", ""), facts["kernel"], f"Python {found['python']}"]
     yield ", ".join([*filter(None, host), f"aeroloop {found.get('revision', found['aeroloop'])}"])
+
+
+def _verdict(ratio: float, aim: float | None) -> str:
+    return "" if aim is None else "met" if ratio <= aim else "missed"
