@@ -1,7 +1,7 @@
 """Start-up of a verb: processor time of its process beside that of an interpreter that imports the libraries it needs.
 
-Processor time and not the clock's, so that what `op status` waits for the network is left out. A first round, which is
-not counted, writes the bytecode.
+Processor time and not the clock's, so that what `op status` waits for the network is left out. A first round, not
+counted, writes the bytecode; both have the environment that the command line sets for itself.
 """
 
 from __future__ import annotations
