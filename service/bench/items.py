@@ -49,8 +49,8 @@ ITEMS: Final = (
         quick=False,
     ),
     Item("burden", "s", 14.0, PROCESSOR, burden, "the grid of `lab burden`; as many in C", quick=False),
-    Item("start-help", "s", 1.2, PROCESSOR, start_help, "`--help`; Python with typer and rich"),
-    Item("start-experiment", "s", 1.8, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
-    Item("start-status", "s", 2.2, PROCESSOR, start_status, "`op status`; Python with zenoh"),
+    Item("start-help", "s", 2.0, PROCESSOR, start_help, "`--help`; Python with typer and rich"),
+    Item("start-experiment", "s", 2.2, PROCESSOR, start_experiment, "`lab experiment` of 1 s; Python with casadi"),
+    Item("start-status", "s", 2.5, PROCESSOR, start_status, "`op status`; Python with zenoh"),
 )
 """The table, in its order."""
