@@ -30,7 +30,7 @@ SATURATED: Final = 0.8
 _SETTLE_S: Final = 1.0
 """The first second of a session is warm-up."""
 _CORES: Final = os.cpu_count() or 1
-_LOWER: Final = 0.9
+_LOWER: Final = 0.75
 """Factor on the rate after a long run that failed."""
 
 
