@@ -17,8 +17,6 @@ from aeroloop.protocol.messages.models import Status
 from aeroloop.service.bench.running import ROLES, running_loop
 from aeroloop.service.config import Settings, load
 
-AIM_MB: Final = 130.0
-"""Most memory that a daemon should have resident [MB], locked or not."""
 SETTLED_S: Final = 20.0
 QUICK_SETTLED_S: Final = 4.0
 
@@ -38,7 +36,6 @@ class Memory(NamedTuple):
         role: Which.
         locked: Whether it was asked to lock its memory (`loop.realtime` = try); the recorder never does.
         resident_mb: Resident memory [MB].
-        proportional_mb: The same, with what processes share divided among them [MB].
         floor_mb: Resident memory of an idle interpreter with the same libraries [MB].
         faults: Page faults of the loop's thread, minor and major, after the first seconds of the session; 0 of the
             recorder, which has no loop.
@@ -49,7 +46,6 @@ class Memory(NamedTuple):
     role: str
     locked: bool
     resident_mb: float
-    proportional_mb: float
     floor_mb: float
     faults: int
     ticks: int
@@ -82,7 +78,6 @@ def _measure(settings: Settings, locked: bool, floor_mb: float, quick: bool) -> 
                 role=role,
                 locked=locked and role != "recorder",
                 resident_mb=megabytes((proc / "status").read_text(), "VmRSS"),
-                proportional_mb=megabytes((proc / "smaps_rollup").read_text(), "Pss"),
                 floor_mb=floor_mb,
                 faults=_faults(after[role]) - _faults(before[role]),
                 ticks=after[role].ticks - before[role].ticks,
@@ -95,7 +90,7 @@ def _faults(status: Status) -> int:
 
 
 def megabytes(text: str, name: str) -> float:
-    """A quantity of /proc/PID/status or smaps_rollup [MB], see proc(5); the kernel's kB are 1024 bytes.
+    """A quantity of /proc/PID/status [MB], see proc(5); the kernel's kB are 1024 bytes.
 
     Raises:
         ValueError: It is not there.

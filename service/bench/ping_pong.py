@@ -4,7 +4,7 @@ Both ends are this file run as a program, with nothing but Zenoh in it. The ping
 takes the time of the answer in the receiving thread, as a plant does; the other waits in the ring, as a loop must;
 all of Zenoh runs in one thread. Slower were a Condition, a semaphore and a queue behind a callback, with and without
 a thread of Python in between, and 4 to 22 threads of Zenoh in one to five pools. Faster are two things that cost a
-loop its freedom: an answer from within the receiving thread (`answer`), and both processes on one CPU (`cpus`).
+loop its freedom: an answer from within the receiving thread, and both processes on one CPU.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Final, Literal
+from typing import Final
 
 import zenoh
 from zenoh import handlers
@@ -29,10 +29,6 @@ ONE_THREAD: Final = (
     "(app: (worker_threads: 1), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))"
 )
 """ZENOH_RUNTIME with which all of Zenoh runs in one thread."""
-
-Answer = Literal["ring", "callback"]
-"""Where the answering end answers: in a thread of its own that waits in Zenoh's ring, as a loop must, or in the
-receiving thread of Zenoh, which saves a change of threads but leaves no time for work."""
 
 _PR_SET_TIMERSLACK: Final = 29
 _PING, _PONG = "bench/ping", "bench/pong"
@@ -48,9 +44,7 @@ class _End:
     seconds: float
     send_bytes: int
     priority: int
-    cpus: tuple[int, ...]
     lossless: bool
-    answer: Answer
 
 
 def ping_pong(
@@ -60,10 +54,8 @@ def ping_pong(
     *,
     payloads: tuple[int, int] = (7, 2),
     priority: int = 10,
-    cpus: tuple[Sequence[int], Sequence[int]] = ((), ()),
     runtime: str | None = ONE_THREAD,
     lossless: bool = False,
-    answer: Answer = "ring",
 ) -> list[float]:
     """Round trips of a ping-pong between two processes started for it [µs]. Shape: rate_hz * seconds, less a warm-up.
 
@@ -73,10 +65,8 @@ def ping_pong(
         seconds: Duration [s].
         payloads: Size of a ping and of its answer [bytes].
         priority: SCHED_FIFO priority of all threads of both; 0: none.
-        cpus: CPUs of the pinging and of the answering process; all if empty.
         runtime: ZENOH_RUNTIME of both; None: Zenoh's default.
         lossless: Whether a put blocks on congestion, as in lockstep.
-        answer: Where the other end answers.
 
     Returns:
         From before a ping is put to the time at which Zenoh's receiving thread has its answer.
@@ -87,10 +77,7 @@ def ping_pong(
     variables = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
     if runtime:
         variables["ZENOH_RUNTIME"] = runtime
-    ends = [
-        _End(endpoint, rate_hz, seconds, size, priority, tuple(some), lossless, answer)
-        for size, some in zip(payloads, cpus, strict=True)
-    ]
+    ends = [_End(endpoint, rate_hz, seconds, size, priority, lossless) for size in payloads]
     pipe = subprocess.PIPE
     ping, pong = (
         subprocess.Popen(
@@ -141,14 +128,13 @@ def _direct(received: Callable[[zenoh.Sample], None]) -> handlers.Callback[zenoh
 def _prepare(end: _End) -> None:
     """Scheduling as of a loop's process, on every thread."""
     gc.disable()
+    if not end.priority:  # lockstep, and a host that refuses real time
+        return
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     with suppress(OSError):  # idle CPUs stay awake until this process ends
         os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), bytes(4))
     for thread in os.listdir("/proc/self/task"):
-        if end.cpus:
-            os.sched_setaffinity(int(thread), end.cpus)
-        if end.priority:
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(end.priority))
+        os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(end.priority))
 
 
 def _pong(end: _End) -> None:
@@ -156,11 +142,6 @@ def _pong(end: _End) -> None:
     payload = bytes(end.send_bytes)
     with _open(end, listens=True) as session:
         put = _publisher(session, _PONG, end).put
-        if end.answer == "callback":
-            session.declare_subscriber(_PING, _direct(lambda _: put(payload)))
-            _prepare(end)
-            sys.stdin.read()
-            return
         receive = session.declare_subscriber(_PING, handlers.RingChannel(1)).recv
         threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0)), daemon=True).start()
         _prepare(end)
