@@ -19,6 +19,8 @@ from aeroloop.service.config import Settings, load
 
 SETTLED_S: Final = 20.0
 QUICK_SETTLED_S: Final = 4.0
+WARM_UP_S: Final = 5.0
+"""Of a loop: from then on each of its paths has run, once-a-second ones included."""
 
 _FLOOR: Final = """
 import casadi, numpy, pydantic, rich, typer, zenoh
@@ -68,7 +70,7 @@ def measure(settings: Settings | None = None, *, quick: bool = False) -> Iterato
 def _measure(settings: Settings, locked: bool, floor_mb: float, quick: bool) -> Iterator[Memory]:
     with running_loop(settings, own_interpreters=True) as running:
         running.await_drive()
-        running.statuses()
+        time.sleep(WARM_UP_S)
         before = running.statuses()
         time.sleep(QUICK_SETTLED_S if quick else SETTLED_S)
         after = running.statuses()

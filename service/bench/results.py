@@ -67,19 +67,23 @@ def _is_in(item: Item, word: str) -> bool:
     return f"{item.name}-".startswith(f"{word}-")
 
 
-def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[Item], None] = lambda _: None) -> Results:
-    """Measure items one after the other; `progress` is called with each one first. One that fails costs no other."""
+def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[str], None] = lambda _: None) -> Results:
+    """Measure items one after the other. One that fails costs no other.
+
+    `progress` is called with a line before each item, and with its figures after it.
+    """
     found: dict[str, Measured | NotMeasured] = {}
     for item in items:
         try:
             if quick and not item.quick:
                 raise NotMeasuredError("full runs only")
-            progress(item)
+            progress(f"{item.name}: {item.what}")
             ours, floor, note = item.measure(quick)
             if not (isfinite(ours) and floor > 0):
                 raise NotMeasuredError(f"{ours:g} over {floor:g}")
             figures = {"ours": _short(ours), "floor": _short(floor), "ratio": _short(ours / floor)}
             found[item.name] = Measured(aim=item.aim, unit=item.unit, note=note, **figures)
+            progress(f"  {ours:.4g} / {floor:.4g} {item.unit} = {ours / floor:.3g}")
         except AeroloopError as error:  # such as a process that ended
             found[item.name] = NotMeasured(aim=item.aim, unit=item.unit, reason=str(error))
     return Results(found)

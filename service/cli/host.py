@@ -86,7 +86,7 @@ def bench(
         items = chosen(ITEMS, only or ())
         earlier = read_results(compare) if compare else None
     with guarded():
-        results = measure(items, quick=quick, progress=lambda item: typer.echo(f"{item.name}: {item.what}", err=True))
+        results = measure(items, quick=quick, progress=lambda line: typer.echo(line, err=True))
     changes = compared(results, earlier, items) if earlier else []
     show(
         results,

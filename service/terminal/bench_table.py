@@ -22,7 +22,7 @@ def bench_table(results: Results, changes: Sequence[Change] = ()) -> None:
     for name in header:
         table.add_column(name, justify="left" if name in ("item", "") else "right", no_wrap=name == "item")
     for *figures, verdict in rows:
-        table.add_row(*map(Text, figures), Text(verdict, style=_STYLES[verdict]))
+        table.add_row(*map(Text, figures), Text(verdict, style=_STYLES.get(verdict, "")))
     console = Console()
     console.print(table)
     for line in _notes(results, changes):

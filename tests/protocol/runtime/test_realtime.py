@@ -56,6 +56,33 @@ awake = "/dev/cpu_dma_latency" in [os.path.realpath(f"/proc/self/fd/{fd}") for f
 print(json.dumps([refused, gc.isenabled(), gc.get_freeze_count(), slack, realtime, memory, awake]))
 """
 
+HEAP_GROWS = """
+import json, resource
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.wire.loop import LoopSettings
+
+def faults(run):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    run()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+prepare_process(LoopSettings())
+kept = []
+room = faults(lambda: kept.extend(bytes(8192) for _ in range(500)))
+kept.clear()
+again = faults(lambda: kept.extend(bytes(8192) for _ in range(500)))
+beyond = faults(lambda: kept.extend(bytes(8192) for _ in range(5000)))
+print(json.dumps([room, again, beyond]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="only glibc's malloc can be set up so")
+def test_what_a_loop_publishes_in_its_first_minute_costs_no_page_faults() -> None:
+    done = subprocess.run([sys.executable, "-c", HEAP_GROWS], capture_output=True, text=True, timeout=60, check=True)
+    room, again, beyond = json.loads(done.stdout)
+    assert beyond > 5000  # what is counted: two pages each, and there is no room for so many
+    assert max(room, again) < 50  # a few of Python's own; there are 1 000 pages
+
 
 def test_a_prepared_process_is_as_it_reports() -> None:
     # In a process of its own: collector and scheduler are the process's, and pytest needs its own as they are.

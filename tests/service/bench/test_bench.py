@@ -70,12 +70,12 @@ def test_json_holds_the_five_figures_of_each_item_and_a_reason_where_there_are_n
         "b": {"ours": None, "floor": None, "ratio": None, "aim": 2.0, "unit": "µs", "reason": "no cyclictest"},
         "c": {"ours": None, "floor": None, "ratio": None, "aim": 2.0, "unit": "µs", "reason": "full runs only"},
     }
-    assert err.splitlines() == ["a: a, made", "b: b, made"]  # progress
+    assert err.splitlines() == ["a: a, made", "  3 / 1.5 µs = 2", "b: b, made"]  # what ^C would otherwise lose
 
 
 @pytest.mark.parametrize("form", [(), ("--markdown",)], ids=["terminal", "markdown"])
 def test_the_table_says_of_each_item_whether_its_aim_is_met(bench: Made, form: tuple[str, ...]) -> None:
-    noted = item("e", 1.0)._replace(measure=lambda _: Figure(1.0, 1.0, "at most so"))
+    noted = item("e", 1.0)._replace(measure=lambda _: Figure(1.0, 1.0, "at most so"), aim=None)
     code, out, _ = bench([item("a", 3.0, 1.5), item("b", 2.1), lacking("c"), lacking("d"), noted], *form)
     assert code == 0
     rows = {words[0]: words[1:] for line in out.splitlines() if (words := line.replace("|", " ").split())}
@@ -83,6 +83,7 @@ def test_the_table_says_of_each_item_whether_its_aim_is_met(bench: Made, form: t
     assert rows["b"] == ["2.1", "µs", "1", "µs", "2.10", "2", "missed"]
     assert "not measured (no cyclictest): c, d\n" in out
     assert "c" not in rows
+    assert rows["e"] == ["1", "µs", "1", "µs", "1.00", "–"]
     assert "e: at most so\n" in out
     assert "CPUs" in out.splitlines()[-1]  # the machine
 
