@@ -155,6 +155,9 @@ class Status(Message):
     )
     process: str = Field(default="", description="host and process id of the role")
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
+    certificate_until: str | None = Field(
+        default=None, description="when the role's certificate expires, UTC; null where no link needs one"
+    )
     uptime_s: float
     ticks: int = Field(description="ticks since start")
     rate_hz: float = Field(description="ticks a second since the last status")
