@@ -29,6 +29,8 @@ ROLES: Final[tuple[CertifiedRole, ...]] = get_args(CertifiedRole)
 OF_ONE_VEHICLE: Final = ("plant", "controller")
 """Roles whose certificates name a vehicle; the others' may."""
 AUTHORITY: Final = "ca.pem"
+SOON_DAYS: Final = 14.0
+"""A certificate that expires within this time is due for renewal [days]."""
 
 
 class CertificateError(AeroloopError):
@@ -94,12 +96,8 @@ def read_certificate(file: Path) -> Certificate:
     """
     certificate = load(file)
     from cryptography.hazmat.primitives.hashes import SHA256
-    from cryptography.x509.oid import NameOID
 
-    cn, name = (
-        next((str(each.value) for each in certificate.subject.get_attributes_for_oid(oid)), "")
-        for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME)
-    )
+    cn, name = names_of(certificate)
     found = read_common_name(cn)
     if found is None:
         raise CertificateError(f"{file} is no role's certificate: its common name is {cn!r}; {_ISSUE}")
@@ -184,6 +182,15 @@ def load(file: Path) -> x509.Certificate:
         raise CertificateError(f"{file} cannot be read: {error.strerror}") from None
     except ValueError:
         raise CertificateError(f"{file} is no certificate in PEM") from None
+
+
+def names_of(holder: x509.Certificate | x509.CertificateSigningRequest) -> tuple[str, str]:
+    """Common name and organizational unit of a subject; empty where there is none."""
+    from cryptography.x509.oid import NameOID
+
+    of = holder.subject.get_attributes_for_oid
+    cn, unit = (of(oid) for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME))
+    return str(cn[0].value) if cn else "", str(unit[0].value) if unit else ""
 
 
 def _is_issued_by(file: Path, authority: Path) -> bool:
