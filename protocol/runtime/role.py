@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from datetime import datetime
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
@@ -94,7 +95,7 @@ class Role:
         OccupiedError: It is a plant's, and the vehicle has one.
     """
 
-    _certificate_until: str | None = None
+    _certificate_until: datetime | None = None
 
     def __init__(
         self, role: str, vehicle: str, network: NetworkSettings, config: dict[str, Any], name: str | None = None
@@ -134,7 +135,7 @@ class Role:
         settings, certificate = protected(network, Identity((self.role,), self.vehicle))
         if certificate is None:
             return None
-        self._certificate_until = certificate.not_after.isoformat()
+        self._certificate_until = certificate.not_after
         places = [*settings.places, *settings.connect]
         watch = RefusalWatch(
             certificate,

@@ -22,6 +22,7 @@ from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
 from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, visit
 from aeroloop.protocol.transport.refusal import refusal
+from aeroloop.protocol.transport.security import READER, Identity
 
 ANSWER_S: Final = 1.0
 
@@ -83,7 +84,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
     Raises:
         OperatorError: No role answers, or it refuses.
     """
-    with visit(network, ANSWER_S) as here:
+    with visit(network, ANSWER_S, Identity(("operator",), vehicle)) as here:
         answers: list[Answer] = []
         deadline = time.monotonic() + ANSWER_S
         while not answers and time.monotonic() < deadline:
@@ -129,7 +130,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
         if reply.ok is not None and address is not None:
             answers[address.vehicle].append(Answer.model_validate_json(reply.ok.payload.to_bytes()).text)
 
-    with visit(network, wait_s) as here:
+    with visit(network, wait_s, Identity(("operator",), None if vehicle == "*" else vehicle)) as here:
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < wait_s:
             # A plant declares its token last, so one with a token answers.
@@ -165,7 +166,7 @@ def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> Sessi
         OperatorError: No controller answers, or the plant has no record.
     """
     found: list[SessionRecord] = []
-    with visit(network) as here:
+    with visit(network, identity=READER._replace(vehicle=vehicle)) as here:
         here.settle()
         for reply in _get(here.session, topics.key("show", vehicle), Request().encode(), ANSWER_S):
             with suppress(ValidationError):  # a plant without a record answers so

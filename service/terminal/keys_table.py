@@ -30,7 +30,7 @@ def keys_table(folder: Path, rows: Sequence[KeyFile]) -> None:
             row.vehicle or ("every" if row.role and row.role != "authority" else "–"),
             row.name or "–",
             f"{row.valid_until:%Y-%m-%d %H:%M}" if row.valid_until else "–",
-            f"{days:.0f}" if days is not None else "–",
+            f"{days:.{0 if abs(days) >= 1 else 1}f}" if days is not None else "–",
             style=style,
         )
     console = Console()
