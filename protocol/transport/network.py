@@ -178,7 +178,8 @@ class Visit:
     def __init__(self, session: zenoh.Session, places: list[str], certificate: Certificate | None) -> None:
         self.session = session
         self.certificate = certificate
-        self._silent = accepting(places)
+        self._places = places
+        self._silent: list[str] | None = None
 
     def settle(self, wait_s: float = VISIT_S) -> None:
         """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
@@ -187,7 +188,13 @@ class Visit:
             time.sleep(POLL_S)
 
     def silent(self) -> list[str]:
-        """Endpoints at which a process accepts connections and has not answered as Zenoh so far."""
+        """Endpoints at which a process accepts connections and has not answered as Zenoh so far.
+
+        Tried are only those without a link, at the first call: after a connection that ends before its handshake,
+        Zenoh's listener of TLS accepts none for 0.1 s.
+        """
+        if self._silent is None:
+            self._silent = accepting(unlinked(self.session, self._places))
         if self._silent:
             self._silent = unlinked(self.session, self._silent)
         return self._silent

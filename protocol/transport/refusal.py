@@ -52,12 +52,13 @@ def refusal(place: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -
     try:
         context.load_verify_locations(certificate.file.with_name(AUTHORITY))
         context.load_cert_chain(certificate.file, certificate.key)
-        plain = socket.create_connection((parts[1].strip("[]"), int(parts[2])), wait_s)
+        plain = socket.create_connection((parts[1].strip("[]"), int(parts[2])), HANDSHAKE_S)
     except (OSError, ssl.SSLError):  # replaced at this moment; gone
         return None
     plain_text = f"{place} does not speak TLS: has its process a network.security.directory?"
-    link = None
+    link, begun = None, time.monotonic()
     with plain:
+        plain.settimeout(wait_s)
         try:
             with context.wrap_socket(plain) as link:
                 link.recv(1)  # an alert, if any; a server of Zenoh's says nothing first
@@ -66,11 +67,13 @@ def refusal(place: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -
         except ssl.SSLCertVerificationError as error:
             foreign = f"its certificate is not of this authority, {certificate.file.with_name(AUTHORITY)}"
             return f"{place} is refused: {_THEIRS.get(error.verify_code, foreign)}"
+        except (ssl.SSLEOFError, ConnectionError):  # at once: it ends
+            return plain_text if link is None and time.monotonic() - begun > HANDSHAKE_S else None
         except ssl.SSLError as error:
             alert = error.reason or ""
             return _alert(place, certificate, alert) if "ALERT" in alert else plain_text
         except OSError:
-            return plain_text if link is None else None
+            return None
     return None
 
 
@@ -87,7 +90,7 @@ class RefusalWatch:
     Args:
         certificate: This process's own.
         vehicle: Its vehicle.
-        places: Returns the endpoints at which a process accepts connections and is not linked.
+        places: Returns the endpoints at which a process may be, and to which there is no link.
         report: Called with each line, in the thread.
     """
 
