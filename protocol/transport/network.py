@@ -220,7 +220,7 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         if _is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
-    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and _is_own(places[0]) else []
+    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and is_own(places[0]) else []
     try:
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
@@ -364,7 +364,7 @@ def _is_free(place: str) -> bool:
     return False
 
 
-def _is_own(place: str) -> bool:
+def is_own(place: str) -> bool:
     """Whether an endpoint's address is this host's."""
     return _is_free(re.sub(r":\d+$", ":0", place))
 
