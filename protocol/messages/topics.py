@@ -127,18 +127,16 @@ RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorde
 FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
 """Topics of frames."""
 
-_CACHED: Final[tuple[frozenset[Action], frozenset[Action]]] = (
-    frozenset({"publish", "answer"}),
-    frozenset({"subscribe", "query"}),
-)
-_ACTIONS: Final[dict[str, tuple[frozenset[Action], frozenset[Action]]]] = {
-    "frame": (frozenset({"publish"}), frozenset({"subscribe"})),
+_Actions = tuple[Action, ...]
+_CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer", "hold"), ("subscribe", "query", "watch")
+ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {
+    "frame": (("publish",), ("subscribe",)),
     "json": _CACHED,
     "trace": _CACHED,
-    "query": (frozenset({"query"}), frozenset({"answer"})),
-    "token": (frozenset({"hold"}), frozenset({"watch"})),
+    "query": (("query",), ("answer",)),
+    "token": (("hold",), ("watch",)),
 }
-"""What senders and what receivers do, by what a topic carries; a cache answers queries for what was published."""
+"""What senders and what receivers do, by what a topic carries. A cache has a token and answers queries."""
 
 _CHUNKS: Final = {"session": "(?P<session>[^/]+)", "role": "(?P<role>[^/]+)"}
 _PATTERNS: Final = [
@@ -163,7 +161,7 @@ def key(name: str, vehicle: str, *, session: str = "*", role: str = "*") -> str:
 def may(role: RoleName, action: Action, name: str) -> bool:
     """Whether a role may do this with a topic. Raises KeyError for an unknown topic."""
     topic = TOPICS[name]
-    sending, receiving = _ACTIONS[topic.carries]
+    sending, receiving = ACTIONS[topic.carries]
     return (action in sending and role in topic.senders) or (action in receiving and role in topic.receivers)
 
 
