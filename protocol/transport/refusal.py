@@ -64,7 +64,8 @@ def refusal(place: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -
         except TimeoutError:
             return None
         except ssl.SSLCertVerificationError as error:
-            return f"{place} is refused: {_THEIRS.get(error.verify_code, 'its certificate is not of this authority')}"
+            foreign = f"its certificate is not of this authority, {certificate.file.with_name(AUTHORITY)}"
+            return f"{place} is refused: {_THEIRS.get(error.verify_code, foreign)}"
         except ssl.SSLError as error:
             alert = error.reason or ""
             return _alert(place, certificate, alert) if "ALERT" in alert else plain_text

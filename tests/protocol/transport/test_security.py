@@ -202,8 +202,8 @@ def test_a_watch_says_each_reason_once(network: Secured, monkeypatch: pytest.Mon
 
     with join(network.settings, PLANT):
         watch = RefusalWatch(wrong, "aero", places, lines.append)
-        for name in ("plant/aero", "operator", "plant/aero-2", "plant/aero-2", "evil.example", None):
-            watch.linked("10.0.0.9", name)
+        for cn in ("plant/aero", "operator", "plant/aero-2", "plant/aero-2", "evil.example", None):
+            watch.linked("10.0.0.9", cn)
         eventually("a third look", lambda: len(looks) > 2)
         watch.close()
     linked = [line for line in lines if "10.0.0.9" in line]
