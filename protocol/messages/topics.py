@@ -158,13 +158,6 @@ def key(name: str, vehicle: str, *, session: str = "*", role: str = "*") -> str:
     return f"{ROOT}/{vehicle}/{TOPICS[name].key.format(session=session, role=role)}"
 
 
-def may(role: RoleName, action: Action, name: str) -> bool:
-    """Whether a role may do this with a topic. Raises KeyError for an unknown topic."""
-    topic = TOPICS[name]
-    sending, receiving = ACTIONS[topic.carries]
-    return (action in sending and role in topic.senders) or (action in receiving and role in topic.receivers)
-
-
 def read_key(text: str) -> Address | None:
     """Parse a key; None if it is not in the table."""
     for topic, pattern in _PATTERNS:
