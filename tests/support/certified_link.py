@@ -12,9 +12,8 @@ import zenoh
 from zenoh.handlers import Callback, FifoChannel, RingChannel
 
 from aeroloop.protocol.messages.topics import Action
-from tests.support.zenoh_network import eventually, free_port
+from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
 
-PATIENCE_S: Final = 20.0
 MARKER: Final = "marker"
 """A key on which anybody may do anything: a link keeps order, so what precedes it has arrived or never will."""
 MESSAGES: Final = (
@@ -84,9 +83,11 @@ class Pair(NamedTuple):
 
 
 @contextmanager
-def linked(guard: Path, access: dict[str, Any], hand: Path, *, listening: bool = True) -> Iterator[Pair]:
+def linked(
+    guard: Path, access: dict[str, Any], hand: Path, *, listening: bool = True, protocol: str = "tls"
+) -> Iterator[Pair]:
     """A guard with a certificate and rules that listens (or connects to the hand), and a hand with a certificate."""
-    place = [f"tls/127.0.0.1:{free_port()}"]
+    place = [f"{protocol}/127.0.0.1:{free_port()}"]
     if listening:
         one = open_session(guard, listen=place, access=access)
         pair = Pair(one, open_session(hand, connect=place))

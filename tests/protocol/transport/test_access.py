@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import socket
+import ssl
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -9,8 +13,9 @@ import pytest
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
 from aeroloop.protocol.transport.access import access_control
-from tests.support.certificates import Authority
-from tests.support.certified_link import attempt, linked, with_marker
+from tests.support.certificates import DAY, Authority
+from tests.support.certified_link import attempt, linked, open_session, with_marker
+from tests.support.zenoh_network import PATIENCE_S, free_port
 
 ACTIONS: Final[tuple[Action, ...]] = ("publish", "subscribe", "query", "answer", "hold", "watch")
 KEYS: Final = [
@@ -71,3 +76,115 @@ def test_what_acts_is_judged_where_it_arrives(authority: Authority, role: RoleNa
         assert achieved[action] == allowed(role, action)
     assert achieved["query"] & VERBS == allowed(role, "query") & VERBS
     assert achieved["delete"] == set()
+
+
+@pytest.mark.parametrize("name", ["plant/bero", "controller/bero", "operator/bero", "recorder/bero", "plant", "lab-2"])
+@pytest.mark.parametrize("listening", [True, False], ids=["listening", "connecting"])
+def test_another_vehicle_s_certificate_and_one_of_no_role_do_nothing(
+    authority: Authority, name: str, listening: bool
+) -> None:
+    hand = authority.issue("stranger", file=name.replace("/", "."), cn=name)
+    rules = with_marker(access_control("aero", loopback=False))
+    with linked(authority.folder / "plant.aero.pem", rules, hand, listening=listening) as pair:
+        assert not any(attempt(pair, KEYS + OTHER_KEYS).values())
+
+
+def test_a_router_s_certificate_passes_what_any_role_may_and_no_other_vehicle_s(authority: Authority) -> None:
+    """The router has checked it. What names all vehicles it may read, as any reader."""
+    authority.issue("router")
+    rules = with_marker(access_control("aero", loopback=False))
+    with linked(authority.folder / "plant.aero.pem", rules, authority.folder / "router.pem") as pair:
+        achieved = attempt(pair, KEYS)
+        assert not any(attempt(pair, OTHER_KEYS).values())
+    for action in ACTIONS:
+        of_any = set.union(*(allowed(role, action) for role in ROLES))
+        assert achieved[action] >= of_any
+        assert not any("/bero/" in key for key in achieved[action])
+
+
+@pytest.mark.parametrize("role", ["operator", "recorder"])
+def test_a_certificate_of_every_vehicle_has_the_rights_of_each_that_is_named(
+    authority: Authority, role: RoleName
+) -> None:
+    every = authority.issue(role)
+    keys = [key for key in KEYS if "/aero/" in key]
+    others = [key.replace("/aero/", "/bero/") for key in keys] + [key.replace("/aero/", "/cero/") for key in keys]
+    with linked(
+        authority.folder / "plant.aero.pem", with_marker(access_control("aero", "bero", loopback=False)), every
+    ) as pair:
+        achieved = attempt(pair, keys + others)
+    for action in ACTIONS:
+        mine = allowed(role, action)
+        assert achieved[action] == mine | {key.replace("/aero/", "/bero/") for key in mine}
+
+
+@pytest.mark.parametrize(("open_here", "achieved"), [(True, True), (False, False)])
+def test_plain_links_on_loopback_are_free_unless_they_are_secured(
+    authority: Authority, open_here: bool, achieved: bool
+) -> None:
+    with linked(
+        authority.folder / "plant.aero.pem",
+        with_marker(access_control("aero", loopback=open_here)),
+        authority.folder / "observer.aero.pem",
+        protocol="tcp",
+    ) as pair:
+        found = attempt(pair, [*KEYS, "t/word"])
+    assert all(found.values()) == any(found.values()) == achieved
+    assert found["publish"] == ({*KEYS, "t/word"} if achieved else set())
+
+
+BAD: Final = ("expired", "not yet valid", "foreign", "none")
+
+
+def held(ours: Authority, foreign: Authority, kind: str) -> Path | None:
+    """The certificate of a kind of stranger, which says that it is an operator; None of the one without."""
+    match kind:
+        case "good":
+            return ours.issue("operator", "aero")
+        case "expired":
+            return ours.issue("operator", "aero", file=kind, ends=-DAY)
+        case "not yet valid":
+            return ours.issue("operator", "aero", file=kind, begins=DAY, ends=2 * DAY)
+        case "foreign":
+            return foreign.issue("operator", "aero")
+    return None
+
+
+@pytest.mark.parametrize("kind", ["good", *BAD])
+def test_no_byte_of_a_connecting_stranger_passes_the_handshake(authority: Authority, tmp_path: Path, kind: str) -> None:
+    """TLS 1.3 shows a client in an alert what the listening end has against its certificate."""
+    certificate = held(authority, Authority(tmp_path), kind)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    if certificate:
+        context.load_cert_chain(certificate, certificate.with_suffix(".key"))
+    port, access = free_port(), access_control("aero", loopback=False)
+    with (
+        open_session(authority.folder / "plant.aero.pem", listen=[f"tls/127.0.0.1:{port}"], access=access),
+        context.wrap_socket(socket.create_connection(("127.0.0.1", port), PATIENCE_S)) as link,
+        nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
+    ):
+        link.sendall(b"\3\0abc")  # not Zenoh's: it answers by a close
+        assert link.recv(1)
+
+
+@pytest.mark.parametrize("kind", ["good", *BAD[:-1]])
+def test_no_byte_of_ours_passes_the_handshake_with_a_listening_stranger(
+    authority: Authority, tmp_path: Path, kind: str
+) -> None:
+    certificate = held(authority, Authority(tmp_path), kind)
+    assert certificate is not None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, certificate.with_suffix(".key"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE_S)
+        place, access = f"tls/127.0.0.1:{server.getsockname()[1]}", access_control("aero", loopback=False)
+        with open_session(authority.folder / "plant.aero.pem", connect=[place], access=access):
+            caller, _ = server.accept()
+            caller.settimeout(PATIENCE_S)
+            with (
+                caller,
+                nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
+                context.wrap_socket(caller, server_side=True) as link,
+            ):
+                assert link.recv(1)
