@@ -197,13 +197,10 @@ def roles(cell: str) -> set[str]:
 
 
 def test_the_table_of_topics_is_that_of_the_code() -> None:
-    documented = [
-        (cells(line)[0], (cells(line)[1], roles(cells(line)[3]), roles(cells(line)[4]), cells(line)[6]))
-        for line in SPEC.read_text(encoding="utf-8").splitlines()
-        if line.startswith("|") and len(cells(line)) == 7
-    ]
-    start = next(i for i, row in enumerate(documented) if row[0] == "topic")
-    table = {name: rest for name, rest in documented[start + 1 :] if not set(name) <= set("-: ")}
+    lines = SPEC.read_text(encoding="utf-8").splitlines()
+    start = next(i for i, line in enumerate(lines) if cells(line)[0] == "topic") + 2
+    documented = [cells(line) for line in takewhile(lambda line: line.startswith("|"), lines[start:])]
+    table = {row[0]: (row[1], roles(row[3]), roles(row[4]), row[6]) for row in documented}
     assert table == {
         topic.name: (
             topic.key,

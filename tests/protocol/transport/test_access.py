@@ -13,9 +13,10 @@ import pytest
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
 from aeroloop.protocol.transport.access import access_control
+from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
 from tests.support.certificates import DAY, Authority
 from tests.support.certified_link import attempt, linked, open_session, with_marker
-from tests.support.zenoh_network import PATIENCE_S, free_port
+from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
 
 ACTIONS: Final[tuple[Action, ...]] = ("publish", "subscribe", "query", "answer", "hold", "watch")
 KEYS: Final = [
@@ -76,6 +77,43 @@ def test_what_acts_is_judged_where_it_arrives(authority: Authority, role: RoleNa
         assert achieved[action] == allowed(role, action)
     assert achieved["query"] & VERBS == allowed(role, "query") & VERBS
     assert achieved["delete"] == set()
+
+
+def test_a_token_bears_the_name_of_its_own_role(authority: Authority) -> None:
+    """A controller's goes on after it: there may be several."""
+    own = [topics.key("alive", "aero", role=name) for name in ("controller", "controller-4711-9f")]
+    names = ("plant", "plant-4711", "controllers", "recorder", "$*-9f", "*")
+    wrong = [topics.key("alive", "aero", role=name) for name in names]
+    rules = with_marker(access_control("aero", loopback=False))
+    with linked(authority.folder / "plant.aero.pem", rules, authority.folder / "controller.aero.pem") as pair:
+        tokens = [pair.hand.liveliness().declare_token(name) for name in own + wrong]
+        pair.settle()
+        seen = [str(reply.ok.key_expr) for reply in pair.guard.liveliness().get("aeroloop/**") if reply.ok]
+        assert sorted(seen) == sorted(own)
+        for token in tokens:
+            token.undeclare()
+
+
+@pytest.mark.parametrize("topic", [TOPICS[name] for name in topics.RECORDED], ids=topics.RECORDED)
+def test_a_late_recorder_recovers_from_caches_with_rules_at_both_ends(authority: Authority, topic: Topic) -> None:
+    sender, rules = topic.senders[0], with_marker(access_control("aero", loopback=False))
+    reader = "observer" if sender == "recorder" else "recorder"
+    place = [f"tls/127.0.0.1:{free_port()}"]
+    with (
+        open_session(authority.folder / f"{sender}.aero.pem", listen=place, access=rules) as publishing,
+        open_session(authority.folder / f"{reader}.aero.pem", connect=place, access=rules) as reading,
+    ):
+        publisher = CachedPublisher(publishing, topics.key(topic.name, "aero", role=sender), 1.0)
+        for word in (b"1", b"2", b"3"):
+            publisher.put(word)
+        subscriber, found = RecoveringSubscriber(reading, topics.key(topic.name, "*")), list[bytes]()
+
+        def recovered() -> bool:
+            found.extend(received.payload for received in subscriber.take())
+            return len(found) >= 3
+
+        eventually("recovering", recovered)
+        assert found == [b"1", b"2", b"3"]
 
 
 @pytest.mark.parametrize("name", ["plant/bero", "controller/bero", "operator/bero", "recorder/bero", "plant", "lab-2"])
