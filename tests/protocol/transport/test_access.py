@@ -108,12 +108,14 @@ def test_a_late_recorder_recovers_from_caches_with_rules_at_both_ends(authority:
             publisher.put(word)
         subscriber, found = RecoveringSubscriber(reading, topics.key(topic.name, "*")), list[bytes]()
 
-        def recovered() -> bool:
+        def has(count: int) -> bool:
             found.extend(received.payload for received in subscriber.take())
-            return len(found) >= 3
+            return len(found) >= count
 
-        eventually("recovering", recovered)
-        assert found == [b"1", b"2", b"3"]
+        eventually("recovering", lambda: has(3))
+        publisher.put(b"4")
+        eventually("receiving", lambda: has(4))
+        assert found == [b"1", b"2", b"3", b"4"]
 
 
 @pytest.mark.parametrize("name", ["plant/bero", "controller/bero", "operator/bero", "recorder/bero", "plant", "lab-2"])
