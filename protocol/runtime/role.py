@@ -32,7 +32,6 @@ from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.network import (
     VISIT_S,
     NetworkSettings,
-    accepting,
     join,
     protected,
     unlinked,
@@ -140,7 +139,7 @@ class Role:
         watch = RefusalWatch(
             certificate,
             self.vehicle,
-            lambda: unlinked(self.zenoh, accepting(places)),
+            lambda: unlinked(self.zenoh, places),
             lambda line: self.event("refused", line),
         )
 

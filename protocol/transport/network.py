@@ -184,7 +184,8 @@ class Visit:
     def __init__(self, session: zenoh.Session, places: list[str], certificate: Certificate | None) -> None:
         self.session = session
         self.certificate = certificate
-        self._silent = accepting(places)
+        self._places = places
+        self._silent: list[str] | None = None
 
     def settle(self, wait_s: float = VISIT_S) -> None:
         """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
@@ -193,7 +194,13 @@ class Visit:
             time.sleep(POLL_S)
 
     def silent(self) -> list[str]:
-        """Endpoints at which a process accepts connections and has not answered as Zenoh so far."""
+        """Endpoints at which a process accepts connections and has not answered as Zenoh so far.
+
+        Tried are only those without a link, at the first call: after a connection that ends before its handshake,
+        Zenoh's listener of TLS accepts none for 0.1 s.
+        """
+        if self._silent is None:
+            self._silent = accepting(unlinked(self.session, self._places))
         if self._silent:
             self._silent = unlinked(self.session, self._silent)
         return self._silent
@@ -219,7 +226,7 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         if _is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
-    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and _is_own(places[0]) else []
+    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and is_own(places[0]) else []
     try:
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
@@ -365,7 +372,7 @@ def _is_free(place: str) -> bool:
     return False
 
 
-def _is_own(place: str) -> bool:
+def is_own(place: str) -> bool:
     """Whether an endpoint's address is this host's."""
     return _is_free(re.sub(r":\d+$", ":0", place))
 

@@ -52,12 +52,13 @@ def refusal(place: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -
     try:
         context.load_verify_locations(certificate.file.with_name(AUTHORITY))
         context.load_cert_chain(certificate.file, certificate.key)
-        plain = socket.create_connection((parts[1].strip("[]"), int(parts[2])), wait_s)
+        plain = socket.create_connection((parts[1].strip("[]"), int(parts[2])), HANDSHAKE_S)
     except (OSError, ssl.SSLError):  # replaced at this moment; gone
         return None
     plain_text = f"{place} does not speak TLS: has its process a network.security.directory?"
-    link = None
+    link, begun = None, time.monotonic()
     with plain:
+        plain.settimeout(wait_s)
         try:
             with context.wrap_socket(plain) as link:
                 link.recv(1)  # an alert, if any; a server of Zenoh's says nothing first
@@ -66,11 +67,13 @@ def refusal(place: str, certificate: Certificate, wait_s: float = HANDSHAKE_S) -
         except ssl.SSLCertVerificationError as error:
             foreign = f"its certificate is not of this authority, {certificate.file.with_name(AUTHORITY)}"
             return f"{place} is refused: {_THEIRS.get(error.verify_code, foreign)}"
+        except (ssl.SSLEOFError, ConnectionError):  # at once: it ends
+            return plain_text if link is None and time.monotonic() - begun > HANDSHAKE_S else None
         except ssl.SSLError as error:
             alert = error.reason or ""
             return _alert(place, certificate, alert) if "ALERT" in alert else plain_text
         except OSError:
-            return plain_text if link is None else None
+            return None
     return None
 
 
@@ -87,7 +90,7 @@ class RefusalWatch:
     Args:
         certificate: This process's own.
         vehicle: Its vehicle.
-        places: Returns the endpoints at which a process accepts connections and is not linked.
+        places: Returns the endpoints at which a process may be, and to which there is no link.
         report: Called with each line, in the thread.
     """
 
@@ -103,13 +106,15 @@ class RefusalWatch:
         self._certificate, self._vehicle = certificate, vehicle
         self._places, self._report = places, report
         self._said: set[str] = set()
-        self._lines = SimpleQueue[str | None]()  # None ends the thread
+        self._lines = SimpleQueue[str]()
+        self._lock, self._closed = threading.Lock(), False
         threading.Thread(target=self._run, name="refusals", daemon=True).start()
 
     def close(self) -> None:
-        """End the thread; nothing is reported from now on."""
-        self._said = {"closed"}
-        self._lines.put(None)
+        """Neither look nor report from now on; the thread ends when its handshake has."""
+        with self._lock:
+            self._closed = True
+        self._lines.put("")  # wakes it
 
     def linked(self, host: str, common_name: str | None) -> None:
         """Report a link whose certificate gives its peer no right here: of no role, or of another vehicle."""
@@ -121,17 +126,16 @@ class RefusalWatch:
 
     def _run(self) -> None:
         due = time.monotonic() + FIRST_S
-        while True:
+        while not self._closed:
             try:
-                line = self._lines.get(timeout=max(0.0, due - time.monotonic()))
+                lines: list[str | None] = [self._lines.get(timeout=max(0.0, due - time.monotonic()))]
             except Empty:
-                lines = [refusal(place, self._certificate, PLAIN_S) for place in self._places()]
+                with self._lock:
+                    places = [] if self._closed else list(self._places())
+                lines = [refusal(place, self._certificate, PLAIN_S) for place in places]
                 due = time.monotonic() + EVERY_S
-            else:
-                if line is None:
-                    return
-                lines = [line]
-            for each in lines:
-                if each is not None and each not in self._said and len(self._said) < self.MAX_SAID:
-                    self._said.add(each)
-                    self._report(each)
+            with self._lock:
+                for line in [] if self._closed else lines:
+                    if line and line not in self._said and len(self._said) < self.MAX_SAID:
+                        self._said.add(line)
+                        self._report(line)

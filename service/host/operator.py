@@ -20,7 +20,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
-from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, visit
+from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, is_own, visit
 from aeroloop.protocol.transport.refusal import refusal
 from aeroloop.protocol.transport.security import READER, Identity
 
@@ -203,7 +203,7 @@ def _unanswered(here: Visit, but: Sequence[str] = (), *, why: bool = True) -> li
     """
     lines = []
     for place in here.silent():
-        process = listener(place)
+        process = listener(place) if is_own(place) else None
         if process is None or process.role not in but:
             name = f"the {process}" if process else "the process"
             refused = refusal(place, here.certificate) if why and here.certificate else None
