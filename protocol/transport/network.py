@@ -27,6 +27,7 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.access import access_control
 from aeroloop.protocol.transport.certificate import Certificate
 from aeroloop.protocol.transport.security import (
     READER,
@@ -142,10 +143,12 @@ class Protected(NamedTuple):
     Attributes:
         settings: The network.
         certificate: Its certificate; None where no link needs one.
+        vehicles: Those whose peers it takes messages of; none are all of them.
     """
 
     settings: NetworkSettings
     certificate: Certificate | None
+    vehicles: tuple[str, ...] = ()
 
 
 def protected(settings: NetworkSettings, identity: Identity) -> Protected:
@@ -164,7 +167,10 @@ def protected(settings: NetworkSettings, identity: Identity) -> Protected:
         for name in ("rendezvous", "listen", "connect")
     }
     network = settings.model_copy(update=update)
-    return Protected(network, certificate_for(network.endpoints, settings.security, identity))
+    certificate = certificate_for(network.endpoints, settings.security, identity)
+    own = (identity.vehicle, certificate.vehicle) if certificate else ()
+    named = [name for name in (*own, *settings.security.vehicles) if name is not None]
+    return Protected(network, certificate, tuple(dict.fromkeys(named)))
 
 
 class Visit:
@@ -285,7 +291,7 @@ def _open(
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
-    settings, certificate = network
+    settings, certificate, vehicles = network
     tree: dict[str, Any] = {
         "mode": "peer",
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -320,6 +326,8 @@ def _open(
         tree["transport"]["link"]["tls"] = tls_tree(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
         tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
+        if vehicles:
+            tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
     session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
     return session

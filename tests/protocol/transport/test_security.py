@@ -70,7 +70,7 @@ def test_plain_text_beyond_loopback_is_said_at_each_start(caplog: pytest.LogCapt
 
 def test_certificates_are_needed_only_where_a_link_uses_them(tmp_path: Path) -> None:
     nowhere = NetworkSettings(security=SecuritySettings(directory=str(tmp_path)))
-    assert protected(nowhere, PLANT) == (nowhere, None)
+    assert protected(nowhere, PLANT) == (nowhere, None, ())
     with pytest.raises(CertificateError, match=r"ca\.pem is missing"):  # never the system's authorities
         protected(nowhere.model_copy(update={"loopback_secured": True}), PLANT)
 
