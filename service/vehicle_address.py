@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Self
 
-from pydantic import BaseModel, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, Field, StringConstraints, ValidationError, model_validator
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network import NetworkSettings
@@ -30,6 +30,15 @@ class VehicleAddress(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     network: NetworkSettings = Field(
         default=NetworkSettings(), description="Zenoh endpoints of this process and of others"
     )
+
+    @model_validator(mode="after")
+    def _messages_of_its_own_vehicle_are_taken(self) -> Self:
+        """Name the vehicle among those whose peers have rights, wherever certificates give them."""
+        security = self.network.security
+        if security.directory and self.vehicle not in security.vehicles:
+            named = security.model_copy(update={"vehicles": [self.vehicle, *security.vehicles]})
+            self.network = self.network.model_copy(update={"security": named})
+        return self
 
 
 def load_vehicle_address(file: Path | None = None, overrides: Sequence[str] = ()) -> VehicleAddress:

@@ -32,6 +32,7 @@ from aeroloop.protocol.transport.certificate import Certificate
 from aeroloop.protocol.transport.security import (
     READER,
     Identity,
+    SecurityError,
     SecuritySettings,
     certificate_for,
     is_plain,
@@ -143,7 +144,7 @@ class Protected(NamedTuple):
     Attributes:
         settings: The network.
         certificate: Its certificate; None where no link needs one.
-        vehicles: Those whose peers it takes messages of; none are all of them.
+        vehicles: Those whose peers it takes messages of, if it has a certificate.
     """
 
     settings: NetworkSettings
@@ -170,6 +171,8 @@ def protected(settings: NetworkSettings, identity: Identity) -> Protected:
     certificate = certificate_for(network.endpoints, settings.security, identity)
     own = (identity.vehicle, certificate.vehicle) if certificate else ()
     named = [name for name in (*own, *settings.security.vehicles) if name is not None]
+    if certificate and not named:
+        raise SecurityError(f"{certificate.file} is good for every vehicle: name them in network.security.vehicles")
     return Protected(network, certificate, tuple(dict.fromkeys(named)))
 
 
@@ -326,8 +329,7 @@ def _open(
         tree["transport"]["link"]["tls"] = tls_tree(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
         tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
-        if vehicles:
-            tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
+        tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
     session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
     return session

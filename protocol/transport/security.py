@@ -41,7 +41,8 @@ class SecuritySettings(BaseModel, extra="forbid"):
 
     vehicles: list[Annotated[str, Field(pattern=f"^{NAME}$")]] = Field(
         default=[],
-        description="further vehicles that a recorder, an operator or an observer of every vehicle takes messages of",
+        description="vehicles whose peers have rights here; the configured one always, further ones for a recorder, an "
+        "operator or an observer of several",
     )
 
     @property

@@ -63,9 +63,11 @@ def test_the_owner_has_an_event_of_each_peer_that_has_no_right_here(
         issue("operator")
         issue("controller", "aero-2")
     network = NetworkSettings(
-        rendezvous=[free_rendezvous()], security=SecuritySettings(directory=str(ours.folder)), loopback_secured=True
+        rendezvous=[free_rendezvous()],
+        security=SecuritySettings(directory=str(ours.folder), vehicles=["aero"]),
+        loopback_secured=True,
     )
-    theirs = network.model_copy(update={"security": SecuritySettings(directory=str(foreign.folder))})
+    theirs = network.model_copy(update={"security": SecuritySettings(directory=str(foreign.folder), vehicles=["aero"])})
     other = Identity(("controller",), "aero-2")
     events = list[Event]()
     with join(network) as owner, Role("plant", "aero", network, {}) as role:

@@ -18,8 +18,16 @@ import zenoh
 from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
 from aeroloop.protocol.transport.network import NetworkSettings, join, protected, visit
 from aeroloop.protocol.transport.refusal import PLAIN_S, RefusalWatch, refusal
-from aeroloop.protocol.transport.security import Identity, SecurityError, SecuritySettings, secured, tls_tree
+from aeroloop.protocol.transport.security import (
+    READER,
+    Identity,
+    SecurityError,
+    SecuritySettings,
+    secured,
+    tls_tree,
+)
 from aeroloop.service.testing.process_group import free_rendezvous
+from aeroloop.service.vehicle_address import load_vehicle_address
 from tests.support.certificates import DAY, Authority
 from tests.support.zenoh_network import eventually, free_port
 
@@ -84,7 +92,7 @@ class Secured:
             self.authority.issue(role, vehicle)
         self.settings = NetworkSettings(
             rendezvous=[free_rendezvous()],
-            security=SecuritySettings(directory=str(self.authority.folder)),
+            security=SecuritySettings(directory=str(self.authority.folder), vehicles=["aero"]),
             loopback_secured=True,
         )
         self.place = protected(self.settings, PLANT).settings.places[0]
@@ -187,7 +195,9 @@ def test_a_command_says_why_a_place_does_not_answer(network: Secured) -> None:
     from aeroloop.service.host.operator import OperatorError, gather
 
     network.foreign.issue("operator")
-    theirs = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.foreign.folder))})
+    theirs = network.settings.model_copy(
+        update={"security": SecuritySettings(directory=str(network.foreign.folder), vehicles=["aero"])}
+    )
     with join(network.settings, PLANT), pytest.raises(OperatorError, match="not of this authority"):
         gather(theirs)
 
@@ -234,3 +244,15 @@ def test_a_watch_that_is_closed_during_a_handshake_reports_no_more(
     go_on.set()
     thread.join()
     assert not lines
+
+
+def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(network: Secured) -> None:
+    nobody = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.authority.folder))})
+    with pytest.raises(SecurityError, match="name them in network.security.vehicles"):
+        protected(nobody, READER)
+    keys = f"network.security.directory={network.authority.folder}"
+    of_one = load_vehicle_address(None, ["vehicle=falcon", keys])
+    assert of_one.network.security.vehicles == ["falcon"]
+    both = load_vehicle_address(None, ["vehicle=falcon", keys, 'network.security.vehicles=["aero"]'])
+    assert both.network.security.vehicles == ["falcon", "aero"]
+    assert load_vehicle_address().network.security.vehicles == []
