@@ -10,6 +10,7 @@ An operator's command does not listen: it visits, and finds which processes acce
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import select
@@ -19,13 +20,25 @@ import struct
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import zenoh
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.certificate import Certificate
+from aeroloop.protocol.transport.security import (
+    READER,
+    Identity,
+    SecuritySettings,
+    certificate_for,
+    is_plain,
+    secured,
+    tls_tree,
+)
+
+log: Final = logging.getLogger("aeroloop")
 
 QUEUE: Final = 16
 """Batches that may wait to be sent on a link, per priority; the most that Zenoh allows."""
@@ -98,6 +111,14 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )
     lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is disconnected after this [ms]")
+    security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
+    insecure: bool = Field(
+        default=False,
+        description="allow plain text beyond loopback: anyone on that network can then drive the vehicle",
+    )
+    loopback_secured: bool = Field(
+        default=False, description="mutual TLS on loopback, too: the users of this host need certificates, as others do"
+    )
 
     @field_validator("rendezvous", mode="before")
     @classmethod
@@ -109,16 +130,54 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         """Every endpoint at which a process may be met: the rendezvous, port by port."""
         return [place for first in self.rendezvous for place in _ports(first, self.ports)]
 
+    @property
+    def endpoints(self) -> list[str]:
+        """Every endpoint that is connected to or listened on."""
+        return [*self.places, *self.connect, *self.listen]
+
+
+class Protected(NamedTuple):
+    """A process's own network, with the endpoints that it opens in place of the configured ones.
+
+    Attributes:
+        settings: The network.
+        certificate: Its certificate; None where no link needs one.
+    """
+
+    settings: NetworkSettings
+    certificate: Certificate | None
+
+
+def protected(settings: NetworkSettings, identity: Identity) -> Protected:
+    """Replace endpoints by those of mutual TLS where `security.secured` says so, and find this process's certificate.
+
+    Raises:
+        SecurityError: An endpoint must not be opened as configured.
+        CertificateError: A certificate is needed, and this process has none that is good.
+    """
+    insecure, loopback = settings.insecure, settings.loopback_secured
+    update = {
+        name: [
+            secured(each, settings.security, insecure=insecure, loopback_secured=loopback)
+            for each in getattr(settings, name)
+        ]
+        for name in ("rendezvous", "listen", "connect")
+    }
+    network = settings.model_copy(update=update)
+    return Protected(network, certificate_for(network.endpoints, settings.security, identity))
+
 
 class Visit:
     """A session of a command: it has no endpoint of its own, and links to every process that answers.
 
     Attributes:
         session: The session.
+        certificate: Its own; None where no link needs one.
     """
 
-    def __init__(self, session: zenoh.Session, places: list[str]) -> None:
+    def __init__(self, session: zenoh.Session, places: list[str], certificate: Certificate | None) -> None:
         self.session = session
+        self.certificate = certificate
         self._silent = accepting(places)
 
     def settle(self, wait_s: float = VISIT_S) -> None:
@@ -130,55 +189,66 @@ class Visit:
     def silent(self) -> list[str]:
         """Endpoints at which a process accepts connections and has not answered as Zenoh so far."""
         if self._silent:
-            linked = {str(link.dst) for link in self.session.info.links()}
-            self._silent = [place for place in self._silent if place not in linked]
+            self._silent = unlinked(self.session, self._silent)
         return self._silent
 
 
-def join(settings: NetworkSettings, *, listen: bool = True) -> zenoh.Session:
+def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
     """Open a session that meets the others at the rendezvous. The caller closes it.
 
     Args:
         settings: Where.
+        identity: What the process is.
         listen: Whether others can connect to this process: yes for a role, no for a command that only queries.
 
     Raises:
         NetworkError: A `listen` endpoint cannot be opened.
+        SecurityError, CertificateError: Its links cannot be secured, see `protected`.
     """
-    places = settings.places
+    network = protected(settings, identity)
+    if listen and settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
+        log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
+    places, further = network.settings.places, network.settings.listen
     for place in places if listen else []:
         if _is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
-                return _open(settings, [place, *settings.listen], [other for other in places if other != place])
+                return _open(network, [place, *further], [other for other in places if other != place])
     any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and _is_own(places[0]) else []
     try:
-        return _open(settings, [*settings.listen, *any_port] if listen else [], places)
+        return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(settings.listen)}: {_reason(error)}; "
+            f"cannot listen on {', '.join(further)}: {_reason(error)}; "
             "give a free one with --set network.listen='[\"tcp/127.0.0.1:0\"]'"
         ) from None
 
 
 @contextmanager
-def visit(settings: NetworkSettings, wait_s: float = VISIT_S) -> Iterator[Visit]:
+def visit(settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity = READER) -> Iterator[Visit]:
     """Open a session for a few queries that take at most `wait_s`.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
     """
     wait_ms = round(wait_s * 1000)
-    places = settings.places
-    session = _open(settings, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
+    network = protected(settings, identity)
+    places = network.settings.places
+    session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
     with closing(session):
-        yield Visit(session, [*settings.connect, *places])
+        yield Visit(session, [*network.settings.connect, *places], network.certificate)
+
+
+def unlinked(session: zenoh.Session, places: list[str]) -> list[str]:
+    """Those of some endpoints to which a session has no link of its own; one that the peer has made is none."""
+    linked = {str(link.dst) for link in session.info.links()}
+    return [place for place in places if place not in linked]
 
 
 def accepting(places: list[str]) -> list[str]:
-    """Those of some TCP endpoints at which a process accepts connections; the others' silence is waited for briefly."""
+    """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
     attempts: dict[int, tuple[socket.socket, str]] = {}
     found = []
     for place in places:
-        if (parts := _PLACE.fullmatch(place)) and parts["protocol"] == "tcp":
+        if (parts := _PLACE.fullmatch(place)) and parts["protocol"] in ("tcp", "tls"):
             attempt = socket.socket(_family(parts))
             attempt.setblocking(False)
             with suppress(OSError):
@@ -202,12 +272,13 @@ def accepting(places: list[str]) -> list[str]:
 
 
 def _open(
-    settings: NetworkSettings,
+    network: Protected,
     listen: list[str],
     places: list[str],
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
+    settings, certificate = network
     tree: dict[str, Any] = {
         "mode": "peer",
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -238,6 +309,10 @@ def _open(
             "unicast": {"open_timeout": handshake_ms, "accept_timeout": HANDSHAKE_MS},
         },
     }
+    if certificate is not None:
+        tree["transport"]["link"]["tls"] = tls_tree(certificate)
+        # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
+        tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
     session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
     return session
@@ -274,7 +349,7 @@ def _family(parts: re.Match[str]) -> socket.AddressFamily:
 def _is_free(place: str) -> bool:
     """Whether this process could listen at an endpoint: it is an address of this host, and its port is free."""
     parts = _PLACE.fullmatch(place)
-    if parts is None or parts["protocol"] == "udp":
+    if parts is None or parts["protocol"] in ("udp", "quic"):
         return True  # only Zenoh can find out
     address = parts["host"].strip("[]"), int(parts["port"])
     with suppress(OSError), socket.create_server(address, family=_family(parts)):

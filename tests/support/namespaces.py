@@ -80,7 +80,7 @@ class Hosts:
 
     def aeroloop(self, host: str, *words: str, overrides: Sequence[str] = ()) -> subprocess.Popen[bytes]:
         """Start a command of the program on a host; its log is `<folder>/<host>.log`."""
-        given = [f"network.rendezvous={json.dumps(self.rendezvous)}", *overrides]
+        given = [f"network.rendezvous={json.dumps(self.rendezvous)}", "network.insecure=true", *overrides]
         sets = [word for override in given for word in ("--set", override)]
         return self.start(host, "-m", "aeroloop", *words, *sets)
 
@@ -129,7 +129,7 @@ def _print_messages(rendezvous: list[str]) -> None:
         sys.stdout.write(json.dumps({"key": str(sample.key_expr), **message}) + "\n")
         sys.stdout.flush()
 
-    with join(NetworkSettings(rendezvous=rendezvous), listen=False) as session:
+    with join(NetworkSettings(rendezvous=rendezvous, insecure=True), listen=False) as session:
         for topic in ("status", "event"):
             session.declare_subscriber(topics.key(topic, "*"), received)
         signal.sigwait([signal.SIGTERM])
