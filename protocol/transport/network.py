@@ -18,9 +18,9 @@ import socket
 import stat
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import zenoh
 from pydantic import AfterValidator, BaseModel, Field, field_validator
@@ -72,6 +72,8 @@ os.environ.setdefault(
     "app: (worker_threads: 4))",
 )
 
+DATAGRAMS: Final = ("udp", "quic")
+"""Protocols over UDP."""
 _PLACE = re.compile(r"(?P<protocol>[a-z]+)/(?P<host>[^/]+):(?P<port>\d+)(?P<rest>[?#].*)?")
 
 
@@ -109,6 +111,11 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     connect: list[Endpoint] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
     gossip: bool = Field(
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
+    )
+    transport: Literal["mixed", "tcp"] = Field(
+        default="mixed",
+        description="of frames beyond loopback, in real time; mixed: datagrams over UDP, by QUIC, at the same ports; "
+        "tcp: the links of all else",
     )
     lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is disconnected after this [ms]")
     security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
@@ -208,18 +215,18 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
     network = protected(settings, identity)
     if listen and settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
         log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
-    places, further = network.settings.places, network.settings.listen
+    places, further = network.settings.places, [_with_port(each) for each in network.settings.listen]
     for place in places if listen else []:
         if _is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
-    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and _is_own(places[0]) else []
+    any_port = [_with_port(_at_port(places[0], 0))] if listen and places and _is_own(places[0]) else []
     try:
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(further)}: {_reason(error)}; "
-            "give a free one with --set network.listen='[\"tcp/127.0.0.1:0\"]'"
+            f"cannot listen on {', '.join(further)}: {_reason(error)}; give free ones with --set network.listen="
+            f"'{json.dumps([_at_port(each, 0) for each in settings.listen])}'"
         ) from None
 
 
@@ -235,6 +242,13 @@ def visit(settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity
     session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
     with closing(session):
         yield Visit(session, [*network.settings.connect, *places], network.certificate)
+
+
+def open_session(network: Protected, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
+    """Open a session at these endpoints and no others. Raises zenoh.ZError."""
+    here = {"rendezvous": [*listen, *connect], "ports": 1, "listen": [], "connect": [], "gossip": False}
+    only = network._replace(settings=network.settings.model_copy(update=here))
+    return _open(only, list(listen), list(connect))
 
 
 def unlinked(session: zenoh.Session, places: list[str]) -> list[str]:
@@ -349,17 +363,39 @@ def _family(parts: re.Match[str]) -> socket.AddressFamily:
 def _is_free(place: str) -> bool:
     """Whether this process could listen at an endpoint: it is an address of this host, and its port is free."""
     parts = _PLACE.fullmatch(place)
-    if parts is None or parts["protocol"] in ("udp", "quic"):
+    if parts is None:
         return True  # only Zenoh can find out
-    address = parts["host"].strip("[]"), int(parts["port"])
-    with suppress(OSError), socket.create_server(address, family=_family(parts)):
+    address, family = (parts["host"].strip("[]"), int(parts["port"])), _family(parts)
+    with suppress(OSError):
+        if parts["protocol"] in DATAGRAMS:
+            with socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.bind(address)
+        else:
+            socket.create_server(address, family=family).close()
         return True
     return False
 
 
 def _is_own(place: str) -> bool:
     """Whether an endpoint's address is this host's."""
-    return _is_free(re.sub(r":\d+$", ":0", place))
+    return _is_free(_at_port(place, 0))
+
+
+def _at_port(endpoint: str, port: int) -> str:
+    """An endpoint with another port; itself where it has none."""
+    parts = _PLACE.fullmatch(endpoint)
+    return endpoint if parts is None else f"{parts['protocol']}/{parts['host']}:{port}{parts['rest'] or ''}"
+
+
+def _with_port(endpoint: str) -> str:
+    """An endpoint at which Zenoh can listen: it chooses a free port of TCP for 0, but refuses 0 with UDP."""
+    parts = _PLACE.fullmatch(endpoint)
+    if parts is None or parts["protocol"] not in DATAGRAMS or parts["port"] != "0":
+        return endpoint
+    with suppress(OSError), socket.socket(_family(parts), socket.SOCK_DGRAM) as probe:
+        probe.bind((parts["host"].strip("[]"), 0))
+        return _at_port(endpoint, probe.getsockname()[1])
+    return endpoint  # another host's: Zenoh says so
 
 
 def _reason(error: Exception) -> str:

@@ -227,7 +227,8 @@ class Daemon:
         elif before is not State.RUNNING:
             self._machine.fire(Trigger.ANSWERED)
             if before is State.CLAIMED:
-                role.event("claimed", f"{role.name} has {role.vehicle}", session, tick)
+                by = ", its frames by datagrams" if self._claims.by_datagrams else ""
+                role.event("claimed", f"{role.name} has {role.vehicle}{by}", session, tick)
         if self._machine.state is not before:
             self._status_due = 0
 

@@ -1,0 +1,94 @@
+"""Datagrams: a second Zenoh session of a loop's two ends, which carries their frames over UDP.
+
+Over TCP, and so over TLS, one lost packet holds back all that follow until it has been sent again: 0.2 s and more, in
+which the plant's watchdog trips. A lost frame needs nothing: the next one replaces it. So between hosts claims, verbs,
+tokens and traces stay where they are, and frames get a session of their own: a QUIC connection, whose datagrams carry
+the frames and whose stream carries what Zenoh declares. With certificates it is encrypted, and both ends have one.
+
+The plant listens at the first free port of its host's places, by UDP, and names the endpoint in its status. The
+controller connects to it before it claims; without such a link its frames stay on the first session.
+
+Why not a second link of the first session: the first link of a peer carries Zenoh's declarations. If that is UDP, which
+has the shortest handshake, a lost packet costs a subscription for good. Why not all on one connection: QUIC's
+retransmissions of traces then hold up its datagrams (`tests/benchmarks/loss.py`).
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from typing import Final
+
+import zenoh
+
+from aeroloop.protocol.transport.network import NetworkSettings, open_session, protected
+from aeroloop.protocol.transport.security import Identity, is_plain
+
+LINK_S: Final = 1.0
+"""How long a claim waits for the link to a plant [s]; at 20 % loss the handshake may lose a packet or two."""
+_POLL_S: Final = 0.005
+_CARRIERS: Final = {"tcp": "udp", "tls": "quic"}
+"""By the protocol of an endpoint, that of its datagrams: as plain, or as protected."""
+_MIXED: Final = "?rel=1;mixed_rel=1"
+"""Zenoh's words for a QUIC connection with a reliable stream and with datagrams."""
+
+
+class Datagrams:
+    """The session of one end's frames; none until `listen` or `connect`, on loopback, or where settings want none."""
+
+    def __init__(self, settings: NetworkSettings, identity: Identity) -> None:
+        self._settings = settings
+        self._identity = identity
+        self._wanted = settings.transport == "mixed" and any(_datagrams_of(place) for place in settings.places)
+        self._wait_until = 0.0
+        self.session: zenoh.Session | None = None
+        self.endpoint = ""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether frames are to travel by datagrams, so that a plant's endpoint is worth asking for."""
+        return self._wanted
+
+    @property
+    def linked(self) -> bool:
+        """Whether there is a link to a peer now."""
+        return self.session is not None and bool(self.session.info.peers_zid())
+
+    def listen(self) -> None:
+        """Listen at the first free one of this host's places, if datagrams are wanted; `endpoint` then names it."""
+        network = protected(self._settings, self._identity)
+        for endpoint in filter(None, map(_datagrams_of, network.settings.places)) if self._wanted else ():
+            with suppress(zenoh.ZError):  # taken, or another host's
+                self.session = open_session(network, listen=[endpoint])
+                self.endpoint = endpoint
+                return
+
+    def connect(self, endpoint: str) -> bool:
+        """Connect to a plant's endpoint, unless that has been done; whether there is a link within `LINK_S` of that.
+
+        An endpoint that is not among the network's own places is refused: a status from elsewhere leads nowhere.
+        """
+        network = protected(self._settings, self._identity)
+        if endpoint not in map(_datagrams_of, network.settings.places):
+            return False
+        if endpoint != self.endpoint or self.session is None:
+            self.close()
+            self.session, self.endpoint = open_session(network, connect=[endpoint]), endpoint
+            self._wait_until = time.monotonic() + LINK_S
+        while not self.linked and time.monotonic() < self._wait_until:
+            time.sleep(_POLL_S)
+        return self.linked
+
+    def close(self) -> None:
+        """Close the session, if there is one."""
+        if self.session is not None:
+            self.session.close()
+            self.session = None
+
+
+def _datagrams_of(place: str) -> str | None:
+    """The endpoint of datagrams beside a place: the same address and port, by UDP. None on loopback."""
+    protocol, _, address = place.partition("/")
+    if protocol not in _CARRIERS or not is_plain(f"tcp/{address}"):
+        return None
+    return f"{_CARRIERS[protocol]}/{address.partition('?')[0]}{_MIXED}"
