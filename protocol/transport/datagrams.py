@@ -21,8 +21,8 @@ from typing import Final
 
 import zenoh
 
-from aeroloop.protocol.transport.network import NetworkSettings, open_session, protected
-from aeroloop.protocol.transport.security import Identity, is_plain
+from aeroloop.protocol.transport.network import NetworkSettings, leaves_host, open_session, protected
+from aeroloop.protocol.transport.security import Identity
 
 LINK_S: Final = 1.0
 """How long a claim waits for the link to a plant [s]; at 20 % loss the handshake may lose a packet or two."""
@@ -39,7 +39,6 @@ class Datagrams:
     def __init__(self, settings: NetworkSettings, identity: Identity) -> None:
         self._settings = settings
         self._identity = identity
-        self._wanted = settings.transport == "mixed" and any(_datagrams_of(place) for place in settings.places)
         self._wait_until = 0.0
         self.session: zenoh.Session | None = None
         self.endpoint = ""
@@ -47,7 +46,7 @@ class Datagrams:
     @property
     def wanted(self) -> bool:
         """Whether frames are to travel by datagrams, so that a plant's endpoint is worth asking for."""
-        return self._wanted
+        return self._settings.mixed
 
     @property
     def linked(self) -> bool:
@@ -56,8 +55,10 @@ class Datagrams:
 
     def listen(self) -> None:
         """Listen at the first free one of this host's places, if datagrams are wanted; `endpoint` then names it."""
+        if not self.wanted:
+            return
         network = protected(self._settings, self._identity)
-        for endpoint in filter(None, map(_datagrams_of, network.settings.places)) if self._wanted else ():
+        for endpoint in filter(None, map(_datagrams_of, network.settings.places)):
             with suppress(zenoh.ZError):  # taken, or another host's
                 self.session = open_session(network, listen=[endpoint])
                 self.endpoint = endpoint
@@ -88,7 +89,7 @@ class Datagrams:
 
 def _datagrams_of(place: str) -> str | None:
     """The endpoint of datagrams beside a place: the same address and port, by UDP. None on loopback."""
-    protocol, _, address = place.partition("/")
-    if protocol not in _CARRIERS or not is_plain(f"tcp/{address}"):
+    if not leaves_host(place):
         return None
+    protocol, _, address = place.partition("/")
     return f"{_CARRIERS[protocol]}/{address.partition('?')[0]}{_MIXED}"

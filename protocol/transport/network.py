@@ -59,6 +59,8 @@ VISIT_S: Final = 0.5
 SETTLE_S: Final = 0.1
 """Declarations follow a new link within this time [s]; usual is a millisecond."""
 POLL_S: Final = 0.005
+PATIENT_LEASE_MS: Final = 10_000
+"""Least lease where frames have a transport of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
@@ -114,10 +116,15 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     )
     transport: Literal["mixed", "tcp"] = Field(
         default="mixed",
-        description="of frames beyond loopback, in real time; mixed: datagrams over UDP, by QUIC, at the same ports; "
-        "tcp: the links of all else",
+        description="of the loop's frames beyond loopback, in real time; mixed: datagrams by QUIC, over UDP at the "
+        "same ports, and what stays on TCP or TLS is compressed; tcp: the same links as everything else",
     )
-    lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is disconnected after this [ms]")
+    lease_ms: int = Field(
+        default=1000,
+        ge=100,
+        le=60_000,
+        description="a silent peer is disconnected after this, or 10 s if longer where `transport` is mixed [ms]",
+    )
     security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
     insecure: bool = Field(
         default=False,
@@ -136,6 +143,11 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     def places(self) -> list[str]:
         """Every endpoint at which a process may be met: the rendezvous, port by port."""
         return [place for first in self.rendezvous for place in _ports(first, self.ports)]
+
+    @property
+    def mixed(self) -> bool:
+        """Whether each kind of traffic has a transport of its own: beyond loopback, if so set."""
+        return self.transport == "mixed" and any(map(leaves_host, self.rendezvous))
 
     @property
     def endpoints(self) -> list[str]:
@@ -246,7 +258,16 @@ def visit(settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity
 
 def open_session(network: Protected, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
     """Open a session at these endpoints and no others. Raises zenoh.ZError."""
-    here = {"rendezvous": [*listen, *connect], "ports": 1, "listen": [], "connect": [], "gossip": False}
+    at = [*listen, *connect]
+    here: dict[str, Any] = {
+        "rendezvous": at,
+        "ports": 1,
+        "listen": [],
+        "connect": [],
+        "gossip": False,
+        "transport": "tcp",
+    }
+    here["lease_ms"] = max(network.settings.lease_ms, PATIENT_LEASE_MS)
     only = network._replace(settings=network.settings.model_copy(update=here))
     return _open(only, list(listen), list(connect))
 
@@ -293,6 +314,7 @@ def _open(
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
     settings, certificate = network
+    lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms
     tree: dict[str, Any] = {
         "mode": "peer",
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -319,8 +341,12 @@ def _open(
             "shared_memory": {"enabled": False},
             # Zenoh's default is 1 for most priorities: a sending thread that is blocked for 2 ms then drops frames.
             # Late frames do no harm: the receiver refuses them by their tick.
-            "link": {"tx": {"lease": settings.lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
-            "unicast": {"open_timeout": handshake_ms, "accept_timeout": HANDSHAKE_MS},
+            "link": {"tx": {"lease": lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
+            "unicast": {
+                "open_timeout": handshake_ms,
+                "accept_timeout": HANDSHAKE_MS,
+                "compression": {"enabled": settings.mixed},
+            },
         },
     }
     if certificate is not None:
@@ -354,6 +380,12 @@ def _ports(first: str, ports: int) -> list[str]:
     head, rest = f"{parts['protocol']}/{parts['host']}", parts["rest"] or ""
     start = int(parts["port"])
     return [f"{head}:{port}{rest}" for port in range(start, min(start + ports, 1 << 16))]
+
+
+def leaves_host(place: str) -> bool:
+    """Whether an endpoint is one of TCP or TLS beyond loopback."""
+    protocol, _, address = place.partition("/")
+    return protocol in ("tcp", "tls") and is_plain(f"tcp/{address}")
 
 
 def _family(parts: re.Match[str]) -> socket.AddressFamily:

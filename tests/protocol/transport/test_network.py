@@ -158,6 +158,26 @@ def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
         assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
 
 
+@pytest.mark.parametrize("rendezvous", [[], ["udp/127.0.0.1:1"]])
+def test_a_free_port_of_udp_is_chosen_here_since_zenoh_refuses_port_0(rendezvous: list[str]) -> None:
+    """Of a listen endpoint, and of a process that finds all of its rendezvous' ports taken."""
+    with Gathering() as gathering, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        rendezvous = [place.replace(":1", f":{taken.getsockname()[1]}") for place in rendezvous]
+        listen = [] if rendezvous else ["udp/127.0.0.1:0"]
+        gathering.join(NetworkSettings(rendezvous=rendezvous, ports=1, listen=listen))
+
+
+def test_a_listen_endpoint_of_udp_in_use_is_reported_with_one_of_udp() -> None:
+    with Gathering() as gathering, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        place = f"udp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(NetworkError) as caught:
+            gathering.join(NetworkSettings(rendezvous=[], listen=[place]))
+        assert f"cannot listen on {place}" in one_line(caught.value)
+        assert '--set network.listen=\'["udp/127.0.0.1:0"]\'' in str(caught.value)
+
+
 def test_an_address_that_cannot_be_reached_is_no_process_that_accepts() -> None:
     """Neither a name that is none, nor a closed port."""
     assert accepting(["tcp/no-such-host.invalid:7447", f"tcp/127.0.0.1:{free_port()}"]) == []
