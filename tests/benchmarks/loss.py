@@ -5,9 +5,9 @@ is on the controller's. A row is a run of one transport and one condition, which
 lasts for SECONDS. It shows the plant's trips, z_track, that as a multiple of the transport's first row, ticks of either
 end that the log lacks, the latency at the plant, and what crosses its cable with all headers.
 
-    python -m tests.benchmarks.loss [--seconds 60] [--transport tcp mixed] [--certificates] [--set KEY=VALUE] [CONDITION…]
+    … [--seconds 60] [--transport tcp mixed] [--certificates] [--set KEY=VALUE] [-- CONDITION…]
 
-A condition is words joined by commas: `loss=20` both ways, `from_plant=5`, `to_plant=1` (percent), `kbit=512` both ways.
+A condition is words joined by commas: `loss=20` (percent, both ways), `from_plant=5`, `to_plant=1`, `kbit=512` (both).
 """
 
 from __future__ import annotations

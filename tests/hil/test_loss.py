@@ -1,4 +1,4 @@
-"""Lost packets: frames between hosts are datagrams, so a lost one stalls no other; traces are recovered to the last row.
+"""Lost packets: between hosts frames are datagrams, so a lost one stalls no other; traces are recovered to the last.
 
 The hosts are network namespaces of this machine. A watchdog of 0.3 s instead of 0.1 s allows for a busy machine; with
 `network.transport=tcp` the loop stands for longer than that several times in these 6 s.
@@ -10,7 +10,6 @@ import json
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any, Final
 
 import pytest

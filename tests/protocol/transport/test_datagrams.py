@@ -29,8 +29,9 @@ def beyond(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(params=["plain", "certificates"])
-def pair(request: pytest.FixtureRequest, tmp_path: Path, beyond: None) -> Iterator[tuple[Datagrams, Datagrams]]:
+def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Datagrams, Datagrams]]:
     """A plant's, which listens, and a controller's, which is connected to it."""
+    request.getfixturevalue("beyond")
     settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
     if request.param == "certificates":
         authority = Authority(tmp_path / "keys")
@@ -69,9 +70,7 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[Datagrams,
             assert session is not None
             controller = ZenohLink(session, "t/s/command", "t/s/measurement", mailbox=(received := Mailbox()))
 
-            def there_and_back(
-                link: ZenohLink = controller, at: Mailbox = received, box: Mailbox = box
-            ) -> bool:
+            def there_and_back(link: ZenohLink = controller, at: Mailbox = received, box: Mailbox = box) -> bool:
                 link.send(b"command")
                 plant.send(b"measurement")
                 there, back = box.take(), at.take()
@@ -82,7 +81,8 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[Datagrams,
         plant.close()
 
 
-def test_each_plant_of_a_host_listens_at_a_port_of_its_own(beyond: None) -> None:
+@pytest.mark.usefixtures("beyond")
+def test_each_plant_of_a_host_listens_at_a_port_of_its_own() -> None:
     settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
     plants = [Datagrams(settings, PLANT), Datagrams(settings, PLANT)]
     for plant in plants:

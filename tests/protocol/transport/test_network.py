@@ -175,7 +175,7 @@ def test_a_listen_endpoint_of_udp_in_use_is_reported_with_one_of_udp() -> None:
         with pytest.raises(NetworkError) as caught:
             gathering.join(NetworkSettings(rendezvous=[], listen=[place]))
         assert f"cannot listen on {place}" in one_line(caught.value)
-        assert '--set network.listen=\'["udp/127.0.0.1:0"]\'' in str(caught.value)
+        assert "--set network.listen='[\"udp/127.0.0.1:0\"]'" in str(caught.value)
 
 
 def test_an_address_that_cannot_be_reached_is_no_process_that_accepts() -> None:
