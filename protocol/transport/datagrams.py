@@ -10,7 +10,7 @@ controller connects to it before it claims; without such a link its frames stay 
 
 Why not a second link of the first session: the first link of a peer carries Zenoh's declarations. If that is UDP, which
 has the shortest handshake, a lost packet costs a subscription for good. Why not all on one connection: QUIC's
-retransmissions of traces then hold up its datagrams (`tests/benchmarks/loss.py`).
+retransmissions of traces then hold up its datagrams.
 """
 
 from __future__ import annotations

@@ -92,7 +92,12 @@ def test_a_claims_frames_travel_by_datagrams_where_the_plant_takes_them(
         zenoh=first, vehicle="aero", name="c", datagrams=asked, warn=lambda *words: warned.append(words[-1])
     )
     used: list[object] = []
-    monkeypatch.setattr(claim, "ZenohLink", lambda session, **_: used.append(session) or SimpleNamespace())
+
+    def link(session: object, **_: object) -> object:
+        used.append(session)
+        return object()
+
+    monkeypatch.setattr(claim, "ZenohLink", link)
     claims = ClaimClient(cast(Role, role), LoopSettings(), WireSpec(), auto_arm=False, own_grid=False)
     assert (claims.claim() is not None) == (carrier != "none")
     assert used == {"datagrams": [datagrams], "first": [first], "none": []}[carrier]
