@@ -21,7 +21,7 @@ from typing import Final
 
 import zenoh
 
-from aeroloop.protocol.transport.network import NetworkSettings, leaves_host, open_session, protected
+from aeroloop.protocol.transport.network import NetworkSettings, is_free, leaves_host, open_session, protected
 from aeroloop.protocol.transport.security import Identity
 
 LINK_S: Final = 1.0
@@ -58,8 +58,8 @@ class Datagrams:
         if not self.wanted:
             return
         network = protected(self._settings, self._identity)
-        for endpoint in filter(None, map(_datagrams_of, network.settings.places)):
-            with suppress(zenoh.ZError):  # taken, or another host's
+        for endpoint in filter(is_free, filter(None, map(_datagrams_of, network.settings.places))):
+            with suppress(zenoh.ZError):  # taken in the meantime
                 self.session = open_session(network, listen=[endpoint])
                 self.endpoint = endpoint
                 return

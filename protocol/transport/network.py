@@ -229,7 +229,7 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
     places, further = network.settings.places, [_with_port(each) for each in network.settings.listen]
     for place in places if listen else []:
-        if _is_free(place):
+        if is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
     any_port = [_with_port(_at_port(places[0], 0))] if listen and places and _is_own(places[0]) else []
@@ -392,7 +392,7 @@ def _family(parts: re.Match[str]) -> socket.AddressFamily:
     return socket.AF_INET6 if parts["host"].startswith("[") else socket.AF_INET
 
 
-def _is_free(place: str) -> bool:
+def is_free(place: str) -> bool:
     """Whether this process could listen at an endpoint: it is an address of this host, and its port is free."""
     parts = _PLACE.fullmatch(place)
     if parts is None:
@@ -410,7 +410,7 @@ def _is_free(place: str) -> bool:
 
 def _is_own(place: str) -> bool:
     """Whether an endpoint's address is this host's."""
-    return _is_free(_at_port(place, 0))
+    return is_free(_at_port(place, 0))
 
 
 def _at_port(endpoint: str, port: int) -> str:
