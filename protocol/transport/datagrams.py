@@ -24,8 +24,9 @@ import zenoh
 from aeroloop.protocol.transport.network import NetworkSettings, is_free, leaves_host, open_session, protected
 from aeroloop.protocol.transport.security import Identity
 
-LINK_S: Final = 1.0
-"""How long a claim waits for the link to a plant [s]; at 20 % loss the handshake may lose a packet or two."""
+LINK_S: Final = 5.0
+"""How long claims are put off for the link to a plant [s]: at 20 % loss a handshake takes up to 4 s, usually 0.02 s."""
+_SOON_S: Final = 0.2
 _POLL_S: Final = 0.005
 _CARRIERS: Final = {"tcp": "udp", "tls": "quic"}
 """By the protocol of an endpoint, that of its datagrams: as plain, or as protected."""
@@ -39,7 +40,7 @@ class Datagrams:
     def __init__(self, settings: NetworkSettings, identity: Identity) -> None:
         self._settings = settings
         self._identity = identity
-        self._wait_until = 0.0
+        self._put_off_until = 0.0
         self.session: zenoh.Session | None = None
         self.endpoint = ""
 
@@ -64,8 +65,8 @@ class Datagrams:
                 self.endpoint = endpoint
                 return
 
-    def connect(self, endpoint: str) -> bool:
-        """Connect to a plant's endpoint, unless that has been done; whether there is a link within `LINK_S` of that.
+    def connect(self, endpoint: str) -> bool | None:
+        """Connect to a plant's endpoint; whether there is a link. None while that is not decided, for up to `LINK_S`.
 
         An endpoint that is not among the network's own places is refused: a status from elsewhere leads nowhere.
         """
@@ -75,10 +76,11 @@ class Datagrams:
         if endpoint != self.endpoint or self.session is None:
             self.close()
             self.session, self.endpoint = open_session(network, connect=[endpoint]), endpoint
-            self._wait_until = time.monotonic() + LINK_S
-        while not self.linked and time.monotonic() < self._wait_until:
+            self._put_off_until = time.monotonic() + LINK_S
+        soon = time.monotonic() + _SOON_S
+        while not self.linked and time.monotonic() < min(soon, self._put_off_until):
             time.sleep(_POLL_S)
-        return self.linked
+        return self.linked or (None if time.monotonic() < self._put_off_until else False)
 
     def close(self) -> None:
         """Close the session, if there is one."""

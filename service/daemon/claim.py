@@ -124,7 +124,7 @@ class ClaimClient:
         return Mailbox() if self._own_grid else None
 
     def _carrier(self) -> zenoh.Session | None:
-        """The session of the frames: that of datagrams once it has a link to the plant. None while no plant answers."""
+        """The session of the frames: of datagrams once it has a link to the plant. None while that is undecided."""
         role, datagrams = self._role, self._role.datagrams
         if self._loop.lockstep or not datagrams.wanted:
             return role.zenoh
@@ -136,8 +136,9 @@ class ClaimClient:
                     endpoint := Status.model_validate_json(reply.ok.payload.to_bytes()).datagrams
                 ):
                     return role.zenoh
-                if datagrams.connect(endpoint):
-                    return datagrams.session
+                linked = datagrams.connect(endpoint)
+                if linked is not False:
+                    return datagrams.session if linked else None
                 text = f"no datagrams pass to {endpoint}: frames go by TCP, where each lost packet delays them"
                 role.warn("datagrams", "fault", text)
                 return role.zenoh

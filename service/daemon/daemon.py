@@ -284,7 +284,8 @@ class Daemon:
         self._role.publish_bytes("trace", self._trace.take(time.monotonic_ns(), time.time_ns(), final=True))
         self._claims.release()
         link.close()
-        self._role.datagrams.close()  # the next claim connects anew: the plant may be another one
+        if self._claims.by_datagrams:
+            self._role.datagrams.close()  # the next claim connects anew: the plant may be another one
         self._status_due = 0
 
     def _token(self, name: str, appeared: bool) -> None:

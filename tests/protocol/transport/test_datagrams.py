@@ -41,7 +41,7 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Datag
         settings = settings.model_copy(update={"security": security, "loopback_secured": True})
     plant, controller = Datagrams(settings, PLANT), Datagrams(settings, CONTROLLER)
     plant.listen()
-    assert controller.connect(plant.endpoint)
+    eventually("a link", lambda: bool(controller.connect(plant.endpoint)))
     assert plant.endpoint.startswith("quic/" if request.param == "certificates" else "udp/")
     yield plant, controller
     controller.close()
@@ -108,5 +108,14 @@ def test_on_loopback_or_where_not_wanted_there_are_none(settings: NetworkSetting
 def test_an_endpoint_that_is_not_of_the_network_is_not_connected_to() -> None:
     controller = Datagrams(NetworkSettings(rendezvous=[FAR], insecure=True), CONTROLLER)
     assert controller.wanted
-    assert not controller.connect("udp/192.0.2.2:7447?rel=1;mixed_rel=1")
+    assert controller.connect("udp/192.0.2.2:7447?rel=1;mixed_rel=1") is False
     assert controller.session is None
+
+
+@pytest.mark.usefixtures("beyond")
+def test_a_link_that_does_not_come_about_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(datagrams, "LINK_S", 0.01)
+    settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
+    controller = Datagrams(settings, CONTROLLER)
+    eventually("giving up", lambda: controller.connect(f"udp/{settings.places[0][4:]}?rel=1;mixed_rel=1") is False)
+    controller.close()
