@@ -139,7 +139,8 @@ class ClaimClient:
                 linked = datagrams.connect(endpoint)
                 if linked is not False:
                     return datagrams.session if linked else None
-                text = f"no datagrams pass to {endpoint}: frames go by TCP, where each lost packet delays them"
+                place = endpoint.partition("?")[0]
+                text = f"no datagrams pass to {place}: frames go by TCP, where each lost packet delays them"
                 role.warn("datagrams", "fault", text)
                 return role.zenoh
         return None
