@@ -227,12 +227,12 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
     network = protected(settings, identity)
     if listen and settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
         log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
-    places, further = network.settings.places, [_with_port(each) for each in network.settings.listen]
+    places, further = network.settings.places, network.settings.listen
     for place in places if listen else []:
         if is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
-    any_port = [_with_port(_at_port(places[0], 0))] if listen and places and _is_own(places[0]) else []
+    any_port = [_at_port(places[0], 0)] if listen and places and _is_own(places[0]) else []
     try:
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
@@ -417,17 +417,6 @@ def _at_port(endpoint: str, port: int) -> str:
     """An endpoint with another port; itself where it has none."""
     parts = _PLACE.fullmatch(endpoint)
     return endpoint if parts is None else f"{parts['protocol']}/{parts['host']}:{port}{parts['rest'] or ''}"
-
-
-def _with_port(endpoint: str) -> str:
-    """An endpoint at which Zenoh can listen: it chooses a free port of TCP for 0, but refuses 0 with UDP."""
-    parts = _PLACE.fullmatch(endpoint)
-    if parts is None or parts["protocol"] not in DATAGRAMS or parts["port"] != "0":
-        return endpoint
-    with suppress(OSError), socket.socket(_family(parts), socket.SOCK_DGRAM) as probe:
-        probe.bind((parts["host"].strip("[]"), 0))
-        return _at_port(endpoint, probe.getsockname()[1])
-    return endpoint  # another host's: Zenoh says so
 
 
 def _reason(error: Exception) -> str:
