@@ -82,6 +82,8 @@ class ZenohFront(Front):
         role.serve("arm", Request, lambda _: self._arm)
         role.serve("stop", Request, lambda _: self._stop)
         role.watch_tokens(self._token)
+        if not self._loop.lockstep:
+            role.datagrams.listen()
         role.zenoh.declare_subscriber(
             topics.key("status", role.vehicle, role=role.role), self._other_plant, allowed_origin=zenoh.Locality.REMOTE
         )
@@ -184,6 +186,7 @@ class ZenohFront(Front):
             receive_key=topics.key("command", vehicle, session=claim.session),
             lossless=self._loop.lockstep,
             mailbox=None if self._loop.lockstep and self._changed is None else Mailbox(self._changed),
+            also=self._role.datagrams.session,
         )
         return answer
 
@@ -220,6 +223,7 @@ class ZenohFront(Front):
                 session=endpoint.session,
                 cause=endpoint.cause,
                 since=self._since,
+                datagrams=self._role.datagrams.endpoint,
                 uptime_s=self._role.uptime_s,
                 ticks=endpoint.ticked + 1,
                 rate_hz=max(0.0, (endpoint.ticked - self._status_tick) / (now - self._status_time)),

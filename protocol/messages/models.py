@@ -155,6 +155,7 @@ class Status(Message):
     )
     process: str = Field(default="", description="host and process id of the role")
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
+    datagrams: str = Field(default="", description="plant: where it takes frames as datagrams; empty for nowhere")
     certificate_until: AwareDatetime | None = Field(
         default=None, description="when the role's certificate expires, UTC; null where no link needs one"
     )

@@ -29,6 +29,7 @@ from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
+from aeroloop.protocol.transport.datagrams import Datagrams
 from aeroloop.protocol.transport.network import (
     VISIT_S,
     NetworkSettings,
@@ -106,7 +107,9 @@ class Role:
         if role == "plant":
             _refuse_second_plant(network, vehicle)
         name_process(role)
-        self.zenoh = join(network, Identity((role,), vehicle))
+        identity = Identity((role,), vehicle)
+        self.zenoh = join(network, identity)
+        self.datagrams = Datagrams(network, identity)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._status: tuple[float, Status] | None = None  # when it was taken
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
@@ -127,6 +130,7 @@ class Role:
         notify_systemd("STOPPING=1")
         if self._refusals is not None:
             self._refusals.close()
+        self.datagrams.close()
         self.zenoh.close()
 
     def _watch_refusals(self, network: NetworkSettings) -> RefusalWatch | None:

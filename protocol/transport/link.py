@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from threading import Lock, Thread
 from typing import Final, NamedTuple
@@ -191,6 +192,9 @@ class ZenohLink(Link):
     Without a `mailbox` the link has a Ring, for a loop that waits. A mailbox is filled by Zenoh's receiving thread, so
     its times are exact; but that thread then holds Python's lock, which delays a loop that it wakes. If `lossless`,
     `send` blocks when a peer does not keep up, instead of dropping: for lockstep, where each frame is waited for.
+
+    A plant's link may have a second session, `also`, and a mailbox: frames are received on both, and sent on each that
+    has a subscriber, which the controller has on one.
     """
 
     def __init__(
@@ -201,10 +205,15 @@ class ZenohLink(Link):
         *,
         lossless: bool = False,
         mailbox: Mailbox | None = None,
+        also: zenoh.Session | None = None,
     ) -> None:
+        sessions = [session] if also is None else [also, session]
+        self._declared: list[Callable[[], None]] = []
         if mailbox is None:
+            assert also is None, "a ring is in one session"
             ring = Ring(session, receive_key)
-            self._mailbox, self._stop_receiving = ring, ring.close
+            self._mailbox = ring
+            self._declared.append(ring.close)
         else:
             self._mailbox = mailbox
 
@@ -212,22 +221,28 @@ class ZenohLink(Link):
                 mailbox.put(sample.payload.to_bytes())
 
             direct = handlers.Callback(receive, indirect=False)  # not by a further thread of Python
-            self._stop_receiving = session.declare_subscriber(receive_key, direct).undeclare
-        self._publisher = session.declare_publisher(
-            send_key,
-            priority=zenoh.Priority.REAL_TIME,
-            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
-            express=True,
-        )
+            self._declared += [each.declare_subscriber(receive_key, direct).undeclare for each in sessions]
+        self._publishers = [
+            each.declare_publisher(
+                send_key,
+                priority=zenoh.Priority.REAL_TIME,
+                congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+                reliability=zenoh.Reliability.RELIABLE if lossless else zenoh.Reliability.BEST_EFFORT,
+                express=True,
+            )
+            for each in sessions
+        ]
+        self._declared += [publisher.undeclare for publisher in self._publishers]
         self._open = True
 
     def send(self, frame: bytes) -> None:
         """Send a frame."""
-        self._publisher.put(frame)
+        for publisher in self._publishers:
+            publisher.put(frame)
 
     def close(self) -> None:
         """Stop receiving."""
         if self._open:
             self._open = False
-            self._stop_receiving()
-            self._publisher.undeclare()
+            for undeclare in self._declared:
+                undeclare()

@@ -18,9 +18,9 @@ import socket
 import stat
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import zenoh
 from pydantic import AfterValidator, BaseModel, Field, field_validator
@@ -61,6 +61,8 @@ VISIT_S: Final = 0.5
 SETTLE_S: Final = 0.1
 """Declarations follow a new link within this time [s]; usual is a millisecond."""
 POLL_S: Final = 0.005
+PATIENT_LEASE_MS: Final = 10_000
+"""Least lease where frames have a transport of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
@@ -74,6 +76,8 @@ os.environ.setdefault(
     "app: (worker_threads: 4))",
 )
 
+DATAGRAMS: Final = ("udp", "quic")
+"""Protocols over UDP."""
 _PLACE = re.compile(r"(?P<protocol>[a-z]+)/(?P<host>[^/]+):(?P<port>\d+)(?P<rest>[?#].*)?")
 
 
@@ -112,7 +116,17 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     gossip: bool = Field(
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )
-    lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is disconnected after this [ms]")
+    transport: Literal["mixed", "tcp"] = Field(
+        default="mixed",
+        description="of the loop's frames beyond loopback, in real time; mixed: datagrams by QUIC, over UDP at the "
+        "same ports, and what stays on TCP or TLS is compressed; tcp: the same links as everything else",
+    )
+    lease_ms: int = Field(
+        default=1000,
+        ge=100,
+        le=60_000,
+        description="a silent peer is disconnected after this, or 10 s if longer where `transport` is mixed [ms]",
+    )
     security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
     insecure: bool = Field(
         default=False,
@@ -131,6 +145,11 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     def places(self) -> list[str]:
         """Every endpoint at which a process may be met: the rendezvous, port by port."""
         return [place for first in self.rendezvous for place in _ports(first, self.ports)]
+
+    @property
+    def mixed(self) -> bool:
+        """Whether each kind of traffic has a transport of its own: beyond loopback, if so set."""
+        return self.transport == "mixed" and any(map(leaves_host, self.rendezvous))
 
     @property
     def endpoints(self) -> list[str]:
@@ -226,16 +245,16 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
     places, further = network.settings.places, network.settings.listen
     for place in places if listen else []:
-        if _is_free(place):
+        if is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
-    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and is_own(places[0]) else []
+    any_port = [_at_port(places[0], 0)] if listen and places and is_own(places[0]) else []
     try:
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(further)}: {_reason(error)}; "
-            "give a free one with --set network.listen='[\"tcp/127.0.0.1:0\"]'"
+            f"cannot listen on {', '.join(further)}: {_reason(error)}; give free ones with --set network.listen="
+            f"'{json.dumps([_at_port(each, 0) for each in settings.listen])}'"
         ) from None
 
 
@@ -251,6 +270,22 @@ def visit(settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity
     session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
     with closing(session):
         yield Visit(session, [*network.settings.connect, *places], network.certificate)
+
+
+def open_session(network: Protected, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
+    """Open a session at these endpoints and no others. Raises zenoh.ZError."""
+    at = [*listen, *connect]
+    here: dict[str, Any] = {
+        "rendezvous": at,
+        "ports": 1,
+        "listen": [],
+        "connect": [],
+        "gossip": False,
+        "transport": "tcp",
+    }
+    here["lease_ms"] = max(network.settings.lease_ms, PATIENT_LEASE_MS)
+    only = network._replace(settings=network.settings.model_copy(update=here))
+    return _open(only, list(listen), list(connect))
 
 
 def unlinked(session: zenoh.Session, places: list[str]) -> list[str]:
@@ -295,6 +330,7 @@ def _open(
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
     settings, certificate, vehicles = network
+    lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms
     tree: dict[str, Any] = {
         "mode": "peer",
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -321,8 +357,12 @@ def _open(
             "shared_memory": {"enabled": False},
             # Zenoh's default is 1 for most priorities: a sending thread that is blocked for 2 ms then drops frames.
             # Late frames do no harm: the receiver refuses them by their tick.
-            "link": {"tx": {"lease": settings.lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
-            "unicast": {"open_timeout": handshake_ms, "accept_timeout": HANDSHAKE_MS},
+            "link": {"tx": {"lease": lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
+            "unicast": {
+                "open_timeout": handshake_ms,
+                "accept_timeout": HANDSHAKE_MS,
+                "compression": {"enabled": settings.mixed},
+            },
         },
     }
     if certificate is not None:
@@ -359,24 +399,41 @@ def _ports(first: str, ports: int) -> list[str]:
     return [f"{head}:{port}{rest}" for port in range(start, min(start + ports, 1 << 16))]
 
 
+def leaves_host(place: str) -> bool:
+    """Whether an endpoint is one of TCP or TLS beyond loopback."""
+    protocol, _, address = place.partition("/")
+    return protocol in ("tcp", "tls") and is_plain(f"tcp/{address}")
+
+
 def _family(parts: re.Match[str]) -> socket.AddressFamily:
     return socket.AF_INET6 if parts["host"].startswith("[") else socket.AF_INET
 
 
-def _is_free(place: str) -> bool:
+def is_free(place: str) -> bool:
     """Whether this process could listen at an endpoint: it is an address of this host, and its port is free."""
     parts = _PLACE.fullmatch(place)
-    if parts is None or parts["protocol"] in ("udp", "quic"):
+    if parts is None:
         return True  # only Zenoh can find out
-    address = parts["host"].strip("[]"), int(parts["port"])
-    with suppress(OSError), socket.create_server(address, family=_family(parts)):
+    address, family = (parts["host"].strip("[]"), int(parts["port"])), _family(parts)
+    with suppress(OSError):
+        if parts["protocol"] in DATAGRAMS:
+            with socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.bind(address)
+        else:
+            socket.create_server(address, family=family).close()
         return True
     return False
 
 
 def is_own(place: str) -> bool:
     """Whether an endpoint's address is this host's."""
-    return _is_free(re.sub(r":\d+$", ":0", place))
+    return is_free(_at_port(place, 0))
+
+
+def _at_port(endpoint: str, port: int) -> str:
+    """An endpoint with another port; itself where it has none."""
+    parts = _PLACE.fullmatch(endpoint)
+    return endpoint if parts is None else f"{parts['protocol']}/{parts['host']}:{port}{parts['rest'] or ''}"
 
 
 def _reason(error: Exception) -> str:

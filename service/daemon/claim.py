@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.role import Role
@@ -35,6 +35,7 @@ class ClaimClient:
         auto_arm: As given; may change.
         session: The granted session, or None.
         last: Record of the vehicle's last session, from the last grant; None if the plant has none.
+        by_datagrams: Whether the last claim's frames travel as datagrams.
     """
 
     def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool, own_grid: bool) -> None:
@@ -46,6 +47,7 @@ class ClaimClient:
         self._refusal = ""
         self.session: str | None = None
         self.last: SessionRecord | None = None
+        self.by_datagrams = False
         self._kept: SessionRecord | None = None  # the last record that the plant has confirmed
 
     def claim(self) -> ZenohLink | None:
@@ -59,8 +61,12 @@ class ClaimClient:
             auto_arm=self.auto_arm,
             wire=self._wire,
         )
+        carrier = self._carrier()
+        if carrier is None:
+            return None
+        self.by_datagrams = carrier is not role.zenoh
         link = ZenohLink(
-            role.zenoh,
+            carrier,
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lossless=self._loop.lockstep,
@@ -116,6 +122,28 @@ class ClaimClient:
         if self._wire.transmit.measurement == "on_change":
             return Mailbox(depth=MAILBOX)
         return Mailbox() if self._own_grid else None
+
+    def _carrier(self) -> zenoh.Session | None:
+        """The session of the frames: of datagrams once it has a link to the plant. None while that is undecided."""
+        role, datagrams = self._role, self._role.datagrams
+        if self._loop.lockstep or not datagrams.wanted:
+            return role.zenoh
+        if datagrams.linked:
+            return datagrams.session
+        for reply in role.zenoh.get(topics.key("status", role.vehicle, role="plant"), timeout=ANSWER_WAIT_S):
+            with suppress(ValidationError):
+                if reply.ok is None or not (
+                    endpoint := Status.model_validate_json(reply.ok.payload.to_bytes()).datagrams
+                ):
+                    return role.zenoh
+                linked = datagrams.connect(endpoint)
+                if linked is not False:
+                    return datagrams.session if linked else None
+                place = endpoint.partition("?")[0]
+                text = f"no datagrams pass to {place}: frames go by TCP, where each lost packet delays them"
+                role.warn("datagrams", "fault", text)
+                return role.zenoh
+        return None
 
     def _query(self, claim: Claim) -> Grant | Refusal | None:
         """The plant's answer; None if no plant answers in time."""

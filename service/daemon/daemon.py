@@ -227,7 +227,8 @@ class Daemon:
         elif before is not State.RUNNING:
             self._machine.fire(Trigger.ANSWERED)
             if before is State.CLAIMED:
-                role.event("claimed", f"{role.name} has {role.vehicle}", session, tick)
+                by = ", its frames by datagrams" if self._claims.by_datagrams else ""
+                role.event("claimed", f"{role.name} has {role.vehicle}{by}", session, tick)
         if self._machine.state is not before:
             self._status_due = 0
 
@@ -283,6 +284,8 @@ class Daemon:
         self._role.publish_bytes("trace", self._trace.take(time.monotonic_ns(), time.time_ns(), final=True))
         self._claims.release()
         link.close()
+        if self._claims.by_datagrams:
+            self._role.datagrams.close()  # the next claim connects anew: the plant may be another one
         self._status_due = 0
 
     def _token(self, name: str, appeared: bool) -> None:

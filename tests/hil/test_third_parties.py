@@ -20,7 +20,13 @@ import pytest
 from tests.support.namespaces import Hosts, NoNamespacesError
 from tests.support.zenoh_network import eventually
 
-PATIENT = ("plant.watchdog_s=0.5", "controller.stale_s=0.5", "wire.counter_bits=10", "loop.realtime=off")
+PATIENT = (
+    "plant.watchdog_s=0.5",
+    "controller.stale_s=0.5",
+    "wire.counter_bits=10",
+    "loop.realtime=off",
+    "network.transport=tcp",  # the harder case: frames share links and a lease of 1 s with all else
+)
 AWAY_S = 2.0
 """Twice the lease, so that the ends close the link [s]."""
 

@@ -112,6 +112,21 @@ class Hosts:
         """Limit what a host receives."""
         self._tc("replace", host, "tbf", "rate", f"{kbit_per_s}kbit", "burst", "4kb", "latency", "400ms")
 
+    def lose(self, host: str, percent: float) -> None:
+        """Lose a share of what a host receives, at random; 0 for none any more."""
+        rules = "add table inet loss; delete table inet loss;"
+        if percent:
+            chain = "type filter hook prerouting priority -300;"
+            drop = f'iifname "cable" numgen random mod 1000 < {round(10 * percent)} drop'
+            rules += f"table inet loss {{ chain received {{ {chain} {drop}; }}; }}"
+        _ip("netns", "exec", self._prefix + host, "nft", rules)
+
+    def crossed(self, host: str) -> tuple[int, int]:
+        """Bytes that a host has sent and received so far, with all headers."""
+        show = ["ip", "-n", self._switch, "-s", "-j", "link", "show", host]
+        found = json.loads(subprocess.run(show, check=True, capture_output=True, text=True).stdout)[0]["stats64"]
+        return found["rx"]["bytes"], found["tx"]["bytes"]
+
     def _tc(self, verb: str, host: str, *words: str) -> None:
         _ip("netns", "exec", self._switch, "tc", "qdisc", verb, "dev", host, "root", *words)
 

@@ -158,6 +158,22 @@ def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
         assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
 
 
+def test_a_process_of_another_host_than_the_rendezvous_joins_by_udp_too() -> None:
+    """It cannot listen there, at any port, and was once refused for it, with an address of TCP to try."""
+    with Gathering() as gathering:
+        gathering.join(NetworkSettings(rendezvous=["udp/192.0.2.1:7447"], ports=1, insecure=True))
+
+
+def test_a_listen_endpoint_of_udp_in_use_is_reported_with_one_of_udp() -> None:
+    with Gathering() as gathering, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        place = f"udp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(NetworkError) as caught:
+            gathering.join(NetworkSettings(rendezvous=[], listen=[place]))
+        assert f"cannot listen on {place}" in one_line(caught.value)
+        assert "--set network.listen='[\"udp/127.0.0.1:0\"]'" in str(caught.value)
+
+
 def test_an_address_that_cannot_be_reached_is_no_process_that_accepts() -> None:
     """Neither a name that is none, nor a closed port."""
     assert accepting(["tcp/no-such-host.invalid:7447", f"tcp/127.0.0.1:{free_port()}"]) == []

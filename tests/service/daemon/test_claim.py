@@ -1,4 +1,4 @@
-"""Claim protocol, controller side: the plant gets every record of the session, also where an answer is lost."""
+"""Claim protocol, controller side: every record reaches the plant, and frames travel by what the plant takes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import SessionRecord
-from aeroloop.protocol.messages.operator import Gains, Hold
+from aeroloop.protocol.messages.models import Grant, SessionRecord, Status
+from aeroloop.protocol.messages.operator import Gains, Hold, Message
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.daemon import claim
 from aeroloop.service.daemon.claim import ClaimClient
 
 
@@ -54,3 +57,55 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
     assert len(queries.sent) == 3
     claims.keep(second)
     assert queries.sent[3:] == [(topics.key("record", "aero"), second)]
+
+
+class Plant:
+    """A Zenoh session on which a plant answers, or none."""
+
+    def __init__(self, status: Status | None) -> None:
+        self._answers: dict[str, Message] = {} if status is None else {"status": status, "claim": Grant(session="s")}
+
+    def get(self, key: str, **_: object) -> list[SimpleNamespace]:
+        """What the plant answers."""
+        answers = [answer for topic, answer in self._answers.items() if f"/{topic}" in key]
+        return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer.encode()))) for answer in answers]
+
+
+def _bytes(payload: bytes) -> SimpleNamespace:
+    return SimpleNamespace(to_bytes=lambda: payload)  # as Zenoh hands them over
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "passes", "carrier"),
+    [
+        ("udp/h:1", True, "datagrams"),
+        ("udp/h:1", False, "first"),
+        ("udp/h:1", None, "none"),
+        ("", True, "first"),
+        (None, True, "none"),
+    ],
+    ids=["the plant takes datagrams", "none pass", "not linked yet", "it takes none", "no plant answers"],
+)
+def test_a_claims_frames_travel_by_datagrams_where_the_plant_takes_them(
+    monkeypatch: pytest.MonkeyPatch, endpoint: str | None, passes: bool | None, carrier: str
+) -> None:
+    status = None if endpoint is None else Status(
+        role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0, datagrams=endpoint
+    )  # fmt: skip
+    first, datagrams, warned = Plant(status), SimpleNamespace(name="datagrams"), []
+    asked = SimpleNamespace(wanted=True, linked=False, connect=lambda _: passes, session=datagrams)
+    role = SimpleNamespace(
+        zenoh=first, vehicle="aero", name="c", datagrams=asked, warn=lambda *words: warned.append(words[-1])
+    )
+    used: list[object] = []
+
+    def link(session: object, **_: object) -> object:
+        used.append(session)
+        return object()
+
+    monkeypatch.setattr(claim, "ZenohLink", link)
+    claims = ClaimClient(cast(Role, role), LoopSettings(), WireSpec(), auto_arm=False, own_grid=False)
+    assert (claims.claim() is not None) == (carrier != "none")
+    assert used == {"datagrams": [datagrams], "first": [first], "none": []}[carrier]
+    assert claims.by_datagrams == (carrier == "datagrams")
+    assert bool(warned) == (passes is False)

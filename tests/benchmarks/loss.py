@@ -1,0 +1,112 @@
+"""What a network that loses packets or is narrow does to the loop: `uv run python -m tests.benchmarks.loss`, as root.
+
+Plant and controller are on hosts of their own (network namespaces), at 500 Hz with the default settings; the recorder
+is on the controller's. A row is a run of one transport and one condition, which begins once the plant is driven and
+lasts for SECONDS. It shows the plant's trips, z_track, that as a multiple of the transport's first row, ticks of either
+end that the log lacks, the latency at the plant, and what crosses its cable with all headers.
+
+    … [--seconds 60] [--transport tcp mixed] [--certificates] [--set KEY=VALUE] [-- CONDITION…]
+
+A condition is words joined by commas: `loss=20` (percent, both ways), `from_plant=5`, `to_plant=1`, `kbit=512` (both).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from tests.support.certificates import Authority
+from tests.support.namespaces import Hosts
+from tests.support.zenoh_network import eventually
+
+LOSSES: Final = ["loss=0", "loss=1", "loss=5", "loss=20", "from_plant=20", "to_plant=20"]
+NARROW: Final = ["kbit=1000", "kbit=512", "kbit=256"]
+COLUMNS: Final = "transport, condition, trips, z_track, ×, ticks missing, latency p50/p99/max ms, kbit/s from/to plant"
+SETTLE_S: Final = 2.0
+RECOVERY_S: Final = 10.0
+"""Time to recover what was lost, afterwards [s]: a publisher repeats its last number every 2 s."""
+
+
+def main() -> None:
+    """Run all conditions with each transport, and print a row for each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--transport", nargs="+", default=["tcp", "mixed"])
+    parser.add_argument("--certificates", action="store_true", help="mutual TLS, and QUIC with it")
+    parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("conditions", nargs="*", default=[*LOSSES, *NARROW])
+    given = parser.parse_args()
+    names = COLUMNS.split(", ")
+    print("| " + " | ".join(names) + " |\n|" + len(names) * "---|")
+    for transport in given.transport:
+        first = 0.0
+        for condition in given.conditions:
+            overrides = [f"network.transport={transport}", "controller.after_restart=configured", *given.overrides]
+            found, kbit = run(overrides, condition, given.seconds, certificates=given.certificates)
+            error, latency = found["z_track"] or 0.0, found["latency_us"] or {}
+            first = first or error
+            row = [
+                transport + (", certificates" if given.certificates else ""),
+                condition,
+                len(found["trips"]),
+                f"{error:.2e}",
+                f"{error / first:.2f}" if first else "–",
+                sum(found["missing_ticks"].values()),
+                "/".join(f"{1e-3 * latency.get(which, 0):.1f}" for which in ("p50", "p99", "max")),
+                "/".join(f"{rate:.0f}" for rate in kbit),
+            ]
+            print("| " + " | ".join(map(str, row)) + " |", flush=True)
+
+
+def run(
+    overrides: list[str], condition: str, seconds: float, *, certificates: bool = False
+) -> tuple[dict[str, Any], list[float]]:
+    """Make one run. Returns the review of its longest session, and the rates from and to the plant [kbit/s]."""
+    words = {name: float(value) for name, _, value in (word.partition("=") for word in condition.split(","))}
+    both = words.get("loss", 0.0)
+    with tempfile.TemporaryDirectory() as name, Hosts(["plant", "controller"], Path(name)) as hosts:
+        if certificates:
+            overrides = [*overrides, f'network.security.directory="{issue(Path(name) / "keys")}"']
+        log = Path(name) / "log.mcap"
+        processes = [
+            hosts.aeroloop("controller", "controller", "--auto-arm", overrides=overrides),
+            hosts.aeroloop("plant", "emulator", overrides=overrides),
+            hosts.aeroloop("controller", "recorder", "--log", str(log), overrides=overrides),
+        ]
+        eventually("driving", lambda: "has aero" in hosts.log("controller").read_text())
+        time.sleep(SETTLE_S)
+        for host, loss in (("plant", words.get("to_plant", both)), ("controller", words.get("from_plant", both))):
+            hosts.lose(host, loss)
+            if "kbit" in words:
+                hosts.narrow(host, round(words["kbit"]))
+        before = hosts.crossed("plant")
+        time.sleep(seconds)
+        after = hosts.crossed("plant")
+        for host in ("plant", "controller"):
+            hosts.lose(host, 0)
+            hosts.plug(host)
+        time.sleep(RECOVERY_S)
+        for process in processes:
+            process.terminate()
+            process.wait()
+        command = [sys.executable, "-m", "aeroloop", "log", "review", str(log), "--json"]
+        review: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
+        return review, [8e-3 * (late - early) / seconds for early, late in zip(before, after, strict=True)]
+
+
+def issue(folder: Path) -> Path:
+    """Make a directory of certificates for all roles."""
+    authority = Authority(folder)
+    for role in ("plant", "controller", "recorder"):
+        authority.issue(role, "aero")
+    return folder
+
+
+if __name__ == "__main__":
+    main()
