@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.transport import datagrams, network
 from aeroloop.protocol.transport.datagrams import Datagrams
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
@@ -18,6 +19,7 @@ from tests.support.certificates import Authority
 from tests.support.zenoh_network import Gathering, eventually
 
 PLANT, CONTROLLER = Identity(("plant",), "aero"), Identity(("controller",), "aero")
+MEASUREMENT, COMMAND = (key(name, "aero", session="s") for name in ("measurement", "command"))
 FAR = "tcp/192.0.2.1:7447"
 
 
@@ -65,10 +67,10 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[Datagrams,
     with Gathering() as gathering:
         main, other = gathering.join(), gathering.join()
         box = Mailbox()
-        plant = ZenohLink(main, "t/s/measurement", "t/s/command", mailbox=box, also=pair[0].session)
+        plant = ZenohLink(main, MEASUREMENT, COMMAND, mailbox=box, also=pair[0].session)
         for session in (other, pair[1].session):
             assert session is not None
-            controller = ZenohLink(session, "t/s/command", "t/s/measurement", mailbox=(received := Mailbox()))
+            controller = ZenohLink(session, COMMAND, MEASUREMENT, mailbox=(received := Mailbox()))
 
             def there_and_back(link: ZenohLink = controller, at: Mailbox = received, box: Mailbox = box) -> bool:
                 link.send(b"command")
