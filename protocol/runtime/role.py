@@ -30,6 +30,7 @@ from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.network import VISIT_S, NetworkSettings, join, visit
 from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
+from aeroloop.protocol.transport.router import route
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wording import problems
@@ -57,7 +58,7 @@ class OccupiedError(AeroloopError):
 
 
 def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
-    with visit(network) as here:
+    with visit(network, patient=True) as here:
         here.settle()
         if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=VISIT_S)):
             return
@@ -75,7 +76,7 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
 class Role:
     """A process's presence on the network.
 
-    `role` is `plant`, `controller` or `recorder`, `vehicle` the vehicle in the keys of its topics, `config` its
+    `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config` its
     effective configuration, for the description. `name` is its liveliness token's; the role's if None.
 
     Raises:
@@ -93,7 +94,7 @@ class Role:
         if role == "plant":
             _refuse_second_plant(network, vehicle)
         name_process(role)
-        self.zenoh = join(network)
+        self.zenoh = route(network) if role == "router" else join(network)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._status: tuple[float, Status] | None = None  # when it was taken
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time

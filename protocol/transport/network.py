@@ -1,8 +1,10 @@
-"""Network: opens this process's Zenoh session, peer to peer, without a router or multicast.
+"""Network: opens this process's Zenoh session, peer to peer or at a router, without multicast.
 
-Every process listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects
+Peer to peer, every process listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects
 to all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
 end or halt of any of them does not matter. Peers also learn each other's addresses by gossip and link directly.
+
+A client links to a router alone (`router.py`), does not listen, and waits until there is one.
 
 An operator's command does not listen: it visits, and finds which processes accept a connection but do not answer.
 """
@@ -10,6 +12,7 @@ An operator's command does not listen: it visits, and finds which processes acce
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import select
@@ -19,13 +22,17 @@ import struct
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import zenoh
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+
+log: Final = logging.getLogger("aeroloop")
+
+Mode = Literal["peer", "client", "router"]
 
 QUEUE: Final = 16
 """Batches that may wait to be sent on a link, per priority; the most that Zenoh allows."""
@@ -46,6 +53,8 @@ VISIT_S: Final = 0.5
 SETTLE_S: Final = 0.1
 """Declarations follow a new link within this time [s]; usual is a millisecond."""
 POLL_S: Final = 0.005
+ROUTER_AGAIN_S: Final = 0.2
+"""Pause before a client that finds no router looks again [s]."""
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
@@ -78,6 +87,11 @@ Endpoint = Annotated[str, AfterValidator(_endpoint)]
 class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """Zenoh endpoints of this process and its peers."""
 
+    mode: Literal["peer", "client"] = Field(
+        default="peer",
+        description="peer: processes link to one another; client: each links to a router at the rendezvous and to "
+        "nothing else, as `aeroloop router` is one",
+    )
     rendezvous: list[Endpoint] = Field(
         default=["tcp/127.0.0.1:7447"],
         description="Zenoh endpoints where processes meet, one for each host; a process listens at its own host's and "
@@ -106,7 +120,9 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
 
     @property
     def places(self) -> list[str]:
-        """Every endpoint at which a process may be met: the rendezvous, port by port."""
+        """Every endpoint at which a process may be met: the rendezvous, port by port; by a client, the routers."""
+        if self.mode == "client":
+            return self.rendezvous
         return [place for first in self.rendezvous for place in _ports(first, self.ports)]
 
 
@@ -143,34 +159,69 @@ def join(settings: NetworkSettings, *, listen: bool = True) -> zenoh.Session:
         listen: Whether others can connect to this process: yes for a role, no for a command that only queries.
 
     Raises:
-        NetworkError: A `listen` endpoint cannot be opened.
+        NetworkError: A `listen` endpoint cannot be opened, or a client's settings name no router.
     """
+    if settings.mode == "client":
+        return _join_router(settings)
     places = settings.places
     for place in places if listen else []:
         if _is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(settings, [place, *settings.listen], [other for other in places if other != place])
-    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and _is_own(places[0]) else []
+    any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and is_own(places[0]) else []
     try:
         return _open(settings, [*settings.listen, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(settings.listen)}: {_reason(error)}; "
+            f"cannot listen on {', '.join(settings.listen)}: {reason(error)}; "
             "give a free one with --set network.listen='[\"tcp/127.0.0.1:0\"]'"
         ) from None
 
 
+def _join_router(settings: NetworkSettings) -> zenoh.Session:
+    """Link to a router, as soon as one answers; Zenoh links again whenever the link is lost."""
+    patient = True
+    while True:
+        try:
+            return _open(settings, [], settings.places)
+        except zenoh.ZError:
+            if not [*settings.connect, *settings.places]:
+                raise NetworkError('network.mode = "client" needs a router in network.rendezvous') from None
+        if patient:
+            log.warning("%s; waiting for one", no_router(settings))
+        patient = False
+        time.sleep(ROUTER_AGAIN_S)
+
+
+def no_router(settings: NetworkSettings) -> str:
+    """One line about routers that do not answer."""
+    places = [*settings.connect, *settings.places]
+    hung = accepting(places)
+    if hung:
+        return f"a process at {', '.join(hung)} accepts connections and does not answer as a router"
+    return f"no router answers at {', '.join(places)}; is `aeroloop router` running?"
+
+
 @contextmanager
-def visit(settings: NetworkSettings, wait_s: float = VISIT_S) -> Iterator[Visit]:
-    """Open a session for a few queries that take at most `wait_s`.
+def visit(settings: NetworkSettings, wait_s: float = VISIT_S, *, patient: bool = False) -> Iterator[Visit]:
+    """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
+
+    Raises:
+        NetworkError: It is a client's, and no router answers.
     """
     wait_ms = round(wait_s * 1000)
     places = settings.places
-    session = _open(settings, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
-    with closing(session):
-        yield Visit(session, [*settings.connect, *places])
+    try:
+        if patient and settings.mode == "client":
+            session = _join_router(settings)
+        else:
+            session = _open(settings, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
+    except zenoh.ZError:
+        raise NetworkError(no_router(settings)) from None
+    with closing(session):  # a client is linked from the start
+        yield Visit(session, [*settings.connect, *places] if settings.mode == "peer" else [])
 
 
 def accepting(places: list[str]) -> list[str]:
@@ -208,8 +259,20 @@ def _open(
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
-    tree: dict[str, Any] = {
-        "mode": "peer",
+    return open_tree(session_tree(settings, settings.mode, listen, places, handshake_ms, retry_ms))
+
+
+def session_tree(
+    settings: NetworkSettings,
+    mode: Mode,
+    listen: list[str],
+    places: list[str],
+    handshake_ms: int = HANDSHAKE_MS,
+    retry_ms: tuple[int, int] = _RETRY_MS,
+) -> dict[str, Any]:
+    """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
+    return {
+        "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
         "connect": {
             "endpoints": [*settings.connect, *places],
@@ -238,6 +301,10 @@ def _open(
             "unicast": {"open_timeout": handshake_ms, "accept_timeout": HANDSHAKE_MS},
         },
     }
+
+
+def open_tree(tree: dict[str, Any]) -> zenoh.Session:
+    """Open a session with a configuration of Zenoh. Raises zenoh.ZError."""
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
     session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
     return session
@@ -282,11 +349,11 @@ def _is_free(place: str) -> bool:
     return False
 
 
-def _is_own(place: str) -> bool:
+def is_own(place: str) -> bool:
     """Whether an endpoint's address is this host's."""
     return _is_free(re.sub(r":\d+$", ":0", place))
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """Zenoh's message without the source locations it carries."""
     return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")

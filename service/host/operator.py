@@ -150,7 +150,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
             time.sleep(POLL_S)
         unanswered = [(place, listener(place)) for place in here.silent()]
     failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
-    others = ("controller", "recorder")
+    others = ("controller", "recorder", "router")
     failures += [_unanswered(place) for place, process in unanswered if process is None or process.role not in others]
     if not answers and not failures:
         failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
