@@ -1,0 +1,54 @@
+"""Router: a session to which clients link, and which passes on what they publish and query.
+
+It listens at those endpoints of `network.rendezvous` that are this host's and connects to the others, which are further
+routers. A stock `zenohd` does the same with the printed configuration.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib.metadata import version
+from typing import Any
+
+import zenoh
+
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, is_own, open_tree, reason, session_tree
+
+
+def route(settings: NetworkSettings) -> zenoh.Session:
+    """Open a router's session. The caller closes it.
+
+    Raises:
+        NetworkError: It cannot listen.
+    """
+    tree = router_tree(settings)
+    try:
+        return open_tree(tree)
+    except zenoh.ZError as error:
+        places = ", ".join(tree["listen"]["endpoints"]) or "nothing"
+        raise NetworkError(
+            f"cannot listen on {places}: {reason(error)}; "
+            "name a free endpoint of this host in network.rendezvous or network.listen"
+        ) from None
+
+
+def router_tree(settings: NetworkSettings) -> dict[str, Any]:
+    """Zenoh's configuration of a router."""
+    here = [place for place in settings.rendezvous if is_own(place)] or settings.rendezvous
+    others = [place for place in settings.rendezvous if place not in here]
+    return {
+        **session_tree(settings, "router", [*here, *settings.listen], others),
+        # A router stamps messages by default: 26 bytes that nothing reads.
+        "timestamping": {"enabled": False},
+        "adminspace": {"enabled": False, "permissions": {"read": False, "write": False}},
+    }
+
+
+def zenohd_config(settings: NetworkSettings) -> str:
+    """The configuration as JSON5, for a stock `zenohd` of the same version."""
+    return (
+        f"// Router of aeroloop, for zenohd {version('eclipse-zenoh')}:\n"
+        f"// ZENOH_RUNTIME='{os.environ['ZENOH_RUNTIME']}' zenohd --config FILE\n"
+        f"{json.dumps(router_tree(settings), indent=2)}\n"
+    )
