@@ -188,7 +188,7 @@ def _join_router(settings: NetworkSettings) -> zenoh.Session:
             if not [*settings.connect, *settings.places]:
                 raise NetworkError('network.mode = "client" needs a router in network.rendezvous') from None
         if patient:
-            log.warning("%s; waiting for one", no_router(settings))
+            log.warning("waiting for a router: %s", no_router(settings))
         patient = False
         time.sleep(ROUTER_AGAIN_S)
 

@@ -37,8 +37,10 @@ def router_tree(settings: NetworkSettings) -> dict[str, Any]:
     """Zenoh's configuration of a router."""
     here = [place for place in settings.rendezvous if is_own(place)] or settings.rendezvous
     others = [place for place in settings.rendezvous if place not in here]
+    tree = session_tree(settings, "router", [*here, *settings.listen], others)
     return {
-        **session_tree(settings, "router", [*here, *settings.listen], others),
+        **tree,
+        "scouting": {**tree["scouting"], "delay": 0},  # otherwise it takes 0.5 s to open, whatever is linked
         # A router stamps messages by default: 26 bytes that nothing reads.
         "timestamping": {"enabled": False},
         "adminspace": {"enabled": False, "permissions": {"read": False, "write": False}},
