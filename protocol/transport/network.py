@@ -22,6 +22,7 @@ import struct
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from math import inf
 from typing import Annotated, Any, Final, Literal
 
 import zenoh
@@ -55,6 +56,8 @@ SETTLE_S: Final = 0.1
 POLL_S: Final = 0.005
 ROUTER_AGAIN_S: Final = 0.2
 """Pause before a client that finds no router looks again [s]."""
+ROUTER_PATIENCE_S: Final = 3.0
+"""After this time without a router a client logs a warning [s]: it may have started first."""
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
@@ -180,16 +183,16 @@ def join(settings: NetworkSettings, *, listen: bool = True) -> zenoh.Session:
 
 def _join_router(settings: NetworkSettings) -> zenoh.Session:
     """Link to a router, as soon as one answers; Zenoh links again whenever the link is lost."""
-    patient = True
+    warn_at = time.monotonic() + ROUTER_PATIENCE_S
     while True:
         try:
             return _open(settings, [], settings.places)
         except zenoh.ZError:
             if not [*settings.connect, *settings.places]:
                 raise NetworkError('network.mode = "client" needs a router in network.rendezvous') from None
-        if patient:
+        if time.monotonic() > warn_at:
             log.warning("waiting for a router: %s", no_router(settings))
-        patient = False
+            warn_at = inf
         time.sleep(ROUTER_AGAIN_S)
 
 

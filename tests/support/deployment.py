@@ -1,0 +1,143 @@
+"""Deployment: the daemons of a configuration that the documentation prints, each on a host of its own, and what a
+trouble of the network costs them, by the recorder's log.
+
+Times come from the log: these hosts have one wall clock. So a message that a pulled cable holds back for seconds still
+says when the plant was at 0 V.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from subprocess import Popen
+from typing import Final, Literal, NamedTuple
+
+from aeroloop.protocol.messages.models import Event, Loss, Status
+from aeroloop.service.cli.show import EXAMPLES
+from aeroloop.service.review.review import read
+from aeroloop.service.testing.hil_log import HilLog
+from tests.support.namespaces import STOP_WAIT_S, Hosts
+from tests.support.zenoh_network import eventually
+
+Kind = Literal["peers", "router"]
+HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")
+"""In the order of their addresses."""
+AWAY_S: Final = 2.0
+"""Twice the lease, so that links are given up [s]."""
+
+
+class Outcome(NamedTuple):
+    """What a trouble cost.
+
+    Attributes:
+        title: What was done.
+        trips: How often the plant tripped.
+        rest_s: From its begin to the first trip, when the motors are at 0 V [s]; None without one.
+        again_s: From its end until the plant is driven and stays so [s]; None without a trip.
+    """
+
+    title: str
+    trips: int
+    rest_s: float | None
+    again_s: float | None
+
+    def __str__(self) -> str:
+        def in_s(value: float | None) -> str:
+            return "–" if value is None else f"{value:.3f}"
+
+        return f"{self.title:44} {self.trips:5} {in_s(self.rest_s):>9} {in_s(self.again_s):>9}"
+
+
+class Deployment(Hosts):
+    """Hosts of an example configuration.
+
+    Attributes:
+        daemons: By host, once started.
+    """
+
+    def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = ()) -> None:
+        super().__init__(HOSTS, folder, EXAMPLES / f"hosts-{kind}.toml")
+        self.kind = kind
+        self.daemons: dict[str, Popen[bytes]] = {}
+        self.log_file = folder / "log.mcap"
+        self._seen = folder / "seen"
+        self._overrides = overrides
+        self._troubles: list[tuple[str, float, float]] = []  # title, begin and end [s since 1970]
+
+    def start(self, environments: Mapping[str, Mapping[str, str]] | None = None) -> None:
+        """Start the daemons, each in its host's environment, and wait until the plant is driven."""
+        given = environments or {}
+        for host in ("recorder", "plant", "controller", *(["router"] if self.kind == "router" else [])):
+            self.start_daemon(host, given.get(host))
+        self.watch("operator", self._seen)
+        self.await_driven(0.0)
+
+    def start_daemon(self, host: str, environment: Mapping[str, str] | None = None) -> None:
+        """Start the daemon of a host."""
+        words = {"plant": ["emulator"], "controller": ["controller", "--auto-arm"], "router": ["router"],
+                 "recorder": ["recorder", "--log", str(self.log_file)]}[host]  # fmt: skip
+        self.daemons[host] = self.aeroloop(host, *words, overrides=self._overrides, environment=environment)
+
+    def suffer(self, title: str, begin: Callable[[], object], end: Callable[[], object], for_s: float = AWAY_S) -> None:
+        """Cause a trouble and end it; then wait until the plant is driven, or still is."""
+        begun = time.time()
+        begin()
+        time.sleep(for_s)
+        ended = time.time()
+        end()
+        self._troubles.append((title, begun, ended))
+        self.await_driven(time.time() + 0.5)  # by a later status: that one may have been under way
+
+    def pull_each(self) -> None:
+        """Pull the cable of each host in turn for `AWAY_S`."""
+        for host in HOSTS:
+            if host in self.daemons or host == "operator":
+                self.suffer(
+                    f"cable of the {host} out for {AWAY_S:g} s", lambda: self.pull(host), lambda: self.plug(host)
+                )
+
+    def await_driven(self, since: float) -> None:
+        """Wait for a status of a driven plant that arrives after a time [s since 1970]."""
+        eventually("driving", lambda: any(
+            line.get("state") == "driven" and line["at"] > since
+            for line in map(json.loads, self._lines())
+        ))  # fmt: skip
+
+    def finish(self) -> list[Outcome]:
+        """End the daemons, the recorder after the ends, and read what each trouble cost from the log."""
+        for host in ("controller", "plant", "recorder"):
+            self.daemons[host].send_signal(signal.SIGTERM)
+            self.daemons[host].wait(STOP_WAIT_S)
+        return list(self._outcomes())
+
+    def missed(self) -> tuple[dict[str, int], int]:
+        """By the log: ticks of each end that are missing, and other messages that the recorder missed for good."""
+        losses = sum(loss.count for _, loss in HilLog(self.log_file).messages("loss") if isinstance(loss, Loss))
+        return dict(read(self.log_file).findings.missing_ticks), losses
+
+    def _outcomes(self) -> Iterator[Outcome]:
+        log = HilLog(self.log_file)
+        trips = [
+            at * 1e-9 for at, event in log.messages("event") if isinstance(event, Event) and event.kind == "tripped"
+        ]
+        states = sorted(
+            (at * 1e-9, status.state)
+            for at, status in log.messages("status")
+            if isinstance(status, Status) and status.role == "plant"
+        )
+        ends = [begun for _, begun, _ in self._troubles[1:]] + [float("inf")]
+        for (title, begun, ended), until in zip(self._troubles, ends, strict=True):
+            tripped = [at for at in trips if begun < at < until]
+            driven = [at for at, state in states if state == "driven" and tripped and tripped[-1] < at < until]
+            yield Outcome(
+                title,
+                len(tripped),
+                tripped[0] - begun if tripped else None,
+                max(0.0, driven[0] - ended) if driven else None,
+            )
+
+    def _lines(self) -> list[str]:
+        return [line for line in self._seen.read_text().splitlines() if line.endswith("}")]
