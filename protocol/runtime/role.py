@@ -76,8 +76,8 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
 class Role:
     """A process's presence on the network.
 
-    `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config` its
-    effective configuration, for the description. `name` is its liveliness token's; the role's if None.
+    `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config`
+    its effective configuration, for the description. `name` is its liveliness token's; the role's if None.
 
     Raises:
         NetworkError: The network cannot be joined.

@@ -1,7 +1,7 @@
 """Network: opens this process's Zenoh session, peer to peer or at a router, without multicast.
 
-Peer to peer, every process listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects
-to all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
+Every peer listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects to
+all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
 end or halt of any of them does not matter. Peers also learn each other's addresses by gossip and link directly.
 
 A client links to a router alone (`router.py`), does not listen, and waits until there is one.

@@ -1,5 +1,4 @@
-"""Deployment: the daemons of a configuration that the documentation prints, each on a host of its own, and what a
-trouble of the network costs them, by the recorder's log.
+"""Deployment: the daemons of an example configuration, each on a host of its own, and what a trouble costs them.
 
 Times come from the log: these hosts have one wall clock. So a message that a pulled cable holds back for seconds still
 says when the plant was at 0 V.
@@ -11,6 +10,7 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from subprocess import Popen
 from typing import Final, Literal, NamedTuple
@@ -19,7 +19,7 @@ from aeroloop.protocol.messages.models import Event, Loss, Status
 from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil_log import HilLog
-from tests.support.namespaces import STOP_WAIT_S, Hosts
+from tests.support.namespaces import STOP_WAIT_S, Hosts, Ways
 from tests.support.zenoh_network import eventually
 
 Kind = Literal["peers", "router"]
@@ -91,13 +91,37 @@ class Deployment(Hosts):
         self._troubles.append((title, begun, ended))
         self.await_driven(time.time() + 0.5)  # by a later status: that one may have been under way
 
-    def pull_each(self) -> None:
-        """Pull the cable of each host in turn for `AWAY_S`."""
+    def cut_off(self, host: str, for_s: float = AWAY_S) -> None:
+        """Pull a host's cable, and put it back."""
+        self.suffer(
+            f"cable of the {host} out for {for_s:g} s", partial(self.pull, host), partial(self.plug, host), for_s
+        )
+
+    def cut_off_each(self) -> None:
+        """Pull the cable of each host in turn."""
         for host in HOSTS:
             if host in self.daemons or host == "operator":
-                self.suffer(
-                    f"cable of the {host} out for {AWAY_S:g} s", lambda: self.pull(host), lambda: self.plug(host)
-                )
+                self.cut_off(host)
+
+    def lossy(self, percent: float, ways: Ways, for_s: float) -> None:
+        """Lose a share of the plant's packets for a time."""
+        what = {"both": "sends and receives", "sent": "sends", "received": "receives"}[ways]
+        title = f"{percent:g} % lost of what the plant {what}"
+        self.suffer(title, partial(self.lose, "plant", percent, ways), partial(self.lose, "plant", 0), for_s)
+
+    def slow(self, kbit_per_s: int, for_s: float) -> None:
+        """Limit what the plant sends and what it receives for a time."""
+        title = f"{kbit_per_s} kbit/s to and from the plant"
+        self.suffer(title, partial(self.narrow, "plant", kbit_per_s, "both"), partial(self.plug, "plant"), for_s)
+
+    def restart(self, host: str) -> None:
+        """End the daemon of a host, and start it again."""
+
+        def end() -> None:
+            self.daemons[host].send_signal(signal.SIGTERM)
+            self.daemons[host].wait(STOP_WAIT_S)
+
+        self.suffer(f"the {host} ended, and started again", end, partial(self.start_daemon, host), 0.0)
 
     def await_driven(self, since: float) -> None:
         """Wait for a status of a driven plant that arrives after a time [s since 1970]."""
@@ -120,9 +144,8 @@ class Deployment(Hosts):
 
     def _outcomes(self) -> Iterator[Outcome]:
         log = HilLog(self.log_file)
-        trips = [
-            at * 1e-9 for at, event in log.messages("event") if isinstance(event, Event) and event.kind == "tripped"
-        ]
+        events = [(at * 1e-9, event) for at, event in log.messages("event") if isinstance(event, Event)]
+        trips = [at for at, event in events if event.kind == "tripped"]
         states = sorted(
             (at * 1e-9, status.state)
             for at, status in log.messages("status")

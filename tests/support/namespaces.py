@@ -38,6 +38,9 @@ def _run(*words: str, given: str | None = None) -> None:
         raise NoNamespacesError(getattr(error, "stderr", None) or str(error)) from None
 
 
+Ways = Literal["sent", "received", "both"]
+
+
 class Hosts:
     """Hosts by name, each with an address and a cable. A context: leaving it ends their processes and removes them.
 
@@ -121,9 +124,8 @@ class Hosts:
 
     def watch(self, host: str, seen: Path) -> subprocess.Popen[bytes]:
         """Write every status and event that a host receives into a file: a line of JSON each, `at` when it arrived."""
-        network = (
-            load_vehicle_address(self._config).network if self._config else NetworkSettings(rendezvous=self.rendezvous)
-        )
+        configured = load_vehicle_address(self._config).network if self._config else None
+        network = configured or NetworkSettings(rendezvous=self.rendezvous)
         return self.python(host, "-m", "tests.support.namespaces", network.model_dump_json(), stdout=seen)
 
     def log(self, host: str) -> Path:
@@ -132,24 +134,28 @@ class Hosts:
 
     def plug(self, host: str) -> None:
         """Plug a host's cable in, at full speed."""
-        with suppress(NoNamespacesError):
-            self._tc("del", host)
+        for where, device in self._ends(host):
+            with suppress(NoNamespacesError):
+                _ip("netns", "exec", where, "tc", "qdisc", "del", "dev", device, "root")
         _ip("-n", self._switch, "link", "set", host, "up")
 
     def pull(self, host: str) -> None:
         """Pull a host's cable out."""
         _ip("-n", self._switch, "link", "set", host, "down")
 
-    def narrow(self, host: str, kbit_per_s: int) -> None:
-        """Limit what a host receives."""
-        self._tc("replace", host, "tbf", "rate", f"{kbit_per_s}kbit", "burst", "4kb", "latency", "400ms")
+    def narrow(self, host: str, kbit_per_s: int, ways: Ways = "received") -> None:
+        """Limit what a host receives, sends, or both."""
+        for way, (where, device) in zip(("received", "sent"), self._ends(host), strict=True):
+            if ways in (way, "both"):
+                rate = ("tbf", "rate", f"{kbit_per_s}kbit", "burst", "4kb", "latency", "400ms")
+                _ip("netns", "exec", where, "tc", "qdisc", "replace", "dev", device, "root", *rate)
 
-    def lose(self, host: str, percent: float, ways: Literal["both", "sent", "received"] = "both") -> None:
+    def lose(self, host: str, percent: float, ways: Ways = "both") -> None:
         """Lose a share of the packets that a host sends, receives, or both, at random; 0 ends it.
 
-        Dropped where they arrive, so that no sender is notified.
+        They are dropped where they arrive: a sender would be notified, and send again sooner than on a real cable.
         """
-        for way, where, device in (("sent", self._switch, host), ("received", self._prefix + host, "cable")):
+        for way, (where, device) in zip(("sent", "received"), self._ends(host), strict=True):
             table = f"add table netdev {device}; delete table netdev {device};"
             if percent and ways in (way, "both"):
                 table += f"""
@@ -159,8 +165,9 @@ class Hosts:
                     }} }}"""
             _run("ip", "netns", "exec", where, "nft", "-f", "-", given=table)
 
-    def _tc(self, verb: str, host: str, *words: str) -> None:
-        _ip("netns", "exec", self._switch, "tc", "qdisc", verb, "dev", host, "root", *words)
+    def _ends(self, host: str) -> tuple[tuple[str, str], tuple[str, str]]:
+        """Namespace and device at both ends of a host's cable, the switch's first."""
+        return (self._switch, host), (self._prefix + host, "cable")
 
     def _remove(self) -> None:
         for name in ("switch", *self._addresses):
