@@ -158,11 +158,9 @@ class Hosts:
         for way, (where, device) in zip(("sent", "received"), self._ends(host), strict=True):
             table = f"add table netdev {device}; delete table netdev {device};"
             if percent and ways in (way, "both"):
-                table += f"""
-                    table netdev {device} {{ chain lossy {{
-                        type filter hook ingress device "{device}" priority 0;
-                        numgen random mod 1000 < {round(10 * percent)} drop
-                    }} }}"""
+                hook = f'type filter hook ingress device "{device}" priority 0;'
+                drop = f"numgen random mod 1000 < {round(10 * percent)} drop;"
+                table += f"table netdev {device} {{ chain lossy {{ {hook} {drop} }}; }}"
             _run("ip", "netns", "exec", where, "nft", "-f", "-", given=table)
 
     def _ends(self, host: str) -> tuple[tuple[str, str], tuple[str, str]]:
