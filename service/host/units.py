@@ -24,7 +24,7 @@ UNITS: Final = {
     "plant": "the plant end that plant.via names",
     "controller": "the adaptive attitude controller",
 }
-"""Daemon to description, in the order of start; `units_of` a configuration."""
+"""Daemon to description, in the order of start."""
 _HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 """What `ProtectHome=` hides."""
 _WITHOUT_DEVICE: Final = ("socketcan", "socketcand", "udp_multicast", "virtual")

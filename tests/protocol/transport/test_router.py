@@ -1,0 +1,142 @@
+"""Router: clients link to it and to nothing else, wait for it, and go on where they were when it is back."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+
+import pytest
+import zenoh
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join, visit
+from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
+from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
+from aeroloop.service.host.operator import stop
+from tests.protocol.transport.test_network import Listener, one_line, receives
+from tests.support.zenoh_network import eventually, free_port
+
+
+@pytest.fixture
+def settings() -> NetworkSettings:
+    return NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"])
+
+
+@pytest.fixture
+def open_sessions() -> Iterator[ExitStack]:
+    """Closes what a test opens, the last first."""
+    with ExitStack() as stack:
+        yield stack
+
+
+def test_clients_link_to_the_router_alone_and_receive_through_it(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    router = open_sessions.enter_context(closing(route(settings)))
+    clients = [open_sessions.enter_context(closing(join(settings))) for _ in range(3)]
+    ear = Listener(clients[0], "t/word")
+    for client in clients[1:]:
+        receives(ear, client, str(client.zid()).encode())
+        assert [str(link.dst) for link in client.info.links()] == settings.rendezvous
+        assert list(client.info.routers_zid()) == [router.zid()]
+        assert not list(client.info.peers_zid())
+    assert set(ear.stamped) == {False}  # a router stamps messages by default
+
+
+def test_a_client_that_starts_first_waits_for_the_router(settings: NetworkSettings, open_sessions: ExitStack) -> None:
+    joined: list[zenoh.Session] = []
+    thread = threading.Thread(target=lambda: joined.append(join(settings)))
+    thread.start()
+    with pytest.raises(NetworkError):  # a command does not wait
+        visit(settings).__enter__()
+    assert not joined
+    open_sessions.enter_context(closing(route(settings)))
+    thread.join()
+    open_sessions.enter_context(closing(joined[0]))
+    with visit(settings) as here:
+        here.settle()
+        assert here.silent() == []
+
+
+def test_a_command_names_a_router_that_is_missing_or_hangs(settings: NetworkSettings) -> None:
+    with pytest.raises(NetworkError) as caught, visit(settings):
+        pass
+    assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
+    port = int(settings.rendezvous[0].rpartition(":")[2])
+    with (
+        socket.create_server(("127.0.0.1", port)),
+        pytest.raises(NetworkError, match="accepts connections and does not answer as a router"),
+        visit(settings),
+    ):
+        pass
+
+
+def test_what_was_published_while_the_router_was_away_is_recovered(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    """Its cache holds it. Tokens that were declared before are seen again, too."""
+    router = route(settings)
+    speaker, listener = (open_sessions.enter_context(closing(join(settings))) for _ in range(2))
+    publisher, subscriber = CachedPublisher(speaker, "t/word", 10.0), RecoveringSubscriber(listener, "t/word")
+    tokens: list[zenoh.SampleKind] = []
+    seen = listener.liveliness().declare_subscriber("t/alive", lambda token: tokens.append(token.kind), history=True)
+    token = speaker.liveliness().declare_token("t/alive")
+    received: list[bytes] = []
+
+    def arrived(*words: bytes) -> bool:
+        received.extend(delivery.payload for delivery in subscriber.take())
+        return received == list(words)
+
+    publisher.put(b"before")
+    eventually("the first", lambda: arrived(b"before"))
+    router.close()
+    eventually("the token's end", lambda: tokens == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE])
+    publisher.put(b"away")
+    with closing(route(settings)):
+        eventually("the second", lambda: arrived(b"before", b"away"))
+        eventually("the token", lambda: len(tokens) == 3)
+        publisher.put(b"again")
+        eventually("the third", lambda: arrived(b"before", b"away", b"again"))
+    assert list(subscriber.missed()) == []
+    seen.undeclare()
+    token.undeclare()
+
+
+def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
+    """On hosts of their own both stand in the rendezvous; here all addresses are this host's."""
+    first, second = (NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"]) for _ in range(2))
+    open_sessions.enter_context(closing(route(first)))
+    open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}))))
+    near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
+    receives(Listener(near, "t/word"), far, b"over both")
+
+
+def test_a_router_that_cannot_listen_says_so_in_one_line(settings: NetworkSettings) -> None:
+    with closing(route(settings)), pytest.raises(NetworkError) as caught:
+        route(settings)
+    assert f"cannot listen on {settings.rendezvous[0]}" in one_line(caught.value)
+
+
+def test_the_printed_configuration_is_the_routers_own_and_opens_one(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    text = zenohd_config(settings)
+    lines = [line for line in text.splitlines() if not line.startswith("//")]
+    assert json.loads("\n".join(lines)) == router_tree(settings)
+    router = open_sessions.enter_context(closing(zenoh.open(zenoh.Config.from_json5(text))))
+    client = open_sessions.enter_context(closing(join(settings)))
+    assert list(client.info.routers_zid()) == [router.zid()]
+
+
+def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    """A plant that hangs is off a router's network after a second, and nothing else names it."""
+    open_sessions.enter_context(closing(route(settings)))
+    member = open_sessions.enter_context(closing(join(settings)))
+    token = member.liveliness().declare_token(topics.key("alive", "aero", role="controller-1-abcd"))
+    assert stop(settings).failures == ["aero has a controller, and no plant of it answers"]
+    token.undeclare()
