@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, Field, PlainSerializer, StringConstraints
+from pydantic import AfterValidator, AwareDatetime, Field, PlainSerializer, StringConstraints
 
 from aeroloop.protocol.messages.operator import Gains, Message, Reference
 from aeroloop.protocol.messages.states import TripCause
@@ -155,6 +155,9 @@ class Status(Message):
     )
     process: str = Field(default="", description="host and process id of the role")
     since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
+    certificate_until: AwareDatetime | None = Field(
+        default=None, description="when the role's certificate expires, UTC; null where no link needs one"
+    )
     uptime_s: float
     ticks: int = Field(description="ticks since start")
     rate_hz: float = Field(description="ticks a second since the last status")

@@ -39,11 +39,11 @@ def name_process(role: str) -> None:
 
 
 def listener(endpoint: str) -> Listener | None:
-    """The process of this host that listens at a Zenoh endpoint of TCP; None where that cannot be found out.
+    """The process of this host that listens at a Zenoh endpoint of TCP or TLS; None where that cannot be found out.
 
     A process of another user is not found, nor one on another host.
     """
-    port = re.fullmatch(r"tcp/.*:(\d+)", endpoint)
+    port = re.fullmatch(r"(?:tcp|tls)/.*:(\d+)", endpoint)
     if port is None:
         return None
     inodes = set()

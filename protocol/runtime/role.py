@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from datetime import datetime
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
@@ -28,9 +29,18 @@ from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
-from aeroloop.protocol.transport.network import VISIT_S, NetworkSettings, join, visit
+from aeroloop.protocol.transport.network import (
+    VISIT_S,
+    NetworkSettings,
+    join,
+    protected,
+    unlinked,
+    visit,
+)
 from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
+from aeroloop.protocol.transport.refusal import RefusalWatch
 from aeroloop.protocol.transport.router import route
+from aeroloop.protocol.transport.security import TLS, Identity
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wording import problems
@@ -58,7 +68,7 @@ class OccupiedError(AeroloopError):
 
 
 def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
-    with visit(network, patient=True) as here:
+    with visit(network, identity=Identity(("plant",), vehicle), patient=True) as here:
         here.settle()
         if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=VISIT_S)):
             return
@@ -81,8 +91,11 @@ class Role:
 
     Raises:
         NetworkError: The network cannot be joined.
+        SecurityError, CertificateError: Its links cannot be secured.
         OccupiedError: It is a plant's, and the vehicle has one.
     """
+
+    _certificate_until: datetime | None = None
 
     def __init__(
         self, role: str, vehicle: str, network: NetworkSettings, config: dict[str, Any], name: str | None = None
@@ -94,7 +107,7 @@ class Role:
         if role == "plant":
             _refuse_second_plant(network, vehicle)
         name_process(role)
-        self.zenoh = route(network) if role == "router" else join(network)
+        self.zenoh = (route if role == "router" else join)(network, Identity((role,), vehicle))
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._status: tuple[float, Status] | None = None  # when it was taken
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
@@ -106,13 +119,38 @@ class Role:
         key = topics.key("description", vehicle, role=role)
         self.answer(key, lambda query: query.reply(key, self._description))
         self.answer(topics.key("status", vehicle, role=role), self._answer_status)
+        self._refusals = self._watch_refusals(network)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         notify_systemd("STOPPING=1")
+        if self._refusals is not None:
+            self._refusals.close()
         self.zenoh.close()
+
+    def _watch_refusals(self, network: NetworkSettings) -> RefusalWatch | None:
+        """Publish an event for each peer that refuses this role's certificate, or whose own is refused."""
+        settings, certificate = protected(network, Identity((self.role,), self.vehicle))
+        if certificate is None:
+            return None
+        self._certificate_until = certificate.not_after
+        places = [*settings.places, *settings.connect]
+        watch = RefusalWatch(
+            certificate,
+            self.vehicle,
+            lambda: unlinked(self.zenoh, places),
+            lambda line: self.event("refused", line),
+        )
+
+        def changed(event: zenoh.LinkEvent) -> None:
+            protocol, _, address = str(event.link.dst).partition("/")
+            if event.kind == zenoh.SampleKind.PUT and protocol in TLS:
+                watch.linked(address.rpartition(":")[0], event.link.auth_identifier)
+
+        self.zenoh.info.declare_link_events_listener(changed, history=True)
+        return watch
 
     def announce(self) -> None:
         """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
@@ -278,7 +316,13 @@ class Role:
         while now - skipped[0][0] > _RECENT_S:
             skipped.popleft()
         recent = status.skipped - skipped[0][1]
-        status = status.model_copy(update={"process": self.process, "recent_skipped": recent})
+        status = status.model_copy(
+            update={
+                "process": self.process,
+                "recent_skipped": recent,
+                "certificate_until": self._certificate_until,
+            }
+        )
         self._status = now, status
         self.publish("status", status)
 

@@ -23,13 +23,24 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from math import inf
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import zenoh
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.certificate import Certificate
+from aeroloop.protocol.transport.refusal import refusal
+from aeroloop.protocol.transport.security import (
+    READER,
+    Identity,
+    SecuritySettings,
+    certificate_for,
+    is_plain,
+    secured,
+    tls_tree,
+)
 
 log: Final = logging.getLogger("aeroloop")
 
@@ -115,6 +126,14 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )
     lease_ms: int = Field(default=1000, ge=100, le=60_000, description="a silent peer is disconnected after this [ms]")
+    security: SecuritySettings = Field(default=SecuritySettings(), description="certificates of this host")
+    insecure: bool = Field(
+        default=False,
+        description="allow plain text beyond loopback: anyone on that network can then drive the vehicle",
+    )
+    loopback_secured: bool = Field(
+        default=False, description="mutual TLS on loopback, too: the users of this host need certificates, as others do"
+    )
 
     @field_validator("rendezvous", mode="before")
     @classmethod
@@ -128,17 +147,56 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
             return self.rendezvous
         return [place for first in self.rendezvous for place in _ports(first, self.ports)]
 
+    @property
+    def endpoints(self) -> list[str]:
+        """Every endpoint that is connected to or listened on."""
+        return [*self.places, *self.connect, *self.listen]
+
+
+class Protected(NamedTuple):
+    """A process's own network, with the endpoints that it opens in place of the configured ones.
+
+    Attributes:
+        settings: The network.
+        certificate: Its certificate; None where no link needs one.
+    """
+
+    settings: NetworkSettings
+    certificate: Certificate | None
+
+
+def protected(settings: NetworkSettings, identity: Identity) -> Protected:
+    """Replace endpoints by those of mutual TLS where `security.secured` says so, and find this process's certificate.
+
+    Raises:
+        SecurityError: An endpoint must not be opened as configured.
+        CertificateError: A certificate is needed, and this process has none that is good.
+    """
+    insecure, loopback = settings.insecure, settings.loopback_secured
+    update = {
+        name: [
+            secured(each, settings.security, insecure=insecure, loopback_secured=loopback)
+            for each in getattr(settings, name)
+        ]
+        for name in ("rendezvous", "listen", "connect")
+    }
+    network = settings.model_copy(update=update)
+    return Protected(network, certificate_for(network.endpoints, settings.security, identity))
+
 
 class Visit:
     """A session of a command: it has no endpoint of its own, and links to every process that answers.
 
     Attributes:
         session: The session.
+        certificate: Its own; None where no link needs one.
     """
 
-    def __init__(self, session: zenoh.Session, places: list[str]) -> None:
+    def __init__(self, session: zenoh.Session, places: list[str], certificate: Certificate | None) -> None:
         self.session = session
-        self._silent = accepting(places)
+        self.certificate = certificate
+        self._places = places
+        self._silent: list[str] | None = None
 
     def settle(self, wait_s: float = VISIT_S) -> None:
         """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
@@ -147,66 +205,87 @@ class Visit:
             time.sleep(POLL_S)
 
     def silent(self) -> list[str]:
-        """Endpoints at which a process accepts connections and has not answered as Zenoh so far."""
+        """Endpoints at which a process accepts connections and has not answered as Zenoh so far.
+
+        Tried are only those without a link, at the first call: after a connection that ends before its handshake,
+        Zenoh's listener of TLS accepts none for 0.1 s.
+        """
+        if self._silent is None:
+            self._silent = accepting(unlinked(self.session, self._places))
         if self._silent:
-            linked = {str(link.dst) for link in self.session.info.links()}
-            self._silent = [place for place in self._silent if place not in linked]
+            self._silent = unlinked(self.session, self._silent)
         return self._silent
 
 
-def join(settings: NetworkSettings, *, listen: bool = True) -> zenoh.Session:
+def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
     """Open a session that meets the others at the rendezvous. The caller closes it.
 
     Args:
         settings: Where.
+        identity: What the process is.
         listen: Whether others can connect to this process: yes for a role, no for a command that only queries.
 
     Raises:
         NetworkError: A `listen` endpoint cannot be opened, or a client's settings name no router.
+        SecurityError, CertificateError: Its links cannot be secured, see `protected`.
     """
+    network = protected(settings, identity)
+    if listen:
+        warn_of_plain(network)
     if settings.mode == "client":
-        return _join_router(settings)
-    places = settings.places
+        return _join_router(network)
+    places, further = network.settings.places, network.settings.listen
     for place in places if listen else []:
         if _is_free(place):
             with suppress(zenoh.ZError):  # taken in the meantime
-                return _open(settings, [place, *settings.listen], [other for other in places if other != place])
+                return _open(network, [place, *further], [other for other in places if other != place])
     any_port = [re.sub(r":\d+$", ":0", places[0])] if listen and places and is_own(places[0]) else []
     try:
-        return _open(settings, [*settings.listen, *any_port] if listen else [], places)
+        return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(settings.listen)}: {reason(error)}; "
+            f"cannot listen on {', '.join(further)}: {reason(error)}; "
             "give a free one with --set network.listen='[\"tcp/127.0.0.1:0\"]'"
         ) from None
 
 
-def _join_router(settings: NetworkSettings) -> zenoh.Session:
+def warn_of_plain(network: Protected) -> None:
+    """Log a warning where links are plain text, because that is allowed."""
+    if network.settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
+        log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
+
+
+def _join_router(network: Protected) -> zenoh.Session:
     """Link to a router, as soon as one answers; Zenoh links again whenever the link is lost."""
+    places = network.settings.places
     warn_at = time.monotonic() + ROUTER_PATIENCE_S
     while True:
         try:
-            return _open(settings, [], settings.places)
+            return _open(network, [], places)
         except zenoh.ZError:
-            if not [*settings.connect, *settings.places]:
+            if not [*network.settings.connect, *places]:
                 raise NetworkError('network.mode = "client" needs a router in network.rendezvous') from None
         if time.monotonic() > warn_at:
-            log.warning("waiting for a router: %s", no_router(settings))
+            log.warning("waiting for a router: %s", _no_router(network))
             warn_at = inf
         time.sleep(ROUTER_AGAIN_S)
 
 
-def no_router(settings: NetworkSettings) -> str:
+def _no_router(network: Protected) -> str:
     """One line about routers that do not answer."""
-    places = [*settings.connect, *settings.places]
+    places = [*network.settings.connect, *network.settings.places]
     hung = accepting(places)
+    if hung and network.certificate is not None:
+        return f"{hung[0]}: {refusal(hung[0], network.certificate) or 'the router does not answer'}"
     if hung:
         return f"a process at {', '.join(hung)} accepts connections and does not answer as a router"
     return f"no router answers at {', '.join(places)}; is `aeroloop router` running?"
 
 
 @contextmanager
-def visit(settings: NetworkSettings, wait_s: float = VISIT_S, *, patient: bool = False) -> Iterator[Visit]:
+def visit(
+    settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity = READER, *, patient: bool = False
+) -> Iterator[Visit]:
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
@@ -215,24 +294,32 @@ def visit(settings: NetworkSettings, wait_s: float = VISIT_S, *, patient: bool =
         NetworkError: It is a client's, and no router answers.
     """
     wait_ms = round(wait_s * 1000)
-    places = settings.places
+    network = protected(settings, identity)
+    places = network.settings.places
     try:
         if patient and settings.mode == "client":
-            session = _join_router(settings)
+            session = _join_router(network)
         else:
-            session = _open(settings, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
+            session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
     except zenoh.ZError:
-        raise NetworkError(no_router(settings)) from None
+        raise NetworkError(_no_router(network)) from None
     with closing(session):  # a client is linked from the start
-        yield Visit(session, [*settings.connect, *places] if settings.mode == "peer" else [])
+        met = [*network.settings.connect, *places] if settings.mode == "peer" else []
+        yield Visit(session, met, network.certificate)
+
+
+def unlinked(session: zenoh.Session, places: list[str]) -> list[str]:
+    """Those of some endpoints to which a session has no link of its own; one that the peer has made is none."""
+    linked = {str(link.dst) for link in session.info.links()}
+    return [place for place in places if place not in linked]
 
 
 def accepting(places: list[str]) -> list[str]:
-    """Those of some TCP endpoints at which a process accepts connections; the others' silence is waited for briefly."""
+    """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
     attempts: dict[int, tuple[socket.socket, str]] = {}
     found = []
     for place in places:
-        if (parts := _PLACE.fullmatch(place)) and parts["protocol"] == "tcp":
+        if (parts := _PLACE.fullmatch(place)) and parts["protocol"] in ("tcp", "tls"):
             attempt = socket.socket(_family(parts))
             attempt.setblocking(False)
             with suppress(OSError):
@@ -256,17 +343,17 @@ def accepting(places: list[str]) -> list[str]:
 
 
 def _open(
-    settings: NetworkSettings,
+    network: Protected,
     listen: list[str],
     places: list[str],
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
-    return open_tree(session_tree(settings, settings.mode, listen, places, handshake_ms, retry_ms))
+    return open_tree(session_tree(network, network.settings.mode, listen, places, handshake_ms, retry_ms))
 
 
 def session_tree(
-    settings: NetworkSettings,
+    network: Protected,
     mode: Mode,
     listen: list[str],
     places: list[str],
@@ -274,7 +361,8 @@ def session_tree(
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> dict[str, Any]:
     """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
-    return {
+    settings, certificate = network
+    tree: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
         "connect": {
@@ -304,6 +392,11 @@ def session_tree(
             "unicast": {"open_timeout": handshake_ms, "accept_timeout": HANDSHAKE_MS},
         },
     }
+    if certificate is not None:
+        tree["transport"]["link"]["tls"] = tls_tree(certificate)
+        # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
+        tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
+    return tree
 
 
 def open_tree(tree: dict[str, Any]) -> zenoh.Session:
@@ -344,7 +437,7 @@ def _family(parts: re.Match[str]) -> socket.AddressFamily:
 def _is_free(place: str) -> bool:
     """Whether this process could listen at an endpoint: it is an address of this host, and its port is free."""
     parts = _PLACE.fullmatch(place)
-    if parts is None or parts["protocol"] == "udp":
+    if parts is None or parts["protocol"] in ("udp", "quic"):
         return True  # only Zenoh can find out
     address = parts["host"].strip("[]"), int(parts["port"])
     with suppress(OSError), socket.create_server(address, family=_family(parts)):

@@ -9,20 +9,34 @@ from __future__ import annotations
 import json
 import os
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 import zenoh
 
-from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, is_own, open_tree, reason, session_tree
+from aeroloop.protocol.transport.network import (
+    NetworkError,
+    NetworkSettings,
+    is_own,
+    open_tree,
+    protected,
+    reason,
+    session_tree,
+    warn_of_plain,
+)
+from aeroloop.protocol.transport.security import Identity
+
+ROUTER: Final = Identity(("router",))
 
 
-def route(settings: NetworkSettings) -> zenoh.Session:
+def route(settings: NetworkSettings, identity: Identity = ROUTER) -> zenoh.Session:
     """Open a router's session. The caller closes it.
 
     Raises:
         NetworkError: It cannot listen.
+        SecurityError, CertificateError: Its links cannot be secured, see `protected`.
     """
-    tree = router_tree(settings)
+    warn_of_plain(protected(settings, identity))
+    tree = router_tree(settings, identity)
     try:
         return open_tree(tree)
     except zenoh.ZError as error:
@@ -33,11 +47,13 @@ def route(settings: NetworkSettings) -> zenoh.Session:
         ) from None
 
 
-def router_tree(settings: NetworkSettings) -> dict[str, Any]:
-    """Zenoh's configuration of a router."""
-    here = [place for place in settings.rendezvous if is_own(place)] or settings.rendezvous
-    others = [place for place in settings.rendezvous if place not in here]
-    tree = session_tree(settings, "router", [*here, *settings.listen], others)
+def router_tree(settings: NetworkSettings, identity: Identity = ROUTER) -> dict[str, Any]:
+    """Zenoh's configuration of a router, with mutual TLS as every session has it. Raises as `protected`."""
+    network = protected(settings, identity)
+    rendezvous = network.settings.rendezvous
+    here = [place for place in rendezvous if is_own(place)] or rendezvous
+    others = [place for place in rendezvous if place not in here]
+    tree = session_tree(network, "router", [*here, *network.settings.listen], others)
     return {
         **tree,
         "scouting": {**tree["scouting"], "delay": 0},  # otherwise it takes 0.5 s to open, whatever is linked

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from math import nan
+from threading import RLock
 from typing import Final
 
 from aeroloop.protocol.lazy import casadi as ca
@@ -23,18 +24,23 @@ from aeroloop.protocol.wire.quantizer import TIE, CodedQuantizer, Continuous, Qu
 NUMBERS: Final = ("deadzone", "step", "top", "limit", "hysteresis", "threshold", "growing")
 """Attributes of quantizers that the expressions use; a kind has some of them."""
 
+_SWITCH: Final = RLock()
+
 
 @contextmanager
 def as_written() -> Iterator[None]:
     """Build expressions and insert functions without simplification, operation by operation.
 
-    CasADi has one switch for all threads: do not build other expressions meanwhile.
+    CasADi has one switch for all threads, so one at a time may build so. What another thread builds meanwhile without
+    asking for it is not simplified either.
     """
-    ca.GlobalOptions.setSimplificationOnTheFly(False)
-    try:
-        yield
-    finally:
-        ca.GlobalOptions.setSimplificationOnTheFly(True)
+    with _SWITCH:
+        before = ca.GlobalOptions.getSimplificationOnTheFly()
+        ca.GlobalOptions.setSimplificationOnTheFly(False)
+        try:
+            yield
+        finally:
+            ca.GlobalOptions.setSimplificationOnTheFly(before)
 
 
 def numbers(quantizer: Quantizer) -> list[float]:

@@ -25,13 +25,13 @@ group = typer.Typer()
 
 @group.command()
 def doctor(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
-    """Check whether this machine holds the configured rate, and print what to change if not."""
+    """Check whether this machine holds the configured rate, and its certificates; print what to change if not."""
     settings = settings_of(config, overrides)
     from aeroloop.service.host.doctor import CHECK_S, diagnose
     from aeroloop.service.terminal.display import diagnosis_table, progress_bar
 
     with guarded(), progress_bar("check", CHECK_S, hidden=json) as update:
-        diagnosis = diagnose(settings.loop, update)
+        diagnosis = diagnose(settings.loop, update, settings.network.security.folder)
     show(diagnosis, json, diagnosis_table)
     if not diagnosis.holds:
         raise typer.Exit(1)

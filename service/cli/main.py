@@ -22,10 +22,13 @@ _GROUPS: Final = {
     "lab": "Experiments, tables, calibration and certificates, in lockstep.",
     "log": "Review, compare, replay, recover and export logs; view a live loop.",
     "op": "Operate running roles over the network.",
-    "host": "Check this machine, soak the loop on it, install its daemons.",
+    "host": "Check this machine, soak the loop on it, install its daemons, make its keys.",
     "show": "Print the configuration, the wire, a DBC file, a layout, examples.",
 }
 """Modules of verbs in this folder, with the help of each. Those of `run` stand beside the groups."""
+
+_KEYS: Final = "Certificates of this host's roles, for mutual TLS between hosts."
+"""Help of the group `keys`, which stands in `host`."""
 
 _EXTRAS: Final = {
     "can": ("python-can", "can"),
@@ -133,8 +136,13 @@ def root() -> Group:
     )
     app.callback()(_options)
     command = cast(Group, typer.main.get_command(app))
-    for name, text in _GROUPS.items():
-        command.add_command(Group(name=name, module=name, help=text, no_args_is_help=True, suggest_commands=False))
+    groups = {
+        name: Group(name=name, module=name, help=text, no_args_is_help=True, suggest_commands=False)
+        for name, text in (*_GROUPS.items(), ("keys", _KEYS))
+    }
+    groups["host"].add_command(groups.pop("keys"))
+    for group in groups.values():
+        command.add_command(group)
     return command
 
 

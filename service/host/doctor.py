@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Final
 
 from pydantic import BaseModel, Field
@@ -18,6 +19,7 @@ from aeroloop.protocol.runtime.host_facts import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming, summary
+from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError
 from aeroloop.protocol.wire.loop import LoopSettings
 
 CHECK_S: Final = 5.0
@@ -45,9 +47,17 @@ class Diagnosis(BaseModel, frozen=True):
     findings: list[Finding]
 
 
-def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None) -> Diagnosis:
-    """Check the settings, then run the trial; `progress` is called five times a second with its elapsed time [s]."""
-    findings = _settings()
+def diagnose(
+    loop: LoopSettings, progress: Callable[[float], None] | None = None, keys: Path | None = None
+) -> Diagnosis:
+    """Check the settings and certificates, then run the trial.
+
+    Args:
+        loop: The rate, and how the daemons are set up.
+        progress: Called five times a second with the trial's elapsed time [s].
+        keys: Directory of this host's certificates; None if there is none.
+    """
+    findings = [*_settings(), *(_certificates(keys) if keys else ())]
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     awake = "let the user write to it, or use tuned's profile latency-performance"
     findings += [
@@ -76,6 +86,25 @@ def diagnose(loop: LoopSettings, progress: Callable[[float], None] | None = None
     return Diagnosis(
         holds=trial.good, rate_hz=loop.rate_hz, skipped=grid.skipped, wake_us=wake, findings=[*findings, trial]
     )
+
+
+def _certificates(directory: Path) -> Iterator[Finding]:
+    """The authority and this host's certificates: whether they can be used, and for how long."""
+    from aeroloop.service.host.keys import show  # imports `cryptography`
+
+    try:
+        rows = show(directory)
+    except CertificateError as error:
+        yield Finding(what="certificates", good=False, found="no authority", advice=str(error))
+        return
+    for row in rows:
+        days = row.days_left
+        yield Finding(
+            what=row.file,
+            good=row.problem is None and days is not None and days >= SOON_DAYS,
+            found="no certificate of a role" if days is None else f"{days:.0f} days left",
+            advice=row.problem or f"renew it: `aeroloop host keys renew {row.file.removesuffix('.pem')}`, and restart",
+        )
 
 
 def _settings() -> list[Finding]:

@@ -8,7 +8,7 @@ is no role delays none of them, and is named by its address and, on this host, b
 from __future__ import annotations
 
 import time
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple
 
@@ -20,7 +20,9 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
-from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, visit
+from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, visit
+from aeroloop.protocol.transport.refusal import refusal
+from aeroloop.protocol.transport.security import READER, Identity
 
 ANSWER_S: Final = 1.0
 
@@ -65,7 +67,7 @@ def gather(network: NetworkSettings) -> Gathered:
         here.settle()
         for reply in _get(here.session, topics.key("status", "*"), b"", VISIT_S):
             received(reply)
-        silent = [_unanswered(place) for place in here.silent()]
+        silent = _unanswered(here)
     if not statuses:
         raise OperatorError("; ".join([_nobody(network), *silent]))
     return Gathered(statuses, silent)
@@ -82,7 +84,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
     Raises:
         OperatorError: No role answers, or it refuses.
     """
-    with visit(network, ANSWER_S) as here:
+    with visit(network, ANSWER_S, Identity(("operator",), vehicle)) as here:
         answers: list[Answer] = []
         deadline = time.monotonic() + ANSWER_S
         while not answers and time.monotonic() < deadline:
@@ -90,8 +92,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
             time.sleep(POLL_S)
         if not answers:
             role = {"arm": "plant", "inject": "emulator"}.get(topic, "controller")
-            silent = [_unanswered(place) for place in here.silent()]
-            raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *silent]))
+            raise OperatorError("; ".join([_nobody(network, f"no {role} of {vehicle}"), *_unanswered(here)]))
         done = [answer.text for answer in answers if answer.done]  # of several, one success is enough
         if not done:
             raise OperatorError("; ".join(answer.text for answer in answers))
@@ -129,7 +130,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
         if reply.ok is not None and address is not None:
             answers[address.vehicle].append(Answer.model_validate_json(reply.ok.payload.to_bytes()).text)
 
-    with visit(network, wait_s) as here:
+    with visit(network, wait_s, Identity(("operator",), None if vehicle == "*" else vehicle)) as here:
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < wait_s:
             # A plant declares its token last, so one with a token answers.
@@ -148,12 +149,11 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
             if passed > SETTLE_S and not here.silent() and all(answers.values()):
                 break
             time.sleep(POLL_S)
-        unanswered = [(place, listener(place)) for place in here.silent()]
+        unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > VISIT_S)
         alone = _without_plant(here.session, answers) if network.mode == "client" and vehicle == "*" else []
     failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
     failures += [f"{name} has a controller, and no plant of it answers" for name in alone]
-    others = ("controller", "recorder", "router")
-    failures += [_unanswered(place) for place, process in unanswered if process is None or process.role not in others]
+    failures += unanswered
     if not answers and not failures:
         failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
     return Stopped([text for texts in answers.values() for text in texts], failures)
@@ -176,7 +176,7 @@ def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> Sessi
         OperatorError: No controller answers, or the plant has no record.
     """
     found: list[SessionRecord] = []
-    with visit(network) as here:
+    with visit(network, identity=READER._replace(vehicle=vehicle)) as here:
         here.settle()
         for reply in _get(here.session, topics.key("show", vehicle), Request().encode(), ANSWER_S):
             with suppress(ValidationError):  # a plant without a record answers so
@@ -206,10 +206,19 @@ def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message)
     return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 
-def _unanswered(place: str) -> str:
-    """One line about a process that accepts connections at an endpoint and does not answer."""
-    process = listener(place)
-    return f"the {process} at {place} does not answer" if process else f"the process at {place} does not answer"
+def _unanswered(here: Visit, but: Sequence[str] = (), *, why: bool = True) -> list[str]:
+    """A line about each process that accepts connections and does not answer; not of some roles of this host.
+
+    `why`: also find out whether certificates are the reason, which takes a while.
+    """
+    lines = []
+    for place in here.silent():
+        process = listener(place)
+        if process is None or process.role not in but:
+            name = f"the {process}" if process else "the process"
+            refused = refusal(place, here.certificate) if why and here.certificate else None
+            lines.append(refused or f"{name} at {place} does not answer")
+    return lines
 
 
 def _nobody(network: NetworkSettings, subject: str = "no role") -> str:

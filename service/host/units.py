@@ -92,7 +92,7 @@ def units_of(settings: Settings) -> list[str]:
 def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
     words = [*_executable(), name, *source.options]
-    rights = _user(source.config)
+    rights = _user(source)
     if name == "recorder":
         words += ["--set", "recorder.directory=%L/aeroloop"]
         rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]
@@ -166,16 +166,20 @@ def _quoted(word: str) -> str:
     return '"' + escaped.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def _user(config: Path) -> list[str]:
-    """Lines on the user: one of systemd's own, unless interpreter or configuration is in a home."""
-    needed = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve(), config.absolute())
-    homes = [path for path in needed if any(path.is_relative_to(home) for home in _HOMES)]
+def _user(source: Source) -> list[str]:
+    """Lines on the user: one of systemd's own, unless something it needs is in a home, or keys are another user's."""
+    keys = source.settings.network.security.folder
+    needed = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve(), source.config.absolute(), keys)
+    homes = [path for path in needed if path and any(path.is_relative_to(home) for home in _HOMES)]
+    protected = "ProtectHome=read-only" if homes else "ProtectHome=yes"
+    if keys is not None and keys.exists():
+        return [f"# The keys in {keys} are its owner's alone.", f"User={keys.owner()}", protected]
     if not homes:
-        return ["DynamicUser=yes", "ProtectHome=yes"]
+        return ["DynamicUser=yes", protected]
     return [
         f"# {homes[0]} is in a home, so its owner runs the daemon; installed under /opt, it gets a user of its own.",
         f"User={homes[0].owner()}",
-        "ProtectHome=read-only",
+        protected,
     ]
 
 

@@ -6,6 +6,7 @@ What is silent is dimmed, and marked with the age of its last status. The table 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from rich.console import Group
@@ -14,6 +15,7 @@ from rich.text import Text
 
 from aeroloop.protocol.messages.models import Percentiles, Status
 from aeroloop.protocol.messages.states import NOT_RECORDING
+from aeroloop.protocol.transport.certificate import SOON_DAYS
 from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
 from aeroloop.service.host.operator import Gathered
 from aeroloop.service.terminal.console import Console
@@ -86,6 +88,12 @@ def _lines(role: str, age: float, status: Status, silent: bool) -> Iterator[Text
         yield Text(f"{role}: no status for {duration(age)}, then {status.state}", style=BAD)
     if status.cause:
         yield Text(f"{role}: {status.cause}", style=_STYLES.get(status.state, WAITING))
+    if status.certificate_until:
+        left = status.certificate_until - datetime.now(UTC)
+        if left < timedelta(days=SOON_DAYS):
+            yield Text(
+                f"{role}: its certificate expires at {status.certificate_until:%Y-%m-%d %H:%M} UTC", style=WAITING
+            )
     for note in status.notes:
         yield Text(f"{role}: {note}", style=WAITING)
     for fault in status.faults:

@@ -57,7 +57,7 @@ EVENTS: Final = (
 def be_a_guest(rendezvous: list[str]) -> None:
     """Follow lines of stdin: observe, record, leave, exit. Prints a line when each is done."""
     join(NetworkSettings(rendezvous=[]), listen=False).close()  # Zenoh's threads are there from now on
-    settings = NetworkSettings(rendezvous=rendezvous)
+    settings = NetworkSettings(rendezvous=rendezvous, insecure=True)
     session: zenoh.Session | None = None
     recorded: Subscriptions | None = None
     say("ready")

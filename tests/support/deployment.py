@@ -16,9 +16,12 @@ from subprocess import Popen
 from typing import Final, Literal, NamedTuple
 
 from aeroloop.protocol.messages.models import Event, Loss, Status
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.security import SecuritySettings
 from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil_log import HilLog
+from tests.support.certificates import Authority
 from tests.support.namespaces import STOP_WAIT_S, Hosts, Ways
 from tests.support.zenoh_network import eventually
 
@@ -52,7 +55,7 @@ class Outcome(NamedTuple):
 
 
 class Deployment(Hosts):
-    """Hosts of an example configuration.
+    """Hosts of an example configuration, with a certificate each.
 
     Attributes:
         daemons: By host, once started.
@@ -65,7 +68,19 @@ class Deployment(Hosts):
         self.log_file = folder / "log.mcap"
         self._seen = folder / "seen"
         self._overrides = overrides
+        self._keys = Authority(folder / "keys")
+        for role in HOSTS:
+            self._keys.issue(role, "aero" if role in ("plant", "controller") else None)
         self._troubles: list[tuple[str, float, float]] = []  # title, begin and end [s since 1970]
+
+    def options(self, overrides: Sequence[str] = ()) -> list[str]:
+        """As of any hosts, with certificates for the example's."""
+        return super().options([f"network.security.directory={self._keys.folder}", *overrides])
+
+    @property
+    def network(self) -> NetworkSettings:
+        """As of any hosts, with certificates for the example's."""
+        return super().network.model_copy(update={"security": SecuritySettings(directory=str(self._keys.folder))})
 
     def start(self, environments: Mapping[str, Mapping[str, str]] | None = None) -> None:
         """Start the daemons, each in its host's environment, and wait until the plant is driven."""

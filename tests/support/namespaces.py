@@ -96,7 +96,7 @@ class Hosts:
 
     def options(self, overrides: Sequence[str] = ()) -> list[str]:
         """Words of a command line: the configuration, or without one the rendezvous, and overrides."""
-        network = [] if self._config else [f"network.rendezvous={json.dumps(self.rendezvous)}"]
+        network = [] if self._config else [f"network.rendezvous={json.dumps(self.rendezvous)}", "network.insecure=true"]
         sets = [word for override in [*network, *overrides] for word in ("--set", override)]
         return [*(["--config", str(self._config)] if self._config else []), *sets]
 
@@ -124,9 +124,13 @@ class Hosts:
 
     def watch(self, host: str, seen: Path) -> subprocess.Popen[bytes]:
         """Write every status and event that a host receives into a file: a line of JSON each, `at` when it arrived."""
+        return self.python(host, "-m", "tests.support.namespaces", self.network.model_dump_json(), stdout=seen)
+
+    @property
+    def network(self) -> NetworkSettings:
+        """The network of the configuration, or without one the rendezvous in plain text."""
         configured = load_vehicle_address(self._config).network if self._config else None
-        network = configured or NetworkSettings(rendezvous=self.rendezvous)
-        return self.python(host, "-m", "tests.support.namespaces", network.model_dump_json(), stdout=seen)
+        return configured or NetworkSettings(rendezvous=self.rendezvous, insecure=True)
 
     def log(self, host: str) -> Path:
         """What processes on a host logged."""

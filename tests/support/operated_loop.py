@@ -137,7 +137,7 @@ class Loop:
     ) -> None:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
-            patch.setattr(role, "join", lambda _: self.network)
+            patch.setattr(role, "join", lambda *_: self.network)
             self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
         self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), reference)

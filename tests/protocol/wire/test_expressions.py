@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from functools import cache
 from math import copysign, inf, isnan, nan, nextafter
 from random import Random
+from threading import Event, Thread
 
 import casadi as ca
 import pytest
@@ -108,3 +109,29 @@ def test_what_is_built_as_written_keeps_its_order_and_the_switch_returns() -> No
     for value in (7e-3, -0.0):
         assert same(float(written(value)), (0.1 * (3.0 * value) + 1) - 1 + 0)
     assert float(simplified(7e-3)) != float(written(7e-3))
+
+
+def test_two_threads_never_build_as_written_at_once() -> None:
+    inside, first_may_end = Event(), Event()
+    order: list[str] = []
+
+    def first() -> None:
+        with as_written():
+            inside.set()
+            first_may_end.wait()
+            order.append("first ends")
+
+    def second() -> None:
+        with as_written(), as_written():  # nests in one thread
+            order.append("second begins")
+
+    threads = [Thread(target=first), Thread(target=second)]
+    threads[0].start()
+    inside.wait()
+    threads[1].start()
+    threads[1].join(0.05)  # time in which it would begin; if it does not, the order cannot fail
+    first_may_end.set()
+    for thread in threads:
+        thread.join()
+    assert order == ["first ends", "second begins"]
+    assert ca.GlobalOptions.getSimplificationOnTheFly()

@@ -126,7 +126,8 @@ def test_systemd_finds_nothing_wrong_with_any_unit(via: str, tmp_path: Path) -> 
 def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, tmp_path: Path) -> None:
     """The words of ExecStart, with a configuration that makes the daemon end at once, in a line of JSON."""
     config = tmp_path / "aero loop.toml"
-    config.write_text('[network]\nrendezvous = ""\nlisten = ["tcp/192.0.2.1:1"]\n')  # an address that is not ours
+    not_ours = 'listen = ["tcp/192.0.2.1:1"]'
+    config.write_text(f'[network]\nrendezvous = ""\n{not_ours}\ninsecure = true\n')
     overrides = ['network.connect=["tcp/127.0.0.1:9?a=$%"]']
     text = unit(name, Source(config, overrides, load(config, overrides)))
     start = next(line for line in text.splitlines() if line.startswith("ExecStart=")).removeprefix("ExecStart=")

@@ -1,0 +1,125 @@
+"""Security of links: mutual TLS beyond loopback, from a host's directory of certificates.
+
+An endpoint of TCP on another host than this becomes one of TLS; on loopback it stays as it is, unless
+`network.loopback_secured`. A process uses the certificate of its role and vehicle, to connect and to listen. Names of
+hosts do not matter: what a peer may do follows from its certificate's common name alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from pydantic import BaseModel, Field
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.transport.certificate import AUTHORITY, Certificate, own_certificate
+
+TLS: Final = ("tls", "quic")
+"""Protocols whose links are encrypted, both ends with a certificate."""
+_HERE: Final = ("unixsock-stream", "unixpipe", "shm")
+"""Protocols that stay on this host, where the file's mode says who may connect."""
+_PLACE: Final = re.compile(r"(?P<protocol>[a-z][a-z0-9_-]*)/(?P<host>.*?)(:\d+)?([?#].*)?")
+
+
+class SecurityError(AeroloopError):
+    """Links cannot be secured as configured; one line that says what to do."""
+
+
+class SecuritySettings(BaseModel, extra="forbid"):
+    """Certificates of this host."""
+
+    directory: str = Field(
+        default="",
+        description="folder of this host's certificates, as `aeroloop host keys` makes it; every link beyond loopback "
+        "is then mutual TLS; empty for none",
+    )
+
+    @property
+    def folder(self) -> Path | None:
+        """The directory, with `~` expanded."""
+        return Path(self.directory).expanduser() if self.directory else None
+
+
+class Identity(NamedTuple):
+    """What a process is: the first of these roles that the directory has a certificate of.
+
+    Attributes:
+        roles: The best one first.
+        vehicle: Name of its vehicle; None if a certificate of any will do.
+    """
+
+    roles: tuple[str, ...]
+    vehicle: str | None = None
+
+
+READER: Final = Identity(("operator", "observer"))
+"""A command or a viewer, of any vehicle."""
+
+
+def secured(endpoint: str, security: SecuritySettings, *, insecure: bool, loopback_secured: bool) -> str:
+    """The endpoint that is opened in place of a configured one.
+
+    Raises:
+        SecurityError: Its links would be plain text where they must not be, or there are no certificates for them.
+    """
+    protocol, _, rest = endpoint.partition("/")
+    must = is_plain(endpoint) or (loopback_secured and protocol not in (*TLS, *_HERE))
+    if security.directory:
+        if not must:
+            return endpoint
+        if protocol == "tcp":
+            return f"tls/{rest}"
+        raise SecurityError(f"{endpoint} is plain text: name a tcp or tls endpoint, which mutual TLS protects")
+    if protocol in TLS or (must and loopback_secured):
+        raise SecurityError(
+            f"{endpoint} needs certificates: make them with `aeroloop host keys`, and set network.security.directory"
+        )
+    if must and not insecure:
+        raise SecurityError(
+            f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle: set "
+            "network.security.directory (see `aeroloop host keys`), or network.insecure = true on a network of your own"
+        )
+    return endpoint
+
+
+def is_plain(endpoint: str) -> bool:
+    """Whether an endpoint's links are plain text that leaves this host, or may."""
+    parts = _PLACE.fullmatch(endpoint)
+    if parts is None:
+        return True
+    if parts["protocol"] in (*TLS, *_HERE) or parts["host"] == "localhost":
+        return False
+    try:
+        return not ip_address(parts["host"].strip("[]")).is_loopback
+    except ValueError:  # a name
+        return True
+
+
+def certificate_for(endpoints: Iterable[str], security: SecuritySettings, identity: Identity) -> Certificate | None:
+    """This process's own certificate, checked; None where none of its endpoints needs one. Raises CertificateError."""
+    if security.folder is None or not any(endpoint.partition("/")[0] in TLS for endpoint in endpoints):
+        return None
+    return own_certificate(security.folder, *identity)
+
+
+def tls_tree(certificate: Certificate) -> dict[str, Any]:
+    """Zenoh's configuration at `transport/link/tls`, for links of both directions.
+
+    The links of a peer close when its certificate expires. Zenoh's connecting side trusts the public authorities
+    besides ours; none of them signs a role's common name, so such a link is allowed nothing.
+    """
+    files = str(certificate.file.absolute()), str(certificate.key.absolute())
+    return {
+        "root_ca_certificate": str(certificate.file.absolute().with_name(AUTHORITY)),
+        **{f"{side}_{what}": file for side in ("listen", "connect") for what, file in zip(_FILES, files, strict=True)},
+        "enable_mtls": True,
+        "verify_name_on_connect": False,
+        "close_link_on_expiration": True,
+    }
+
+
+_FILES: Final = "certificate", "private_key"

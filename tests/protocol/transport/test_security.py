@@ -1,0 +1,212 @@
+"""Mutual TLS: plain text stays on this host, and only our authority's certificates link, until they expire."""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
+from aeroloop.protocol.transport.network import NetworkSettings, join, protected, visit
+from aeroloop.protocol.transport.refusal import PLAIN_S, RefusalWatch, refusal
+from aeroloop.protocol.transport.security import Identity, SecurityError, SecuritySettings, secured, tls_tree
+from aeroloop.service.testing.process_group import free_rendezvous
+from tests.support.certificates import DAY, Authority
+from tests.support.zenoh_network import eventually, free_port
+
+NO_KEYS, KEYS = SecuritySettings(), SecuritySettings(directory="/keys")
+PLANT, CONTROLLER = Identity(("plant",), "aero"), Identity(("controller",), "aero")
+HERE = ("tcp/127.0.0.1:1", "tcp/[::1]:1", "tcp/localhost:1", "udp/127.1.2.3:1", "unixsock-stream//run/a.sock")
+BEYOND = ("tcp/10.0.0.1:1", "tcp/[fe80::1]:1?iface=eth0", "tcp/0.0.0.0:1", "tcp/[::]:1", "tcp/lab-2:1")
+
+
+def opened(endpoint: str, security: SecuritySettings, **flags: bool) -> str:
+    return secured(endpoint, security, **{"insecure": False, "loopback_secured": False, **flags})
+
+
+@pytest.mark.parametrize("endpoint", BEYOND)
+def test_beyond_loopback_tcp_becomes_tls_or_is_refused_unless_that_is_written_down(endpoint: str) -> None:
+    assert opened(endpoint, KEYS) == opened(endpoint, KEYS, insecure=True) == "tls" + endpoint.removeprefix("tcp")
+    with pytest.raises(SecurityError, match=r"network\.insecure"):
+        opened(endpoint, NO_KEYS)
+    assert opened(endpoint, NO_KEYS, insecure=True) == endpoint
+
+
+@pytest.mark.parametrize("endpoint", HERE)
+def test_loopback_stays_as_it_is_unless_it_is_secured(endpoint: str) -> None:
+    assert opened(endpoint, KEYS) == opened(endpoint, NO_KEYS) == endpoint
+    if endpoint.startswith("tcp"):
+        assert opened(endpoint, KEYS, loopback_secured=True) == "tls" + endpoint.removeprefix("tcp")
+        with pytest.raises(SecurityError, match="needs certificates"):
+            opened(endpoint, NO_KEYS, loopback_secured=True, insecure=True)
+
+
+@pytest.mark.parametrize("endpoint", ["udp/10.0.0.1:1", "ws/10.0.0.1:1"])
+def test_other_plain_text_is_refused_beside_certificates(endpoint: str) -> None:
+    with pytest.raises(SecurityError, match="plain text"):
+        opened(endpoint, KEYS)
+    with pytest.raises(SecurityError, match="needs certificates"):
+        opened("tls/127.0.0.1:1", NO_KEYS, insecure=True)
+
+
+def test_plain_text_beyond_loopback_is_said_at_each_start(caplog: pytest.LogCaptureFixture) -> None:
+    network = NetworkSettings(rendezvous=[], connect=["tcp/192.0.2.1:1"])  # an address that nobody has
+    with pytest.raises(SecurityError):
+        join(network)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            join(network.model_copy(update={"insecure": True})).close()
+    assert len([line for line in caplog.messages if "tcp/192.0.2.1:1" in line and "insecure" in line]) == 2
+
+
+def test_certificates_are_needed_only_where_a_link_uses_them(tmp_path: Path) -> None:
+    nowhere = NetworkSettings(security=SecuritySettings(directory=str(tmp_path)))
+    assert protected(nowhere, PLANT) == (nowhere, None)
+    with pytest.raises(CertificateError, match=r"ca\.pem is missing"):  # never the system's authorities
+        protected(nowhere.model_copy(update={"loopback_secured": True}), PLANT)
+
+
+class Secured:
+    """A network on loopback with mutual TLS, and what its authority has issued."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        self.authority, self.foreign = Authority(tmp_path / "keys"), Authority(tmp_path / "foreign")
+        for role, vehicle in (("plant", "aero"), ("controller", "aero"), ("operator", None)):
+            self.authority.issue(role, vehicle)
+        self.settings = NetworkSettings(
+            rendezvous=[free_rendezvous()],
+            security=SecuritySettings(directory=str(self.authority.folder)),
+            loopback_secured=True,
+        )
+        self.place = protected(self.settings, PLANT).settings.places[0]
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Secured:
+    return Secured(tmp_path)
+
+
+def spoiled(network: Secured, kind: str) -> Path:
+    """A certificate that its holder should not have used."""
+    ours = network.authority
+    match kind:
+        case "expired":
+            return ours.issue("recorder", ends=-DAY)
+        case "not yet valid":
+            return ours.issue("recorder", begins=DAY, ends=2 * DAY)
+        case _:
+            return network.foreign.issue("recorder")
+
+
+SPOILED = ("expired", "not yet valid", "foreign")
+
+
+@contextmanager
+def bare(certificate: Path | None, **tree: Any) -> Iterator[zenoh.Session]:
+    """A session of Zenoh's alone, which checks nothing of its own certificate."""
+    tls = {"transport": {"link": {"tls": tls_tree(read_certificate(certificate))}}} if certificate else {}
+    config = {"scouting": {"multicast": {"enabled": False}}, **tls, **tree}
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        yield session
+
+
+def links(session: zenoh.Session) -> set[str | None]:
+    """Common names of a session's links."""
+    return {link.auth_identifier for link in session.info.links()}
+
+
+def test_peers_link_by_their_certificates_and_a_command_visits_them(network: Secured) -> None:
+    with join(network.settings, PLANT) as plant, join(network.settings, CONTROLLER) as controller:
+        eventually("a link", lambda: links(plant) == {"controller/aero"} and links(controller) == {"plant/aero"})
+        with visit(network.settings) as here:
+            here.settle()
+            assert here.silent() == []
+            assert links(here.session) == {"plant/aero", "controller/aero"}
+
+
+@pytest.mark.parametrize("kind", [*SPOILED, "none"])
+def test_a_peer_without_a_good_certificate_does_not_link(network: Secured, kind: str) -> None:
+    certificate = None if kind == "none" else spoiled(network, kind)
+    place = network.place.replace("tls", "tcp") if certificate is None else network.place
+    connect = {"endpoints": [place], "exit_on_failure": True, "timeout_ms": 0}
+    with (
+        join(network.settings, PLANT) as plant,
+        pytest.raises(zenoh.ZError),
+        bare(certificate, mode="client", connect=connect),
+    ):
+        pytest.fail(f"it links: {links(plant)}")
+
+
+def test_a_link_closes_when_its_certificate_expires(network: Secured) -> None:
+    soon = network.authority.issue("recorder", begins=-DAY, ends=timedelta(seconds=3))
+    connect = {"endpoints": [network.place], "exit_on_failure": True}
+    with join(network.settings, PLANT) as plant, bare(soon, mode="client", connect=connect):
+        eventually("the link", lambda: links(plant) == {"recorder"})
+        eventually("its end", lambda: not links(plant))
+
+
+THEIRS = {"expired": "certificate has expired", "not yet valid": "not yet valid by", "foreign": "not of this authority"}
+OURS = {"expired": "expired or not yet valid", "not yet valid": "expired or not yet valid"}
+
+
+@pytest.mark.parametrize("kind", SPOILED)
+def test_a_refused_peer_and_the_one_that_refuses_it_learn_why(network: Secured, kind: str) -> None:
+    wrong, mine = read_certificate(spoiled(network, kind)), read_certificate(network.authority.folder / "operator.pem")
+    with join(network.settings, PLANT):
+        assert refusal(network.place, mine) is None
+        line = refusal(network.place, wrong) or ""
+        assert network.place in line
+        assert OURS.get(kind, "not of this authority") in line
+    place = f"tls/127.0.0.1:{free_port()}"
+    with bare(wrong.file, listen={"endpoints": [place]}):
+        line = refusal(place, mine) or ""
+        assert place in line
+        assert THEIRS[kind] in line
+
+
+def test_a_peer_without_tls_is_told_from_one_that_is_halted(network: Secured) -> None:
+    mine = read_certificate(network.authority.folder / "operator.pem")
+    plain = NetworkSettings(rendezvous=[free_rendezvous()])
+    with join(plain):
+        assert "does not speak TLS" in (refusal(plain.places[0].replace("tcp", "tls"), mine, PLAIN_S) or "")
+    with socket.create_server(("127.0.0.1", 0)) as halted:
+        assert refusal(f"tls/127.0.0.1:{halted.getsockname()[1]}", mine) is None
+    assert refusal(f"tls/127.0.0.1:{free_port()}", mine) is None
+
+
+def test_a_command_says_why_a_place_does_not_answer(network: Secured) -> None:
+    from aeroloop.service.host.operator import OperatorError, gather
+
+    network.foreign.issue("operator")
+    theirs = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.foreign.folder))})
+    with join(network.settings, PLANT), pytest.raises(OperatorError, match="not of this authority"):
+        gather(theirs)
+
+
+def test_a_watch_says_each_reason_once(network: Secured, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_S", "EVERY_S"):
+        monkeypatch.setattr(f"aeroloop.protocol.transport.refusal.{name}", 0.0)
+    wrong, lines, looks = read_certificate(spoiled(network, "expired")), list[str](), list[int]()
+
+    def places() -> list[str]:
+        looks.append(1)
+        return [network.place]
+
+    with join(network.settings, PLANT):
+        watch = RefusalWatch(wrong, "aero", places, lines.append)
+        for cn in ("plant/aero", "operator", "plant/aero-2", "plant/aero-2", "evil.example", None):
+            watch.linked("10.0.0.9", cn)
+        eventually("a third look", lambda: len(looks) > 2)
+        watch.close()
+    linked = [line for line in lines if "10.0.0.9" in line]
+    assert len(lines) == len(set(lines)) == len(linked) + 1
+    for text, said in zip(linked, ("plant/aero-2", "evil.example", "None"), strict=True):
+        assert said in text

@@ -1,0 +1,206 @@
+"""Keys of a host: what is issued can be used, nothing is overwritten, and no key leaves its host."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import stat
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.transport.certificate import CertificateError, check, load, own_certificate, read_certificate
+from aeroloop.service.cli.main import execute as run
+from aeroloop.service.host import keys
+from aeroloop.service.host.doctor import _certificates
+from tests.support.certificates import DAY, Authority, common_name
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A directory with an authority."""
+    keys.init(tmp_path / "keys")
+    return tmp_path / "keys"
+
+
+@pytest.mark.parametrize(
+    ("role", "vehicle"), [("plant", "aero"), ("controller", "aero-2"), ("operator", None), ("recorder", "aero")]
+)
+def test_what_is_issued_can_be_used_for_ninety_days(folder: Path, role: str, vehicle: str | None) -> None:
+    file = keys.issue(folder, role, "lab 2", vehicle)
+    found = own_certificate(folder, (role,), vehicle)
+    assert (found.file, found.role, found.vehicle, found.name) == (file, role, vehicle, "lab 2")
+    assert 89.9 < found.days_left <= 90
+    assert load(file).subject.rfc4514_string() == f"OU=lab 2,CN={common_name(role, vehicle)}"
+
+
+def test_keys_are_the_owners_alone(folder: Path) -> None:
+    keys.issue(folder, "operator", "Ada")
+    keys.request(folder, "observer", "Ada")
+    keys.renew(folder, new_key=True)
+    secrets = [path for path in folder.iterdir() if b"PRIVATE" in path.read_bytes()]
+    assert len(secrets) == 4  # the authority's, the operator's two, the observer's
+    assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    folder.chmod(0o755)
+    with pytest.raises(CertificateError, match="chmod 700"):
+        keys.request(folder, "recorder", "Ada")
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        keys.init,
+        lambda folder: keys.issue(folder, "operator", "Eve"),
+        lambda folder: keys.request(folder, "operator", "Eve"),
+        lambda folder: keys.request(folder, "observer", "Eve"),
+        lambda folder: keys.issue(folder, "observer", "Eve"),
+        lambda folder: keys.issue_requested(folder, folder / "operator.csr"),
+    ],
+)
+def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -> None:
+    keys.issue(folder, "operator", "Ada")
+    keys.request(folder, "observer", "Ada")
+    shutil.copy(folder / "observer.csr", folder / "operator.csr")
+    before = files(folder)
+    with pytest.raises(CertificateError, match="is not overwritten"):
+        again(folder)
+    assert files(folder) == before
+
+
+def test_a_request_is_signed_and_its_key_stays_where_it_was_made(folder: Path, tmp_path: Path) -> None:
+    far, here = tmp_path / "far", tmp_path / "here"
+    here.mkdir()
+    asked = shutil.copy(keys.request(far, "plant", "bench", "aero"), here)
+    signed = keys.issue_requested(folder, Path(asked), days=7)
+    shutil.copy(signed, far)
+    shutil.copy(folder / "ca.pem", far)
+    assert own_certificate(far, ("plant",), "aero").name == "bench"
+    assert sorted(files(folder)) == ["ca.key", "ca.pem"]
+    again = keys.renew(far)  # without the authority's key
+    assert again == [far / "plant.aero.csr"]
+    with pytest.raises(CertificateError, match=r"ca\.key is not here"):
+        keys.issue(far, "operator", "Ada")
+
+
+@pytest.mark.parametrize("new_key", [False, True])
+def test_a_renewed_certificate_is_good_for_longer_and_what_it_replaces_is_kept(folder: Path, new_key: bool) -> None:
+    file = keys.issue(folder, "plant", "bench", "aero", days=1)
+    keys.issue(folder, "operator", "Ada", days=1)
+    before, old = files(folder), read_certificate(file)
+    assert keys.renew(folder, ["plant"], new_key=new_key) == [file]
+    found = check(file, "plant", "aero")
+    assert found.not_after - old.not_after > 80 * DAY
+    assert (found.name, found.vehicle) == (old.name, old.vehicle)
+    after = files(folder)
+    kept = f".{old.fingerprint[:8]}"
+    assert after[f"plant.aero.pem{kept}"] == before["plant.aero.pem"]
+    assert (after["plant.aero.key"] == before["plant.aero.key"]) != new_key
+    assert after.get(f"plant.aero.key{kept}") == (before["plant.aero.key"] if new_key else None)
+    assert after["operator.pem"] == before["operator.pem"]
+    with pytest.raises(CertificateError, match="no certificate of router"):
+        keys.renew(folder, ["router"])
+
+
+def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
+    keys.init(tmp_path / "keys", days=30)
+    file = keys.issue(tmp_path / "keys", "operator", "Ada")
+    assert read_certificate(file).not_after == load(tmp_path / "keys" / "ca.pem").not_valid_after_utc
+
+
+@pytest.mark.parametrize(
+    ("role", "name", "vehicle", "says"),
+    [
+        ("pilot", "Ada", None, "roles are plant, controller"),
+        ("plant", "bench", None, "--vehicle V"),
+        ("plant", "bench", "a/b", "cannot name a vehicle"),
+        ("controller", "bench", "a" * 60, "too long"),
+        ("operator", "", None, "1 to 64"),
+        ("operator", "a\nb", None, "1 to 64"),
+    ],
+)
+def test_what_cannot_be_in_a_certificate_is_refused(
+    folder: Path, role: str, name: str, vehicle: str | None, says: str
+) -> None:
+    before = files(folder)
+    for make in (keys.issue, keys.request):
+        with pytest.raises(CertificateError, match=says) as caught:
+            make(folder, role, name, vehicle)
+        assert "\n" not in str(caught.value)
+    assert files(folder) == before
+
+
+def test_a_request_of_anything_else_is_not_signed(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.csr").write_text("x")
+    with pytest.raises(CertificateError, match="no request in PEM"):
+        keys.issue_requested(folder, tmp_path / "x.csr")
+    with pytest.raises(CertificateError, match="cannot be read"):
+        keys.issue_requested(folder, tmp_path / "y.csr")
+
+
+def test_what_expires_soon_or_cannot_be_used_is_shown(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    authority = Authority(tmp_path / "keys", days=100)
+    authority.issue("plant", "aero", ends=50 * DAY)
+    authority.issue("operator", ends=13 * DAY)
+    findings = {finding.what: finding for finding in _certificates(authority.folder)}
+    assert [name for name, finding in findings.items() if not finding.good] == ["operator.pem"]
+    assert "13 days left" in findings["operator.pem"].found
+    assert "keys renew operator" in findings["operator.pem"].advice
+    words = ["host", "keys", "show", "--json", "--set", f"network.security.directory={authority.folder}"]
+    assert run(words) == 0
+    authority.issue("observer", ends=-DAY)
+    assert run(words) == 1
+    rows = {row["file"]: row for row in json.loads(capfd.readouterr().out.partition("]\n")[2])}
+    assert "expired" in rows["observer.pem"]["problem"]
+    assert rows["plant.aero.pem"]["problem"] is None
+    assert 49 < rows["plant.aero.pem"]["days_left"] < 51
+    assert not {finding.what: finding for finding in _certificates(authority.folder)}["observer.pem"].good
+    (missing,) = _certificates(tmp_path)
+    assert not missing.good
+    monkeypatch.setenv("COLUMNS", "120")
+    assert run([*words[:3], *words[4:]]) == 1
+    assert "observer.pem expired" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(("days", "said"), [(13, True), (15, False)])
+def test_the_status_of_a_role_says_when_its_certificate_expires_soon(
+    days: int, said: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from datetime import UTC, datetime
+
+    from aeroloop.service.host.operator import Gathered
+    from aeroloop.service.terminal.roles import status_view
+
+    until = datetime.now(UTC) + timedelta(days=days)
+    status = Status(
+        role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0, certificate_until=until
+    )  # fmt: skip
+    status_view(Gathered({"aero": {"plant": status}}, []))
+    assert (f"expires at {until:%Y-%m-%d}" in capfd.readouterr().out) == said
+
+
+def test_the_command_line_makes_what_two_hosts_need(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    lab, far = str(tmp_path / "lab"), str(tmp_path / "far")
+    configured = ["--set", f"network.security.directory={lab}"]
+    assert run(["host", "keys", "init", *configured]) == 0
+    assert run(["host", "keys", "issue", "operator", "Ada", "--days", "7", *configured]) == 0
+    assert run(["host", "keys", "request", "plant", "bench", "--vehicle", "aero", "--directory", far]) == 0
+    assert run(["host", "keys", "issue", "--request", f"{far}/plant.aero.csr", "--directory", lab]) == 0
+    out = capfd.readouterr().out.splitlines()
+    assert out == [f"{lab}/ca.pem", f"{lab}/operator.pem", f"{far}/plant.aero.csr", f"{far}/plant.aero.pem"]
+    assert run(["host", "keys", "issue", *configured]) == 2
+    assert run(["host", "keys", "issue", "plant", "bench", *configured]) == 1
+    assert capfd.readouterr().err.count("aeroloop: ") == 2
+    assert run(["host", "keys", "renew", "operator", *configured]) == 0
+    shutil.copy(Path(lab, "ca.pem"), far)
+    assert own_certificate(Path(far), ("plant",), "aero").name == "bench"
+    assert own_certificate(Path(lab), ("operator",), None).days_left > 80
