@@ -274,11 +274,9 @@ def _join_router(network: Protected) -> zenoh.Session:
 def _no_router(network: Protected) -> str:
     """One line about routers that do not answer."""
     places = [*network.settings.connect, *network.settings.places]
-    hung = accepting(places)
-    if hung and network.certificate is not None:
-        return f"{hung[0]}: {refusal(hung[0], network.certificate) or 'the router does not answer'}"
-    if hung:
-        return f"a process at {', '.join(hung)} accepts connections and does not answer as a router"
+    for place in accepting(places):
+        why = refusal(place, network.certificate) if network.certificate else None
+        return why or f"a process at {place} accepts connections and does not answer as a router"
     return f"no router answers at {', '.join(places)}; is `aeroloop router` running?"
 
 

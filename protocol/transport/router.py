@@ -63,10 +63,10 @@ def router_tree(settings: NetworkSettings, identity: Identity = ROUTER) -> dict[
     }
 
 
-def zenohd_config(settings: NetworkSettings) -> str:
-    """The configuration as JSON5, for a stock `zenohd` of the same version."""
+def zenohd_config(settings: NetworkSettings, identity: Identity = ROUTER) -> str:
+    """The configuration as JSON5, for a stock `zenohd` of the same version. Raises as `protected`."""
     return (
         f"// Router of aeroloop, for zenohd {version('eclipse-zenoh')}:\n"
         f"// ZENOH_RUNTIME='{os.environ['ZENOH_RUNTIME']}' zenohd --config FILE\n"
-        f"{json.dumps(router_tree(settings), indent=2)}\n"
+        f"{json.dumps(router_tree(settings, identity), indent=2)}\n"
     )

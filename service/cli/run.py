@@ -191,8 +191,10 @@ def router(
     settings, load = reloadable(options.config, options.overrides)
     if print_config:
         from aeroloop.protocol.transport.router import zenohd_config
+        from aeroloop.protocol.transport.security import Identity
 
-        typer.echo(zenohd_config(settings.network), nl=False)
+        with guarded():
+            typer.echo(zenohd_config(settings.network, Identity(("router",), settings.vehicle)), nl=False)
         return
 
     def run(role: Role) -> None:

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -17,12 +18,19 @@ from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringS
 from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
 from aeroloop.service.host.operator import stop
 from tests.protocol.transport.test_network import Listener, one_line, receives
+from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually, free_port
 
 
-@pytest.fixture
-def settings() -> NetworkSettings:
-    return NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"])
+@pytest.fixture(params=["tcp", "tls"])
+def settings(request: pytest.FixtureRequest, tmp_path: Path) -> NetworkSettings:
+    """Of clients and their router, in plain text and with certificates."""
+    authority = Authority(tmp_path)
+    for role in ("router", "operator"):
+        authority.issue(role)
+    secured = {"security": {"directory": str(tmp_path)}, "loopback_secured": True} if request.param == "tls" else {}
+    rendezvous = [f"{request.param}/127.0.0.1:{free_port()}"]
+    return NetworkSettings.model_validate({"mode": "client", "rendezvous": rendezvous, **secured})
 
 
 @pytest.fixture
@@ -112,6 +120,20 @@ def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
     open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}))))
     near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
     receives(Listener(near, "t/word"), far, b"over both")
+
+
+def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
+    ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
+    ours.issue("router")
+    foreign.issue("operator")
+    network = {"mode": "client", "rendezvous": f"tls/127.0.0.1:{free_port()}", "loopback_secured": True}
+    mine, theirs = (
+        NetworkSettings.model_validate({**network, "security": {"directory": str(each.folder)}})
+        for each in (ours, foreign)
+    )
+    with closing(route(mine)), pytest.raises(NetworkError) as caught, visit(theirs):
+        pass
+    assert "not of this authority" in one_line(caught.value)
 
 
 def test_a_router_that_cannot_listen_says_so_in_one_line(settings: NetworkSettings) -> None:
