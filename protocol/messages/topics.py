@@ -1,14 +1,15 @@
-"""Topics: the one table of what crosses the network, with keys, senders, rates and models.
+"""Topics: the one table of what crosses the network, with keys, roles, models and sizes.
 
 Every key starts with `aeroloop/<vehicle>/`. Frames travel under the session's own keys, so that frames of another
-controller, or of another wire spec, cannot arrive. Services and the recorder look topics up here.
+controller, or of another wire spec, cannot arrive. Services and the recorder look topics up here, and a network with
+certificates takes its access rules from here (transport/access.py).
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 from aeroloop.protocol.messages.models import (
     Claim,
@@ -24,6 +25,21 @@ from aeroloop.protocol.messages.models import (
 from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Setpoint, Track
 
 ROOT: Final = "aeroloop"
+RoleName = Literal["plant", "controller", "operator", "observer", "recorder"]
+"""What a process does on the network: a daemon of that name, or a command with that right."""
+_Roles = tuple[RoleName, ...]
+ROLES: Final[_Roles] = get_args(RoleName)
+Action = Literal["publish", "subscribe", "query", "answer", "hold", "watch"]
+"""What a role does with a topic; a liveliness token is held and watched."""
+
+_PLANT: Final[_Roles] = ("plant",)
+_CONTROLLER: Final[_Roles] = ("controller",)
+_OPERATOR: Final[_Roles] = ("operator",)
+_RECORDER: Final[_Roles] = ("recorder",)
+_ENDS: Final = _PLANT + _CONTROLLER
+_DAEMONS: Final = _ENDS + _RECORDER
+_READERS: Final[_Roles] = ("operator", "observer", "recorder")
+
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
 
@@ -49,8 +65,8 @@ class Topic:
         key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
         carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
             reply), `token` (liveliness, no payload).
-        sender: Role that publishes or queries it.
-        rate: How often.
+        senders: Roles that publish it, hold it or query by it; under its own role where the key has one.
+        receivers: Roles that subscribe to it, watch it or answer it.
         model: Model of its messages or requests; None of frames, traces and tokens, and where a request is empty.
         decoded: For viewers: `always` or at most at the `limited` rate; None where nothing is shown.
         limit: Most bytes of payload and attachment. What is longer is neither published nor received.
@@ -59,8 +75,8 @@ class Topic:
     name: str
     key: str
     carries: Literal["frame", "trace", "json", "query", "token"]
-    sender: str
-    rate: str
+    senders: _Roles
+    receivers: _Roles
     model: type[Message] | None = None
     decoded: Literal["always", "limited"] | None = None
     limit: int = MESSAGE_BYTES
@@ -79,45 +95,29 @@ class Topic:
 TOPICS: Final = {
     topic.name: topic
     for topic in (
-        Topic("claim", "claim", "query", "controller", "once a session", Claim, limit=POINTS_BYTES),
-        Topic("release", "release", "query", "controller", "once a session", Release),
-        Topic(
-            "record",
-            "record",
-            "query",
-            "controller",
-            "at a session's start and on change",
-            SessionRecord,
-            limit=POINTS_BYTES,
-        ),
-        Topic("arm", "arm", "query", "operator", "when needed"),
-        Topic("stop", "stop", "query", "operator", "when needed"),
-        Topic("stand_down", "stand-down", "query", "operator", "when needed"),
-        Topic("recall", "recall", "query", "operator", "when needed"),
-        Topic("show", "show", "query", "operator", "when needed", limit=POINTS_BYTES),
-        Topic("set_gains", "set-gains", "query", "operator", "when needed", Gains),
-        Topic("track", "track", "query", "operator", "when needed", Track, limit=POINTS_BYTES),
-        Topic("inject", "inject", "query", "operator", "when needed", Inject),
-        Topic("advance", "advance", "query", "operator", "when needed", Advance),
-        Topic(
-            "description",
-            "description/{role}",
-            "json",
-            "every role",
-            "at start and on change",
-            Description,
-            limit=POINTS_BYTES,
-        ),
-        Topic("measurement", "{session}/measurement", "frame", "plant", "every tick of a session", limit=FRAME_BYTES),
-        Topic("command", "{session}/command", "frame", "controller", "answers a measurement", limit=FRAME_BYTES),
-        Topic("telemetry", "telemetry", "json", "controller", "telemetry_rate", Telemetry, "limited", SAMPLE_BYTES),
-        Topic("trace", "trace/{role}", "trace", "plant, controller", "trace_s", limit=POINTS_BYTES),
-        Topic("reference", "reference", "json", "operator", "as it streams", Setpoint, "limited", SAMPLE_BYTES),
-        Topic("truth", "truth", "json", "plant", "truth_rate", Truth, "limited", SAMPLE_BYTES),
-        Topic("status", "status/{role}", "json", "every role", "1 Hz and on change", Status, "always", STATUS_BYTES),
-        Topic("event", "event", "json", "every role", "when it happens", Event, "always"),
-        Topic("loss", "loss", "json", "recorder", "when it is found", Loss, "always"),
-        Topic("alive", "alive/{role}", "token", "every role", "while it runs"),
+        Topic("claim", "claim", "query", _CONTROLLER, _PLANT, Claim, limit=POINTS_BYTES),
+        Topic("release", "release", "query", _CONTROLLER, _PLANT, Release),
+        Topic("record", "record", "query", _CONTROLLER, _PLANT, SessionRecord, limit=POINTS_BYTES),
+        Topic("arm", "arm", "query", _OPERATOR, _PLANT),
+        Topic("stop", "stop", "query", _OPERATOR, _PLANT),
+        Topic("stand_down", "stand-down", "query", _OPERATOR, _CONTROLLER),
+        Topic("recall", "recall", "query", _OPERATOR, _CONTROLLER),
+        Topic("show", "show", "query", _READERS, _ENDS, limit=POINTS_BYTES),
+        Topic("set_gains", "set-gains", "query", _OPERATOR, _CONTROLLER, Gains),
+        Topic("track", "track", "query", _OPERATOR, _CONTROLLER, Track, limit=POINTS_BYTES),
+        Topic("inject", "inject", "query", _OPERATOR, _PLANT, Inject),
+        Topic("advance", "advance", "query", _OPERATOR, _PLANT, Advance),
+        Topic("description", "description/{role}", "json", _DAEMONS, _READERS, Description, limit=POINTS_BYTES),
+        Topic("measurement", "{session}/measurement", "frame", _PLANT, _CONTROLLER + _READERS, limit=FRAME_BYTES),
+        Topic("command", "{session}/command", "frame", _CONTROLLER, _PLANT + _READERS, limit=FRAME_BYTES),
+        Topic("telemetry", "telemetry", "json", _CONTROLLER, _READERS, Telemetry, "limited", SAMPLE_BYTES),
+        Topic("trace", "trace/{role}", "trace", _ENDS, _READERS, limit=POINTS_BYTES),
+        Topic("reference", "reference", "json", _OPERATOR, _CONTROLLER + _READERS, Setpoint, "limited", SAMPLE_BYTES),
+        Topic("truth", "truth", "json", _PLANT, _READERS, Truth, "limited", SAMPLE_BYTES),
+        Topic("status", "status/{role}", "json", _DAEMONS, _ENDS + _READERS, Status, "always", STATUS_BYTES),
+        Topic("event", "event", "json", _DAEMONS, _READERS, Event, "always"),
+        Topic("loss", "loss", "json", _RECORDER, _READERS, Loss, "always"),
+        Topic("alive", "alive/{role}", "token", _DAEMONS, _ENDS + _READERS),
     )
 }
 
@@ -126,6 +126,17 @@ RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorde
 
 FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
 """Topics of frames."""
+
+_Actions = tuple[Action, ...]
+_CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer", "hold"), ("subscribe", "query", "watch")
+ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {
+    "frame": (("publish",), ("subscribe",)),
+    "json": _CACHED,
+    "trace": _CACHED,
+    "query": (("query",), ("answer",)),
+    "token": (("hold",), ("watch",)),
+}
+"""What senders and what receivers do, by what a topic carries. A cache has a token and answers queries."""
 
 _CHUNKS: Final = {"session": "(?P<session>[^/]+)", "role": "(?P<role>[^/]+)"}
 _PATTERNS: Final = [

@@ -132,7 +132,7 @@ class Role:
 
     def _watch_refusals(self, network: NetworkSettings) -> RefusalWatch | None:
         """Publish an event for each peer that refuses this role's certificate, or whose own is refused."""
-        settings, certificate = protected(network, Identity((self.role,), self.vehicle))
+        settings, certificate, _ = protected(network, Identity((self.role,), self.vehicle))
         if certificate is None:
             return None
         self._certificate_until = certificate.not_after

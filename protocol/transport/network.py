@@ -30,6 +30,7 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.access import access_control
 from aeroloop.protocol.transport.certificate import Certificate
 from aeroloop.protocol.transport.refusal import refusal
 from aeroloop.protocol.transport.security import (
@@ -159,10 +160,12 @@ class Protected(NamedTuple):
     Attributes:
         settings: The network.
         certificate: Its certificate; None where no link needs one.
+        vehicles: Those whose peers it takes messages of; none are all of them.
     """
 
     settings: NetworkSettings
     certificate: Certificate | None
+    vehicles: tuple[str, ...] = ()
 
 
 def protected(settings: NetworkSettings, identity: Identity) -> Protected:
@@ -181,7 +184,10 @@ def protected(settings: NetworkSettings, identity: Identity) -> Protected:
         for name in ("rendezvous", "listen", "connect")
     }
     network = settings.model_copy(update=update)
-    return Protected(network, certificate_for(network.endpoints, settings.security, identity))
+    certificate = certificate_for(network.endpoints, settings.security, identity)
+    own = (identity.vehicle, certificate.vehicle) if certificate else ()
+    named = [name for name in (*own, *settings.security.vehicles) if name is not None]
+    return Protected(network, certificate, tuple(dict.fromkeys(named)))
 
 
 class Visit:
@@ -359,7 +365,7 @@ def session_tree(
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> dict[str, Any]:
     """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
-    settings, certificate = network
+    settings, certificate, vehicles = network
     tree: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -394,6 +400,8 @@ def session_tree(
         tree["transport"]["link"]["tls"] = tls_tree(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
         tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
+        if vehicles:
+            tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
     return tree
 
 

@@ -163,7 +163,6 @@ class RecoveringSubscriber:
             RingChannel(waiting),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-            subscriber_detection=True,
         )
         self._misses = self._subscriber.sample_miss_listener(RingChannel(1024))
         self._session = session

@@ -106,13 +106,15 @@ class RefusalWatch:
         self._certificate, self._vehicle = certificate, vehicle
         self._places, self._report = places, report
         self._said: set[str] = set()
-        self._lines = SimpleQueue[str | None]()  # None ends the thread
+        self._lines = SimpleQueue[str]()
+        self._lock, self._closed = threading.Lock(), False
         threading.Thread(target=self._run, name="refusals", daemon=True).start()
 
     def close(self) -> None:
-        """End the thread; nothing is reported from now on."""
-        self._said = {"closed"}
-        self._lines.put(None)
+        """Neither look nor report from now on; the thread ends when its handshake has."""
+        with self._lock:
+            self._closed = True
+        self._lines.put("")  # wakes it
 
     def linked(self, host: str, common_name: str | None) -> None:
         """Report a link whose certificate gives its peer no right here: of no role, or of another vehicle."""
@@ -124,17 +126,16 @@ class RefusalWatch:
 
     def _run(self) -> None:
         due = time.monotonic() + FIRST_S
-        while True:
+        while not self._closed:
             try:
-                line = self._lines.get(timeout=max(0.0, due - time.monotonic()))
+                lines: list[str | None] = [self._lines.get(timeout=max(0.0, due - time.monotonic()))]
             except Empty:
-                lines = [refusal(place, self._certificate, PLAIN_S) for place in self._places()]
+                with self._lock:
+                    places = [] if self._closed else list(self._places())
+                lines = [refusal(place, self._certificate, PLAIN_S) for place in places]
                 due = time.monotonic() + EVERY_S
-            else:
-                if line is None:
-                    return
-                lines = [line]
-            for each in lines:
-                if each is not None and each not in self._said and len(self._said) < self.MAX_SAID:
-                    self._said.add(each)
-                    self._report(each)
+            with self._lock:
+                for line in [] if self._closed else lines:
+                    if line and line not in self._said and len(self._said) < self.MAX_SAID:
+                        self._said.add(line)
+                        self._report(line)

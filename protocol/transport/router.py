@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any
 
 import zenoh
 
@@ -25,10 +25,8 @@ from aeroloop.protocol.transport.network import (
 )
 from aeroloop.protocol.transport.security import Identity
 
-ROUTER: Final = Identity(("router",))
 
-
-def route(settings: NetworkSettings, identity: Identity = ROUTER) -> zenoh.Session:
+def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
     """Open a router's session. The caller closes it.
 
     Raises:
@@ -47,8 +45,8 @@ def route(settings: NetworkSettings, identity: Identity = ROUTER) -> zenoh.Sessi
         ) from None
 
 
-def router_tree(settings: NetworkSettings, identity: Identity = ROUTER) -> dict[str, Any]:
-    """Zenoh's configuration of a router, with mutual TLS as every session has it. Raises as `protected`."""
+def router_tree(settings: NetworkSettings, identity: Identity) -> dict[str, Any]:
+    """Zenoh's configuration of a router, with certificate and rules as any session's. Raises as `protected`."""
     network = protected(settings, identity)
     rendezvous = network.settings.rendezvous
     here = [place for place in rendezvous if is_own(place)] or rendezvous
@@ -63,7 +61,7 @@ def router_tree(settings: NetworkSettings, identity: Identity = ROUTER) -> dict[
     }
 
 
-def zenohd_config(settings: NetworkSettings, identity: Identity = ROUTER) -> str:
+def zenohd_config(settings: NetworkSettings, identity: Identity) -> str:
     """The configuration as JSON5, for a stock `zenohd` of the same version. Raises as `protected`."""
     return (
         f"// Router of aeroloop, for zenohd {version('eclipse-zenoh')}:\n"

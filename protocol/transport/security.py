@@ -11,11 +11,12 @@ import re
 from collections.abc import Iterable
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.topics import NAME
 from aeroloop.protocol.transport.certificate import AUTHORITY, Certificate, own_certificate
 
 TLS: Final = ("tls", "quic")
@@ -36,6 +37,11 @@ class SecuritySettings(BaseModel, extra="forbid"):
         default="",
         description="folder of this host's certificates, as `aeroloop host keys` makes it; every link beyond loopback "
         "is then mutual TLS; empty for none",
+    )
+
+    vehicles: list[Annotated[str, Field(pattern=f"^{NAME}$")]] = Field(
+        default=[],
+        description="further vehicles that a recorder, an operator or an observer of every vehicle takes messages of",
     )
 
     @property

@@ -20,7 +20,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
-from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, visit
+from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, is_own, visit
 from aeroloop.protocol.transport.refusal import refusal
 from aeroloop.protocol.transport.security import READER, Identity
 
@@ -84,7 +84,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
     Raises:
         OperatorError: No role answers, or it refuses.
     """
-    with visit(network, ANSWER_S, Identity(("operator",), vehicle)) as here:
+    with visit(network, ANSWER_S, Identity(topics.TOPICS[topic].senders, vehicle)) as here:
         answers: list[Answer] = []
         deadline = time.monotonic() + ANSWER_S
         while not answers and time.monotonic() < deadline:
@@ -130,7 +130,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
         if reply.ok is not None and address is not None:
             answers[address.vehicle].append(Answer.model_validate_json(reply.ok.payload.to_bytes()).text)
 
-    with visit(network, wait_s, Identity(("operator",), None if vehicle == "*" else vehicle)) as here:
+    with visit(network, wait_s, Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)) as here:
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < wait_s:
             # A plant declares its token last, so one with a token answers.
@@ -213,7 +213,7 @@ def _unanswered(here: Visit, but: Sequence[str] = (), *, why: bool = True) -> li
     """
     lines = []
     for place in here.silent():
-        process = listener(place)
+        process = listener(place) if is_own(place) else None
         if process is None or process.role not in but:
             name = f"the {process}" if process else "the process"
             refused = refusal(place, here.certificate) if why and here.certificate else None

@@ -10,7 +10,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.messages.topics import FRAMES, NAME, RECORDED, TOPICS, Address, Topic, key, read_key
+from aeroloop.protocol.messages.topics import FRAMES, NAME, RECORDED, ROLES, TOPICS, Address, Topic, key, read_key
 
 every_topic = pytest.mark.parametrize("topic", TOPICS.values(), ids=list(TOPICS))
 
@@ -60,6 +60,31 @@ def test_every_topic_is_called_what_the_table_calls_it_and_has_a_key_of_its_own(
 def test_every_json_topic_has_a_model_and_no_frame_trace_or_token_has_one(topic: Topic) -> None:
     if topic.carries != "query":
         assert (topic.model is not None) == (topic.carries == "json")
+
+
+def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
+    presence = {"description", "status", "event", "alive"}
+    assert {role: {topic.name for topic in TOPICS.values() if role in topic.senders} for role in ROLES} == {
+        "plant": presence | {"measurement", "truth", "trace"},
+        "controller": presence | {"claim", "release", "record", "command", "telemetry", "trace"},
+        "recorder": presence | {"loss", "show"},
+        "operator": {"arm", "stop", "stand_down", "recall", "show", "set_gains", "track", "inject", "advance"}
+        | {"reference"},
+        "observer": {"show"},
+    }
+    queries = [topic for topic in TOPICS.values() if topic.carries == "query"]
+    assert {role: {topic.name for topic in queries if role in topic.receivers} for role in ROLES} == {
+        "plant": {"claim", "release", "record", "show", "arm", "stop", "inject", "advance"},
+        "controller": {"show", "set_gains", "track", "stand_down", "recall"},
+        "operator": set(),
+        "observer": set(),
+        "recorder": set(),
+    }
+
+
+@every_topic
+def test_whatever_is_published_may_be_observed(topic: Topic) -> None:
+    assert ("observer" in topic.receivers) == (topic.carries != "query")
 
 
 def test_an_unknown_topic_has_no_key() -> None:

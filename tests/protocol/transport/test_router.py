@@ -16,10 +16,14 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join, visit
 from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
+from aeroloop.protocol.transport.security import Identity
 from aeroloop.service.host.operator import stop
 from tests.protocol.transport.test_network import Listener, one_line, receives
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually, free_port
+
+ROUTER = Identity(("router",))
+"""Of no vehicle, so without rules: the keys here are of no topic."""
 
 
 @pytest.fixture(params=["tcp", "tls"])
@@ -43,7 +47,7 @@ def open_sessions() -> Iterator[ExitStack]:
 def test_clients_link_to_the_router_alone_and_receive_through_it(
     settings: NetworkSettings, open_sessions: ExitStack
 ) -> None:
-    router = open_sessions.enter_context(closing(route(settings)))
+    router = open_sessions.enter_context(closing(route(settings, ROUTER)))
     clients = [open_sessions.enter_context(closing(join(settings))) for _ in range(3)]
     ear = Listener(clients[0], "t/word")
     for client in clients[1:]:
@@ -61,7 +65,7 @@ def test_a_client_that_starts_first_waits_for_the_router(settings: NetworkSettin
     with pytest.raises(NetworkError):  # a command does not wait
         visit(settings).__enter__()
     assert not joined
-    open_sessions.enter_context(closing(route(settings)))
+    open_sessions.enter_context(closing(route(settings, ROUTER)))
     thread.join()
     open_sessions.enter_context(closing(joined[0]))
     with visit(settings) as here:
@@ -86,7 +90,7 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
     settings: NetworkSettings, open_sessions: ExitStack
 ) -> None:
     """Its cache holds it. Tokens that were declared before are seen again, too."""
-    router = route(settings)
+    router = route(settings, ROUTER)
     speaker, listener = (open_sessions.enter_context(closing(join(settings))) for _ in range(2))
     publisher, subscriber = CachedPublisher(speaker, "t/word", 10.0), RecoveringSubscriber(listener, "t/word")
     tokens: list[zenoh.SampleKind] = []
@@ -103,7 +107,7 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
     router.close()
     eventually("the token's end", lambda: tokens == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE])
     publisher.put(b"away")
-    with closing(route(settings)):
+    with closing(route(settings, ROUTER)):
         eventually("the second", lambda: arrived(b"before", b"away"))
         eventually("the token", lambda: len(tokens) == 3)
         publisher.put(b"again")
@@ -116,8 +120,8 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
 def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
     """On hosts of their own both stand in the rendezvous; here all addresses are this host's."""
     first, second = (NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"]) for _ in range(2))
-    open_sessions.enter_context(closing(route(first)))
-    open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}))))
+    open_sessions.enter_context(closing(route(first, ROUTER)))
+    open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}), ROUTER)))
     near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
     receives(Listener(near, "t/word"), far, b"over both")
 
@@ -131,23 +135,23 @@ def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None
         NetworkSettings.model_validate({**network, "security": {"directory": str(each.folder)}})
         for each in (ours, foreign)
     )
-    with closing(route(mine)), pytest.raises(NetworkError) as caught, visit(theirs):
+    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, visit(theirs):
         pass
     assert "not of this authority" in one_line(caught.value)
 
 
 def test_a_router_that_cannot_listen_says_so_in_one_line(settings: NetworkSettings) -> None:
-    with closing(route(settings)), pytest.raises(NetworkError) as caught:
-        route(settings)
+    with closing(route(settings, ROUTER)), pytest.raises(NetworkError) as caught:
+        route(settings, ROUTER)
     assert f"cannot listen on {settings.rendezvous[0]}" in one_line(caught.value)
 
 
 def test_the_printed_configuration_is_the_routers_own_and_opens_one(
     settings: NetworkSettings, open_sessions: ExitStack
 ) -> None:
-    text = zenohd_config(settings)
+    text = zenohd_config(settings, ROUTER)
     lines = [line for line in text.splitlines() if not line.startswith("//")]
-    assert json.loads("\n".join(lines)) == router_tree(settings)
+    assert json.loads("\n".join(lines)) == router_tree(settings, ROUTER)
     router = open_sessions.enter_context(closing(zenoh.open(zenoh.Config.from_json5(text))))
     client = open_sessions.enter_context(closing(join(settings)))
     assert list(client.info.routers_zid()) == [router.zid()]
@@ -157,7 +161,7 @@ def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
     settings: NetworkSettings, open_sessions: ExitStack
 ) -> None:
     """A plant that hangs is off a router's network after a second, and nothing else names it."""
-    open_sessions.enter_context(closing(route(settings)))
+    open_sessions.enter_context(closing(route(settings, ROUTER)))
     member = open_sessions.enter_context(closing(join(settings)))
     token = member.liveliness().declare_token(topics.key("alive", "aero", role="controller-1-abcd"))
     assert stop(settings).failures == ["aero has a controller, and no plant of it answers"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -69,7 +70,7 @@ def test_plain_text_beyond_loopback_is_said_at_each_start(caplog: pytest.LogCapt
 
 def test_certificates_are_needed_only_where_a_link_uses_them(tmp_path: Path) -> None:
     nowhere = NetworkSettings(security=SecuritySettings(directory=str(tmp_path)))
-    assert protected(nowhere, PLANT) == (nowhere, None)
+    assert protected(nowhere, PLANT) == (nowhere, None, ())
     with pytest.raises(CertificateError, match=r"ca\.pem is missing"):  # never the system's authorities
         protected(nowhere.model_copy(update={"loopback_secured": True}), PLANT)
 
@@ -210,3 +211,26 @@ def test_a_watch_says_each_reason_once(network: Secured, monkeypatch: pytest.Mon
     assert len(lines) == len(set(lines)) == len(linked) + 1
     for text, said in zip(linked, ("plant/aero-2", "evil.example", "None"), strict=True):
         assert said in text
+
+
+def test_a_watch_that_is_closed_during_a_handshake_reports_no_more(
+    network: Secured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its session is closed then, too: publishing would fail, and be a traceback."""
+    begun, go_on, lines = threading.Event(), threading.Event(), list[str]()
+
+    def slow(*_: object) -> str:
+        begun.set()
+        go_on.wait()
+        return "late"
+
+    monkeypatch.setattr("aeroloop.protocol.transport.refusal.FIRST_S", 0.0)
+    monkeypatch.setattr("aeroloop.protocol.transport.refusal.refusal", slow)
+    certificate = read_certificate(network.authority.folder / "operator.pem")
+    watch = RefusalWatch(certificate, "aero", lambda: [network.place], lines.append)
+    (thread,) = (each for each in threading.enumerate() if each.name == "refusals")
+    begun.wait()
+    watch.close()
+    go_on.set()
+    thread.join()
+    assert not lines

@@ -63,6 +63,7 @@ def test_keys_are_the_owners_alone(folder: Path) -> None:
         lambda folder: keys.request(folder, "observer", "Eve"),
         lambda folder: keys.issue(folder, "observer", "Eve"),
         lambda folder: keys.issue_requested(folder, folder / "operator.csr"),
+        lambda folder: keys._write(folder / "operator.pem", b""),  # made by another since it was looked for
     ],
 )
 def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -> None:

@@ -121,6 +121,16 @@ def test_systemd_finds_nothing_wrong_with_any_unit(via: str, tmp_path: Path) -> 
     assert (checked.returncode, about_ours) == (0, [])
 
 
+def test_daemons_run_as_the_owner_of_their_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user of systemd's own could not read them."""
+    monkeypatch.setattr(units, "_HOMES", ())
+    for name in UNITS:
+        assert made(name)["DynamicUser"] == "yes"
+        found = made(name, f"network.security.directory={tmp_path}")
+        assert found["User"] == tmp_path.owner()
+        assert "DynamicUser" not in found
+
+
 @pytest.mark.processes
 @pytest.mark.parametrize("name", UNITS)
 def test_what_a_unit_starts_is_a_command_line_that_the_daemon_takes(name: str, tmp_path: Path) -> None:

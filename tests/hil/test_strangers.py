@@ -1,0 +1,82 @@
+"""A driven plant among certified strangers: what is not a role's right moves no actuator and trips nothing."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+import pytest
+import zenoh
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Release
+from aeroloop.protocol.messages.operator import Advance, Gains, Inject, Message, Request
+from aeroloop.service.testing.hil import Hil
+from tests.hil.test_faults import PATIENT
+from tests.support.certificates import Authority
+from tests.support.certified_link import open_session
+from tests.support.zenoh_network import eventually
+
+STRANGERS: Final = {
+    ("observer", "aero"): frozenset(topics.TOPICS),
+    ("recorder", "aero"): frozenset(topics.TOPICS),
+    ("operator", "aero"): frozenset({"claim", "release", "record", "command", "measurement", "alive"}),
+    ("controller", "aero"): frozenset({"arm", "stop", "stand_down", "set_gains", "inject", "measurement", "reference"}),
+    ("plant", "bero"): frozenset(topics.TOPICS),
+    ("controller", "bero"): frozenset(topics.TOPICS),
+    ("operator", "bero"): frozenset(topics.TOPICS),
+}
+"""Certificates, and topics that are not theirs."""
+
+
+def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: list[str]) -> None:
+    """Do with these topics what would end, steal or disturb a running session."""
+    requests: dict[str, Message] = {
+        **dict.fromkeys(("stop", "stand_down", "arm"), Request()),
+        "release": Release(session=running),
+        "set_gains": Gains(C1=(9.0, 9.0, 9.0)),
+        "inject": Inject(faults=["motors:bias=24"]),
+        "advance": Advance(seconds=1.0),
+    }
+    for name in sorted(names):
+        key = topics.key(name, "aero", session=running, role="plant")
+        for payload in (requests[name].encode() if name in requests else b"{}", os.urandom(7)):
+            session.put(key, payload)
+            session.delete(key)
+            session.get(key, lambda _: None, payload=payload, timeout=1.0)
+    for token in tokens if "alive" in names else []:
+        session.liveliness().declare_token(token).undeclare()
+
+
+@pytest.mark.processes
+def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: Hil, tmp_path: Path) -> None:
+    """Slack: the watchdog of `PATIENT`; a second of driving, where a stop takes effect within milliseconds."""
+    ours = Authority(tmp_path)
+    for role in ("plant", "controller", "recorder", "operator"):
+        ours.issue(role, "aero")
+    hil.start(settings={**PATIENT, "network.security.directory": str(ours.folder), "network.loopback_secured": True})
+    hil.run(1.5)  # until each has published a status
+    running = hil.status("controller").session
+    assert running is not None
+    alive = hil.processes.zenoh.liveliness().get(topics.key("alive", "aero"))
+    tokens = [str(reply.ok.key_expr) for reply in alive if reply.ok]
+    assert "aeroloop/aero/alive/plant" in tokens
+    places = [place.replace("tcp/", "tls/") for place in hil.settings.network.places]
+    with ExitStack() as stack:
+        joined = {
+            who: stack.enter_context(open_session(ours.issue(*who, file="-".join(who)), connect=places))
+            for who in STRANGERS
+        }
+        for each in joined.values():
+            eventually("links", lambda e=each: len(list(e.info.peers_zid())) >= 4)  # type: ignore[misc]  # bound now
+        before = len(hil.events)
+        for who, names in STRANGERS.items():
+            harass(joined[who], names, running, tokens)
+        hil.run(1.0)
+        assert [event.text for event in hil.events[before:] if event.kind != "refused"] == []
+        assert (hil.state("plant"), hil.state("controller")) == ("driven", "running")
+        assert hil.status("controller").session == hil.status("plant").session == running
+        harass(joined["operator", "aero"], frozenset({"stop"}), running, tokens)  # as a proof that it would have
+        hil.eventually("the stop", lambda: hil.happened("tripped", "stopped by an operator"))

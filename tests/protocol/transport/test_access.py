@@ -1,0 +1,230 @@
+"""Access rules: on real links, each role does exactly what the table of topics says, and a stranger does nothing."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
+from aeroloop.protocol.transport.access import access_control
+from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
+from tests.support.certificates import DAY, Authority
+from tests.support.certified_link import attempt, linked, open_session, with_marker
+from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
+
+ACTIONS: Final[tuple[Action, ...]] = ("publish", "subscribe", "query", "answer", "hold", "watch")
+KEYS: Final = [
+    topics.key(topic.name, vehicle, session="s1", role=role) + cache
+    for topic in TOPICS.values()
+    for vehicle in ("aero", "bero")
+    for role in (ROLES if "{role}" in topic.key else ("",))
+    for cache in (("", "/@adv/pub/a1/2/_") if topic.recorded else ("",))
+]
+"""Of one vehicle with rules and one without; with the key of a cache below each that is published from one."""
+VERBS: Final = {topics.key(topic.name, "aero") for topic in TOPICS.values() if topic.carries == "query"}
+OTHER_KEYS: Final = ["t/word", "aeroloop/aero/unknown", "aeroloop/aero", "aeroloop/aero/**", "**", "aeroloop/*/stop"]
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    made = Authority(tmp_path_factory.mktemp("authority"))
+    for role in ROLES:
+        made.issue(role, "aero")
+    return made
+
+
+def may(role: RoleName, action: Action, topic: Topic) -> bool:
+    """Whether the table lets a role do this with a topic."""
+    sending, receiving = topics.ACTIONS[topic.carries]
+    return (action in sending and role in topic.senders) or (action in receiving and role in topic.receivers)
+
+
+def allowed(role: RoleName, action: Action) -> set[str]:
+    """Keys on which the table allows an action, written anew: what acts names its vehicle and its own role."""
+    found = set()
+    for key in KEYS:
+        address = topics.read_key(key.partition("/@adv")[0])
+        assert address is not None
+        acts = action in topics.ACTIONS[address.topic.carries][0]
+        if address.vehicle == "aero" and may(role, action, address.topic):
+            found |= {key} if address.role in (None, role) or not acts else set()
+    return found
+
+
+@pytest.mark.parametrize("listening", [True, False], ids=["listening", "connecting"])
+@pytest.mark.parametrize("role", ROLES)
+def test_each_role_does_what_the_table_says_and_no_more(authority: Authority, role: RoleName, listening: bool) -> None:
+    guard, hand = (authority.folder / f"{name}.aero.pem" for name in ("observer", role))
+    with linked(guard, with_marker(access_control("aero", loopback=False)), hand, listening=listening) as pair:
+        assert attempt(pair, KEYS) == {action: allowed(role, action) for action in ACTIONS} | {"delete": set()}
+        assert not any(attempt(pair, OTHER_KEYS).values())
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_what_acts_is_judged_where_it_arrives(authority: Authority, role: RoleName) -> None:
+    """A peer of another make may send what it was not asked for: rules of what is sent to it must not be needed."""
+    guard, hand = (authority.folder / f"{name}.aero.pem" for name in ("observer", role))
+    rules = with_marker(access_control("aero", loopback=False), egress_open=True)
+    with linked(guard, rules, hand) as pair:
+        achieved = attempt(pair, KEYS)
+    for action in ("publish", "answer", "hold"):
+        assert achieved[action] == allowed(role, action)
+    assert achieved["query"] & VERBS == allowed(role, "query") & VERBS
+    assert achieved["delete"] == set()
+
+
+def test_a_token_bears_the_name_of_its_own_role(authority: Authority) -> None:
+    """A controller's goes on after it: there may be several."""
+    own = [topics.key("alive", "aero", role=name) for name in ("controller", "controller-4711-9f")]
+    names = ("plant", "plant-4711", "controllers", "recorder", "$*-9f", "*")
+    wrong = [topics.key("alive", "aero", role=name) for name in names]
+    rules = with_marker(access_control("aero", loopback=False))
+    with linked(authority.folder / "plant.aero.pem", rules, authority.folder / "controller.aero.pem") as pair:
+        tokens = [pair.hand.liveliness().declare_token(name) for name in own + wrong]
+        pair.settle()
+        seen = [str(reply.ok.key_expr) for reply in pair.guard.liveliness().get("aeroloop/**") if reply.ok]
+        assert sorted(seen) == sorted(own)
+        for token in tokens:
+            token.undeclare()
+
+
+@pytest.mark.parametrize("topic", [TOPICS[name] for name in topics.RECORDED], ids=topics.RECORDED)
+def test_a_late_recorder_recovers_from_caches_with_rules_at_both_ends(authority: Authority, topic: Topic) -> None:
+    sender, rules = topic.senders[0], with_marker(access_control("aero", loopback=False))
+    reader = "observer" if sender == "recorder" else "recorder"
+    place = [f"tls/127.0.0.1:{free_port()}"]
+    with (
+        open_session(authority.folder / f"{sender}.aero.pem", listen=place, access=rules) as publishing,
+        open_session(authority.folder / f"{reader}.aero.pem", connect=place, access=rules) as reading,
+    ):
+        publisher = CachedPublisher(publishing, topics.key(topic.name, "aero", role=sender), 1.0)
+        for word in (b"1", b"2", b"3"):
+            publisher.put(word)
+        subscriber, found = RecoveringSubscriber(reading, topics.key(topic.name, "*")), list[bytes]()
+
+        def has(count: int) -> bool:
+            found.extend(received.payload for received in subscriber.take())
+            return len(found) >= count
+
+        eventually("recovering", lambda: has(3))
+        publisher.put(b"4")
+        eventually("receiving", lambda: has(4))
+        assert found == [b"1", b"2", b"3", b"4"]
+
+
+@pytest.mark.parametrize("name", ["plant/bero", "controller/bero", "operator/bero", "recorder/bero", "plant", "lab-2"])
+@pytest.mark.parametrize("listening", [True, False], ids=["listening", "connecting"])
+def test_another_vehicle_s_certificate_and_one_of_no_role_do_nothing(
+    authority: Authority, name: str, listening: bool
+) -> None:
+    hand = authority.issue("stranger", file=name.replace("/", "."), cn=name)
+    rules = with_marker(access_control("aero", loopback=False))
+    with linked(authority.folder / "plant.aero.pem", rules, hand, listening=listening) as pair:
+        assert not any(attempt(pair, KEYS + OTHER_KEYS).values())
+
+
+def test_a_router_s_certificate_passes_what_any_role_may_and_no_other_vehicle_s(authority: Authority) -> None:
+    """The router has checked it. What names all vehicles it may read, as any reader."""
+    authority.issue("router")
+    rules = with_marker(access_control("aero", loopback=False))
+    with linked(authority.folder / "plant.aero.pem", rules, authority.folder / "router.pem") as pair:
+        achieved = attempt(pair, KEYS)
+        assert not any(attempt(pair, OTHER_KEYS).values())
+    for action in ACTIONS:
+        of_any = set.union(*(allowed(role, action) for role in ROLES))
+        assert achieved[action] >= of_any
+        assert not any("/bero/" in key for key in achieved[action])
+
+
+@pytest.mark.parametrize("role", ["operator", "recorder"])
+def test_a_certificate_of_every_vehicle_has_the_rights_of_each_that_is_named(
+    authority: Authority, role: RoleName
+) -> None:
+    every = authority.issue(role)
+    keys = [key for key in KEYS if "/aero/" in key]
+    others = [key.replace("/aero/", "/bero/") for key in keys] + [key.replace("/aero/", "/cero/") for key in keys]
+    with linked(
+        authority.folder / "plant.aero.pem", with_marker(access_control("aero", "bero", loopback=False)), every
+    ) as pair:
+        achieved = attempt(pair, keys + others)
+    for action in ACTIONS:
+        mine = allowed(role, action)
+        assert achieved[action] == mine | {key.replace("/aero/", "/bero/") for key in mine}
+
+
+@pytest.mark.parametrize(("open_here", "achieved"), [(True, True), (False, False)])
+def test_plain_links_on_loopback_are_free_unless_they_are_secured(
+    authority: Authority, open_here: bool, achieved: bool
+) -> None:
+    with linked(
+        authority.folder / "plant.aero.pem",
+        with_marker(access_control("aero", loopback=open_here)),
+        authority.folder / "observer.aero.pem",
+        protocol="tcp",
+    ) as pair:
+        found = attempt(pair, [*KEYS, "t/word"])
+    assert all(found.values()) == any(found.values()) == achieved
+    assert found["publish"] == ({*KEYS, "t/word"} if achieved else set())
+
+
+BAD: Final = ("expired", "not yet valid", "foreign", "none")
+
+
+def held(ours: Authority, foreign: Authority, kind: str) -> Path | None:
+    """The certificate of a kind of stranger, which says that it is an operator; None of the one without."""
+    match kind:
+        case "good":
+            return ours.issue("operator", "aero")
+        case "expired":
+            return ours.issue("operator", "aero", file=kind, ends=-DAY)
+        case "not yet valid":
+            return ours.issue("operator", "aero", file=kind, begins=DAY, ends=2 * DAY)
+        case "foreign":
+            return foreign.issue("operator", "aero")
+    return None
+
+
+@pytest.mark.parametrize("kind", ["good", *BAD])
+def test_no_byte_of_a_connecting_stranger_passes_the_handshake(authority: Authority, tmp_path: Path, kind: str) -> None:
+    """TLS 1.3 shows a client in an alert what the listening end has against its certificate."""
+    certificate = held(authority, Authority(tmp_path), kind)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    if certificate:
+        context.load_cert_chain(certificate, certificate.with_suffix(".key"))
+    port, access = free_port(), access_control("aero", loopback=False)
+    with (
+        open_session(authority.folder / "plant.aero.pem", listen=[f"tls/127.0.0.1:{port}"], access=access),
+        context.wrap_socket(socket.create_connection(("127.0.0.1", port), PATIENCE_S)) as link,
+        nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
+    ):
+        link.sendall(b"\3\0abc")  # not Zenoh's: it answers by a close
+        assert link.recv(1)
+
+
+@pytest.mark.parametrize("kind", ["good", *BAD[:-1]])
+def test_no_byte_of_ours_passes_the_handshake_with_a_listening_stranger(
+    authority: Authority, tmp_path: Path, kind: str
+) -> None:
+    certificate = held(authority, Authority(tmp_path), kind)
+    assert certificate is not None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, certificate.with_suffix(".key"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE_S)
+        place, access = f"tls/127.0.0.1:{server.getsockname()[1]}", access_control("aero", loopback=False)
+        with open_session(authority.folder / "plant.aero.pem", connect=[place], access=access):
+            caller, _ = server.accept()
+            caller.settimeout(PATIENCE_S)
+            with (
+                caller,
+                nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
+                context.wrap_socket(caller, server_side=True) as link,
+            ):
+                assert link.recv(1)
