@@ -13,11 +13,13 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join, visit
 from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
 from aeroloop.protocol.transport.security import Identity
-from aeroloop.service.host.operator import stop
+from aeroloop.service.host.operator import gather, stop
 from tests.protocol.transport.test_network import Listener, one_line, receives
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually, free_port
@@ -166,3 +168,38 @@ def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
     token = member.liveliness().declare_token(topics.key("alive", "aero", role="controller-1-abcd"))
     assert stop(settings).failures == ["aero has a controller, and no plant of it answers"]
     token.undeclare()
+
+
+def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions: ExitStack) -> None:
+    """The router has rules, too: a claim of the controller passes it, one of a recorder does not."""
+    authority = Authority(tmp_path)
+    for role in ("router", "recorder", "operator"):
+        authority.issue(role)
+    for role in ("plant", "controller"):
+        authority.issue(role, "aero")
+    network = NetworkSettings.model_validate(
+        {"mode": "client", "rendezvous": f"tls/127.0.0.1:{free_port()}", "loopback_secured": True,
+         "security": {"directory": str(tmp_path)}}
+    )  # fmt: skip
+    names = ("router", "plant", "controller", "recorder")
+    roles = {name: open_sessions.enter_context(Role(name, "aero", network, {})) for name in names}
+    claims: list[bytes] = []
+    key = topics.key("claim", "aero")
+
+    def answer(query: zenoh.Query) -> None:
+        claims.append(query.payload.to_bytes() if query.payload else b"")
+        query.reply(key, b"granted")
+
+    roles["plant"].answer(key, answer)
+    for role in roles.values():
+        role.announce()
+        role.status(Status(role=role.role, state="idle", uptime_s=0.0, ticks=0, rate_hz=0.0, skipped=0))
+
+    def answers(role: str) -> list[bytes]:
+        replies = roles[role].zenoh.get(key, payload=role.encode(), timeout=1.0)
+        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+    eventually("the claim", lambda: answers("controller") == [b"granted"])
+    assert answers("recorder") == []
+    assert set(claims) == {b"controller"}
+    assert set(gather(network).statuses["aero"]) == set(names)
