@@ -126,6 +126,9 @@ def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
     open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}), ROUTER)))
     near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
     receives(Listener(near, "t/word"), far, b"over both")
+    with visit(first.model_copy(update={"connect": second.rendezvous})) as here:
+        here.settle()
+        assert here.silent() == []  # it links to one of them, and the other is well
 
 
 def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
