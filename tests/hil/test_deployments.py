@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hil.test_clocks import LIBRARIES, WALL_ALONE, faketime
+from tests.hil.test_clocks import python_clocks
 from tests.support.deployment import Deployment, Kind, Outcome
 from tests.support.namespaces import NoNamespacesError
 
@@ -58,11 +58,11 @@ def assert_cheap(outcome: Outcome) -> None:
 def test_the_plant_rests_in_time_is_driven_again_and_the_log_lacks_nothing(
     tmp_path: Path, kind: Kind, happens: Callable[[Deployment], None], clocks_differ: bool
 ) -> None:
-    """With the router, the controller's clock is 10 s ahead and the recorder's 10 s behind, given libfaketime."""
-    clocks = {"controller": faketime("+10s", **WALL_ALONE), "recorder": faketime("-10s")} if LIBRARIES else {}
+    """With the router, the clocks of the controller's and the recorder's hosts are an hour ahead from the start."""
+    ahead = python_clocks(tmp_path, CLOCK_STEP=str(tmp_path)) if clocks_differ else {}
     try:
         with Deployment(kind, tmp_path, PATIENT) as hosts:
-            hosts.start(clocks if clocks_differ else {})
+            hosts.start({"controller": ahead, "recorder": ahead})
             happens(hosts)
             for outcome in hosts.finish():
                 assert_cheap(outcome)
