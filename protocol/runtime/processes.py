@@ -14,7 +14,7 @@ _SUFFIX: Final = "@aeroloop"
 _NAME_LENGTH: Final = 15
 _PR_SET_NAME: Final = 15
 _LISTENS: Final = "0A"
-_ROLES: Final = ("plant", "controller", "recorder")
+_ROLES: Final = ("plant", "controller", "recorder", "router")
 
 
 class Listener(NamedTuple):
@@ -22,7 +22,7 @@ class Listener(NamedTuple):
 
     Attributes:
         pid: Process id.
-        role: `plant`, `controller`, `recorder`, or None where it is not a role of this program.
+        role: `plant`, `controller`, `recorder`, `router`, or None where it is not a role of this program.
     """
 
     pid: int

@@ -40,6 +40,7 @@ from aeroloop.protocol.transport.network import (
 )
 from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
 from aeroloop.protocol.transport.refusal import RefusalWatch
+from aeroloop.protocol.transport.router import route
 from aeroloop.protocol.transport.security import TLS, Identity
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -68,7 +69,7 @@ class OccupiedError(AeroloopError):
 
 
 def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
-    with visit(network, identity=Identity(("plant",), vehicle)) as here:
+    with visit(network, identity=Identity(("plant",), vehicle), patient=True) as here:
         here.settle()
         if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=VISIT_S)):
             return
@@ -86,8 +87,8 @@ def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
 class Role:
     """A process's presence on the network.
 
-    `role` is `plant`, `controller` or `recorder`, `vehicle` the vehicle in the keys of its topics, `config` its
-    effective configuration, for the description. `name` is its liveliness token's; the role's if None.
+    `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config`
+    its effective configuration, for the description. `name` is its liveliness token's; the role's if None.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -108,7 +109,7 @@ class Role:
             _refuse_second_plant(network, vehicle)
         name_process(role)
         identity = Identity((role,), vehicle)
-        self.zenoh = join(network, identity)
+        self.zenoh = (route if role == "router" else join)(network, identity)
         self.datagrams = Datagrams(network, identity)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._status: tuple[float, Status] | None = None  # when it was taken

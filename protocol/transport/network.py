@@ -1,8 +1,10 @@
-"""Network: opens this process's Zenoh session, peer to peer, without a router or multicast.
+"""Network: opens this process's Zenoh session, peer to peer or at a router, without multicast.
 
-Every process listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects
-to all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
+Every peer listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects to
+all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
 end or halt of any of them does not matter. Peers also learn each other's addresses by gossip and link directly.
+
+A client links to a router alone (`router.py`), does not listen, and waits until there is one.
 
 An operator's command does not listen: it visits, and finds which processes accept a connection but do not answer.
 """
@@ -20,6 +22,7 @@ import struct
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from math import inf
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import zenoh
@@ -29,6 +32,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.access import access_control
 from aeroloop.protocol.transport.certificate import Certificate
+from aeroloop.protocol.transport.refusal import refusal
 from aeroloop.protocol.transport.security import (
     READER,
     Identity,
@@ -41,6 +45,8 @@ from aeroloop.protocol.transport.security import (
 )
 
 log: Final = logging.getLogger("aeroloop")
+
+Mode = Literal["peer", "client", "router"]
 
 QUEUE: Final = 16
 """Batches that may wait to be sent on a link, per priority; the most that Zenoh allows."""
@@ -63,6 +69,10 @@ SETTLE_S: Final = 0.1
 POLL_S: Final = 0.005
 PATIENT_LEASE_MS: Final = 10_000
 """Least lease where frames have a transport of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
+ROUTER_AGAIN_S: Final = 0.2
+"""Pause before a client that finds no router looks again [s]."""
+ROUTER_PATIENCE_S: Final = 3.0
+"""After this time without a router a client logs a warning [s]: it may have started first."""
 _RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
@@ -97,6 +107,11 @@ Endpoint = Annotated[str, AfterValidator(_endpoint)]
 class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """Zenoh endpoints of this process and its peers."""
 
+    mode: Literal["peer", "client"] = Field(
+        default="peer",
+        description="peer: processes link to one another; client: each links to a router at the rendezvous and to "
+        "nothing else, as `aeroloop router` is one",
+    )
     rendezvous: list[Endpoint] = Field(
         default=["tcp/127.0.0.1:7447"],
         description="Zenoh endpoints where processes meet, one for each host; a process listens at its own host's and "
@@ -143,13 +158,15 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
 
     @property
     def places(self) -> list[str]:
-        """Every endpoint at which a process may be met: the rendezvous, port by port."""
+        """Every endpoint at which a process may be met: the rendezvous, port by port; by a client, the routers."""
+        if self.mode == "client":
+            return self.rendezvous
         return [place for first in self.rendezvous for place in _ports(first, self.ports)]
 
     @property
     def mixed(self) -> bool:
-        """Whether each kind of traffic has a transport of its own: beyond loopback, if so set."""
-        return self.transport == "mixed" and any(map(leaves_host, self.rendezvous))
+        """Whether each kind of traffic has a transport of its own: between peers beyond loopback, if so set."""
+        return self.transport == "mixed" and self.mode == "peer" and any(map(leaves_host, self.rendezvous))
 
     @property
     def endpoints(self) -> list[str]:
@@ -237,12 +254,14 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         listen: Whether others can connect to this process: yes for a role, no for a command that only queries.
 
     Raises:
-        NetworkError: A `listen` endpoint cannot be opened.
+        NetworkError: A `listen` endpoint cannot be opened, or a client's settings name no router.
         SecurityError, CertificateError: Its links cannot be secured, see `protected`.
     """
     network = protected(settings, identity)
-    if listen and settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
-        log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
+    if listen:
+        warn_of_plain(network)
+    if settings.mode == "client":
+        return _join_router(network)
     places, further = network.settings.places, network.settings.listen
     for place in places if listen else []:
         if is_free(place):
@@ -253,23 +272,66 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(further)}: {_reason(error)}; give free ones with --set network.listen="
+            f"cannot listen on {', '.join(further)}: {reason(error)}; give free ones with --set network.listen="
             f"'{json.dumps([_at_port(each, 0) for each in settings.listen])}'"
         ) from None
 
 
+def warn_of_plain(network: Protected) -> None:
+    """Log a warning where links are plain text, because that is allowed."""
+    if network.settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
+        log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
+
+
+def _join_router(network: Protected) -> zenoh.Session:
+    """Link to a router, as soon as one answers; Zenoh links again whenever the link is lost."""
+    places = network.settings.places
+    warn_at = time.monotonic() + ROUTER_PATIENCE_S
+    while True:
+        try:
+            return _open(network, [], places)
+        except zenoh.ZError:
+            if not [*network.settings.connect, *places]:
+                raise NetworkError('network.mode = "client" needs a router in network.rendezvous') from None
+        if time.monotonic() > warn_at:
+            log.warning("waiting for a router: %s", _no_router(network))
+            warn_at = inf
+        time.sleep(ROUTER_AGAIN_S)
+
+
+def _no_router(network: Protected) -> str:
+    """One line about routers that do not answer."""
+    places = [*network.settings.connect, *network.settings.places]
+    for place in accepting(places):
+        why = refusal(place, network.certificate) if network.certificate else None
+        return why or f"a process at {place} accepts connections and does not answer as a router"
+    return f"no router answers at {', '.join(places)}; is `aeroloop router` running?"
+
+
 @contextmanager
-def visit(settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity = READER) -> Iterator[Visit]:
-    """Open a session for a few queries that take at most `wait_s`.
+def visit(
+    settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity = READER, *, patient: bool = False
+) -> Iterator[Visit]:
+    """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
+
+    Raises:
+        NetworkError: It is a client's, and no router answers.
     """
     wait_ms = round(wait_s * 1000)
     network = protected(settings, identity)
     places = network.settings.places
-    session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
-    with closing(session):
-        yield Visit(session, [*network.settings.connect, *places], network.certificate)
+    try:
+        if patient and settings.mode == "client":
+            session = _join_router(network)
+        else:
+            session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
+    except zenoh.ZError:
+        raise NetworkError(_no_router(network)) from None
+    with closing(session):  # a client is linked from the start
+        met = [*network.settings.connect, *places] if settings.mode == "peer" else []
+        yield Visit(session, met, network.certificate)
 
 
 def open_session(network: Protected, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
@@ -282,6 +344,7 @@ def open_session(network: Protected, *, listen: Sequence[str] = (), connect: Seq
         "connect": [],
         "gossip": False,
         "transport": "tcp",
+        "mode": "peer",
     }
     here["lease_ms"] = max(network.settings.lease_ms, PATIENT_LEASE_MS)
     only = network._replace(settings=network.settings.model_copy(update=here))
@@ -329,10 +392,22 @@ def _open(
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
+    return open_tree(session_tree(network, network.settings.mode, listen, places, handshake_ms, retry_ms))
+
+
+def session_tree(
+    network: Protected,
+    mode: Mode,
+    listen: list[str],
+    places: list[str],
+    handshake_ms: int = HANDSHAKE_MS,
+    retry_ms: tuple[int, int] = _RETRY_MS,
+) -> dict[str, Any]:
+    """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
     settings, certificate, vehicles = network
     lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms
     tree: dict[str, Any] = {
-        "mode": "peer",
+        "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
         "connect": {
             "endpoints": [*settings.connect, *places],
@@ -370,6 +445,11 @@ def _open(
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
         tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
         tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
+    return tree
+
+
+def open_tree(tree: dict[str, Any]) -> zenoh.Session:
+    """Open a session with a configuration of Zenoh. Raises zenoh.ZError."""
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
     session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
     return session
@@ -436,6 +516,6 @@ def _at_port(endpoint: str, port: int) -> str:
     return endpoint if parts is None else f"{parts['protocol']}/{parts['host']}:{port}{parts['rest'] or ''}"
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """Zenoh's message without the source locations it carries."""
     return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")

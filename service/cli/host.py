@@ -117,7 +117,7 @@ def units(
     file = config or (units.CONFIG if units.CONFIG.exists() else None)
     source = units.Source(file or units.CONFIG, overrides or [], settings_of(file, overrides))
     if install is None:
-        for name in units.UNITS:
+        for name in units.units_of(source.settings):
             typer.echo(f"# aeroloop-{name}.service\n{units.unit(name, source)}")
     else:
         with guarded():

@@ -180,6 +180,34 @@ def _run_plant(options: DaemonOptions, *overrides: str) -> None:
 
 
 @group.command()
+@daemon("router")
+def router(
+    options: DaemonOptions,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the configuration for a stock zenohd, JSON5, and end.")
+    ] = False,
+) -> None:
+    """Run a router for clients (network.mode = "client") until SIGTERM."""
+    settings, load = reloadable(options.config, options.overrides)
+    if print_config:
+        from aeroloop.protocol.transport.router import zenohd_config
+        from aeroloop.protocol.transport.security import Identity
+
+        with guarded():
+            typer.echo(zenohd_config(settings.network, Identity(("router",), settings.vehicle)), nl=False)
+        return
+
+    def run(role: Role) -> None:
+        from aeroloop.service.daemon.reload import reload_on_hangup
+        from aeroloop.service.daemon.router import run_router
+
+        reload_on_hangup(role, settings, load, lambda _: None)
+        run_router(role)
+
+    run_role("router", settings, run, options)
+
+
+@group.command()
 @daemon("recorder")
 def recorder(
     options: DaemonOptions,

@@ -29,6 +29,7 @@ LIVE: Final = {
     ),
     "plant": ("plant.limits", "plant.watchdog_s", "plant.truth_rate_hz"),
     "recorder": ("recorder.chunk_s", "recorder.max_file_mb", "recorder.max_file_s", "recorder.keep_gb"),
+    "router": (),
 }
 """By role, the keys and sections that take effect at once."""
 
@@ -36,6 +37,7 @@ _SECTIONS: Final = {
     "controller": {"vehicle", "loop", "wire", "law", "reference", "controller", "network"},
     "plant": {"vehicle", "loop", "wire", "plant", "network"},
     "recorder": {"vehicle", "recorder", "network"},
+    "router": {"vehicle", "network"},
 }
 """By role, the sections that it uses."""
 

@@ -8,7 +8,7 @@ is no role delays none of them, and is named by its address and, on this host, b
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple
 
@@ -149,12 +149,22 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
             if passed > SETTLE_S and not here.silent() and all(answers.values()):
                 break
             time.sleep(POLL_S)
-        unanswered = _unanswered(here, but=("controller", "recorder"), why=wait_s > VISIT_S)
+        unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > VISIT_S)
+        alone = _without_plant(here.session, answers) if network.mode == "client" and vehicle == "*" else []
     failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
+    failures += [f"{name} has a controller, and no plant of it answers" for name in alone]
     failures += unanswered
     if not answers and not failures:
         failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
     return Stopped([text for texts in answers.values() for text in texts], failures)
+
+
+def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str]:
+    """Vehicles that have a controller and did not answer: a router has forgotten a plant that hangs."""
+    tokens = _get(session, topics.key("alive", "*"), None, VISIT_S)
+    found = [topics.read_key(str(token.ok.key_expr)) for token in tokens if token.ok is not None]
+    controlled = {each.vehicle for each in found if each and each.role and each.role.startswith("controller")}
+    return sorted(name for name in controlled if name not in answered)
 
 
 def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> SessionRecord:

@@ -19,6 +19,7 @@ from aeroloop.service.config import Settings
 CONFIG: Final = Path("/etc/aeroloop/aeroloop.toml")
 SYSTEM_FOLDER: Final = Path("/etc/systemd/system")
 UNITS: Final = {
+    "router": "the router that all others connect to",
     "recorder": "the recorder of everything on the network",
     "plant": "the plant end that plant.via names",
     "controller": "the adaptive attitude controller",
@@ -83,6 +84,11 @@ class Source(NamedTuple):
         return ["--config", str(self.config.absolute()), *(word for each in self.overrides for word in ("--set", each))]
 
 
+def units_of(settings: Settings) -> list[str]:
+    """Names of the units of a configuration: only clients need a router."""
+    return [name for name in UNITS if name != "router" or settings.network.mode == "client"]
+
+
 def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
     words = [*_executable(), name, *source.options]
@@ -90,6 +96,8 @@ def unit(name: str, source: Source) -> str:
     if name == "recorder":
         words += ["--set", "recorder.directory=%L/aeroloop"]
         rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]
+    elif name == "router":
+        rights.append("CapabilityBoundingSet=")
     else:
         priority = source.settings.loop.priority
         rights += [
@@ -115,7 +123,7 @@ def install(folder: Path, source: Source, *, force: bool = False) -> list[Path]:
     Raises:
         UnitError: A unit exists and `force` is false, or the folder cannot be written.
     """
-    paths = {name: folder / f"aeroloop-{name}.service" for name in UNITS}
+    paths = {name: folder / f"aeroloop-{name}.service" for name in units_of(source.settings)}
     existing = [str(path) for path in paths.values() if path.exists()]
     if existing and not force:
         raise UnitError(f"not written over without --force: {', '.join(existing)}")
@@ -138,7 +146,7 @@ def next_steps(folder: Path | None, source: Source) -> list[str]:
         steps.append(f"sudo {shlex.join(command)}")
     elif folder.absolute() != SYSTEM_FOLDER:
         steps.append(f"sudo cp {shlex.quote(str(folder))}/aeroloop-*.service {SYSTEM_FOLDER}/")
-    names = " ".join(f"aeroloop-{name}" for name in UNITS)
+    names = " ".join(f"aeroloop-{name}" for name in units_of(source.settings))
     return [*steps, "sudo systemctl daemon-reload", f"sudo systemctl enable --now {names}", "aeroloop op status"]
 
 

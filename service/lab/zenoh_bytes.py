@@ -107,7 +107,7 @@ def count_bytes(network: NetworkSettings, measurements: Sequence[bytes], command
         NetworkError: A session cannot be opened.
     """
     address = free_rendezvous()
-    here = {"rendezvous": [], "gossip": False}  # two peers need neither, and their bytes would count
+    here = {"mode": "peer", "rendezvous": [], "gossip": False}  # two peers need neither, and their bytes would count
     plant_side = network.model_copy(update={**here, "listen": [address], "connect": []})
     with CountingRelay(int(address.rpartition(":")[2])) as relay, join(plant_side) as plant:
         other_side = network.model_copy(update={**here, "listen": [], "connect": [f"tcp/127.0.0.1:{relay.port}"]})

@@ -27,6 +27,7 @@ _STYLES: Final = {
     "running": GOOD,
     "driven": GOOD,
     "recording": GOOD,
+    "routing": GOOD,
     "tripped": BAD,
     "faulted": BAD,
     NOT_RECORDING: BAD,

@@ -25,12 +25,12 @@ import zenoh
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import POLL_S, NetworkSettings, accepting, join
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
 
-RoleName = Literal["controller", "plant", "can-node", "recorder"]
+RoleName = Literal["controller", "plant", "can-node", "recorder", "router"]
 
 Child = subprocess.Popen[bytes] | ForkedProcess
 
@@ -97,7 +97,7 @@ class ProcessGroup:
     """Processes of one network and one configuration on this machine. A context: leaving it stops them all.
 
     Their configuration and output, a text file each, are kept in the folder if one is given; `zenoh` is a session on
-    their network.
+    their network. Clients get a router of their own.
     """
 
     def __init__(self, settings: Settings, folder: Path | None = None) -> None:
@@ -111,6 +111,8 @@ class ProcessGroup:
         self._alive: set[str] = set()
         self._killed: set[str] = set()  # stopped by `stop`, so an exit code is no failure
         self._changed = threading.Condition()
+        if settings.network.mode == "client":
+            self._start_router()
         self.zenoh = join(settings.network)  # listens, so that a process links to it as it starts
         self.zenoh.liveliness().declare_subscriber(topics.key("alive", settings.vehicle), self._token, history=True)
 
@@ -118,11 +120,17 @@ class ProcessGroup:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for role in get_args(RoleName):  # the controller first, the recorder last
+        for role in get_args(RoleName):  # the controller first, recorder and router last
             if role in self._children:
                 self.stop(role)
         self.zenoh.close()
         self._cleanup.close()
+
+    def _start_router(self) -> None:
+        self.start("router")
+        while not accepting(self._settings.network.places):
+            self._check("router")
+            time.sleep(POLL_S)
 
     def start_plant(self) -> None:
         """Start the configured plant end, and a node on the bus where the bus is software."""

@@ -96,7 +96,7 @@ class Guest:
     def __init__(self, hosts: Hosts, said: Path) -> None:
         self._said = said
         words = ["-m", "tests.benchmarks.joins_and_leaves", "--guest", json.dumps(hosts.rendezvous)]
-        self._process = hosts.start("third", *words, stdin=subprocess.PIPE, stdout=said)
+        self._process = hosts.python("third", *words, stdin=subprocess.PIPE, stdout=said)
 
     def await_said(self, word: str) -> None:
         """Wait until it has printed a line."""
@@ -190,7 +190,7 @@ def main(trials: int, realtime: str) -> None:
         overrides = [f"loop.realtime={realtime}"]
         hosts.aeroloop("plant", "emulator", overrides=overrides)
         hosts.aeroloop("controller", "controller", "--auto-arm", overrides=overrides)
-        hosts.start("plant", "-m", "tests.support.namespaces", json.dumps(hosts.rendezvous), stdout=folder / "seen")
+        hosts.watch("plant", folder / "seen")
         watch = Watch(folder / "seen")
         until("a driven plant", watch.driven)
         refused = {role: notes for role, notes in watch.notes.items() if notes}

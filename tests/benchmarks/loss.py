@@ -82,7 +82,7 @@ def run(
         eventually("driving", lambda: "has aero" in hosts.log("controller").read_text())
         time.sleep(SETTLE_S)
         for host, loss in (("plant", words.get("to_plant", both)), ("controller", words.get("from_plant", both))):
-            hosts.lose(host, loss)
+            hosts.lose(host, loss, "received")
             if "kbit" in words:
                 hosts.narrow(host, round(words["kbit"]))
         before = hosts.crossed("plant")

@@ -45,7 +45,7 @@ def main(trials: int) -> None:
         folder = Path(name)
         hosts.aeroloop("plant", "emulator")
         hosts.aeroloop("controller", "controller", "--auto-arm")
-        hosts.start("plant", "-m", "tests.support.namespaces", json.dumps(hosts.rendezvous), stdout=folder / "seen")
+        hosts.watch("plant", folder / "seen")
         seen, logs = Seen(folder / "seen"), count()
 
         def recorder() -> Popen[bytes]:

@@ -38,7 +38,7 @@ def review(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
             ]
             eventually("driving", lambda: "frames by datagrams" in hosts.log("controller").read_text())
             for host in ("plant", "controller"):
-                hosts.lose(host, LOSS)
+                hosts.lose(host, LOSS, "received")
             time.sleep(LOST_FOR_S)
             for host in ("plant", "controller"):
                 hosts.lose(host, 0)

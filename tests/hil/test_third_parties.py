@@ -42,8 +42,7 @@ def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosts]:
         with Hosts(["plant", "controller", "third"], tmp_path) as hosts:
             hosts.aeroloop("plant", "emulator", overrides=PATIENT)
             hosts.aeroloop("controller", "controller", "--auto-arm", overrides=PATIENT)
-            words = ["-m", "tests.support.namespaces", json.dumps(hosts.rendezvous)]
-            hosts.start("plant", *words, stdout=tmp_path / "seen")
+            hosts.watch("plant", tmp_path / "seen")
             eventually("driving", lambda: bool(ticks(tmp_path)))
             yield hosts
     except NoNamespacesError as error:

@@ -7,29 +7,38 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.service.vehicle_address import load_vehicle_address
 
 STOP_WAIT_S: Final = 10.0
 
 
 class NoNamespacesError(Exception):
-    """This machine makes no network namespaces."""
+    """This machine makes no network namespaces, or loses no packets on request; one line."""
 
 
 def _ip(*words: str) -> None:
+    _run("ip", *words)
+
+
+def _run(*words: str, given: str | None = None) -> None:
     try:
-        subprocess.run(["ip", *words], check=True, capture_output=True, text=True)  # noqa: S607 - any ip will do
+        subprocess.run(words, check=True, capture_output=True, text=True, input=given)
     except (OSError, subprocess.CalledProcessError) as error:
         raise NoNamespacesError(getattr(error, "stderr", None) or str(error)) from None
+
+
+Ways = Literal["sent", "received", "both"]
 
 
 class Hosts:
@@ -39,8 +48,9 @@ class Hosts:
         rendezvous: Zenoh endpoints, one for each host, for `network.rendezvous`.
     """
 
-    def __init__(self, names: Sequence[str], folder: Path) -> None:
+    def __init__(self, names: Sequence[str], folder: Path, config: Path | None = None) -> None:
         self._folder = folder
+        self._config = config
         self._prefix = f"al{os.getpid()}-"
         self._switch = f"{self._prefix}switch"
         self._addresses = {name: f"10.77.0.{number}" for number, name in enumerate(names, 1)}
@@ -78,21 +88,49 @@ class Hosts:
                 process.wait()
         self._remove()
 
-    def aeroloop(self, host: str, *words: str, overrides: Sequence[str] = ()) -> subprocess.Popen[bytes]:
-        """Start a command of the program on a host; its log is `<folder>/<host>.log`."""
-        given = [f"network.rendezvous={json.dumps(self.rendezvous)}", "network.insecure=true", *overrides]
-        sets = [word for override in given for word in ("--set", override)]
-        return self.start(host, "-m", "aeroloop", *words, *sets)
-
-    def start(
-        self, host: str, *words: str, stdin: int | None = None, stdout: Path | None = None
+    def aeroloop(
+        self, host: str, *words: str, overrides: Sequence[str] = (), environment: Mapping[str, str] | None = None
     ) -> subprocess.Popen[bytes]:
-        """Start this Python on a host."""
+        """Start a command of the program on a host; its log is `<folder>/<host>.log`."""
+        return self.python(host, "-m", "aeroloop", *words, *self.options(overrides), environment=environment)
+
+    def options(self, overrides: Sequence[str] = ()) -> list[str]:
+        """Words of a command line: the configuration, or without one the rendezvous, and overrides."""
+        network = [] if self._config else [f"network.rendezvous={json.dumps(self.rendezvous)}", "network.insecure=true"]
+        sets = [word for override in [*network, *overrides] for word in ("--set", override)]
+        return [*(["--config", str(self._config)] if self._config else []), *sets]
+
+    def output(self, host: str, *words: str) -> str:
+        """What a command of the program prints on a host. Raises subprocess.CalledProcessError."""
+        command = ["ip", "netns", "exec", self._prefix + host, sys.executable, "-m", "aeroloop", *words]
+        return subprocess.run([*command, *self.options()], check=True, capture_output=True, text=True).stdout
+
+    def python(
+        self,
+        host: str,
+        *words: str,
+        stdin: int | None = None,
+        stdout: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> subprocess.Popen[bytes]:
+        """Start this Python on a host, with additions to the environment."""
         command = ["ip", "netns", "exec", self._prefix + host, sys.executable, *words]
         with self.log(host).open("ab") as errors, (stdout or Path(os.devnull)).open("ab") as output:
-            process = subprocess.Popen(command, stdin=stdin, stdout=output, stderr=errors)
+            process = subprocess.Popen(
+                command, stdin=stdin, stdout=output, stderr=errors, env={**os.environ, **(environment or {})}
+            )
         self._processes.append(process)
         return process
+
+    def watch(self, host: str, seen: Path) -> subprocess.Popen[bytes]:
+        """Write every status and event that a host receives into a file: a line of JSON each, `at` when it arrived."""
+        return self.python(host, "-m", "tests.support.namespaces", self.network.model_dump_json(), stdout=seen)
+
+    @property
+    def network(self) -> NetworkSettings:
+        """The network of the configuration, or without one the rendezvous in plain text."""
+        configured = load_vehicle_address(self._config).network if self._config else None
+        return configured or NetworkSettings(rendezvous=self.rendezvous, insecure=True)
 
     def log(self, host: str) -> Path:
         """What processes on a host logged."""
@@ -100,26 +138,34 @@ class Hosts:
 
     def plug(self, host: str) -> None:
         """Plug a host's cable in, at full speed."""
-        with suppress(NoNamespacesError):
-            self._tc("del", host)
+        for where, device in self._ends(host):
+            with suppress(NoNamespacesError):
+                _ip("netns", "exec", where, "tc", "qdisc", "del", "dev", device, "root")
         _ip("-n", self._switch, "link", "set", host, "up")
 
     def pull(self, host: str) -> None:
         """Pull a host's cable out."""
         _ip("-n", self._switch, "link", "set", host, "down")
 
-    def narrow(self, host: str, kbit_per_s: int) -> None:
-        """Limit what a host receives."""
-        self._tc("replace", host, "tbf", "rate", f"{kbit_per_s}kbit", "burst", "4kb", "latency", "400ms")
+    def narrow(self, host: str, kbit_per_s: int, ways: Ways = "received") -> None:
+        """Limit what a host receives, sends, or both."""
+        for way, (where, device) in zip(("received", "sent"), self._ends(host), strict=True):
+            if ways in (way, "both"):
+                rate = ("tbf", "rate", f"{kbit_per_s}kbit", "burst", "4kb", "latency", "400ms")
+                _ip("netns", "exec", where, "tc", "qdisc", "replace", "dev", device, "root", *rate)
 
-    def lose(self, host: str, percent: float) -> None:
-        """Lose a share of what a host receives, at random; 0 for none any more."""
-        rules = "add table inet loss; delete table inet loss;"
-        if percent:
-            chain = "type filter hook prerouting priority -300;"
-            drop = f'iifname "cable" numgen random mod 1000 < {round(10 * percent)} drop'
-            rules += f"table inet loss {{ chain received {{ {chain} {drop}; }}; }}"
-        _ip("netns", "exec", self._prefix + host, "nft", rules)
+    def lose(self, host: str, percent: float, ways: Ways = "both") -> None:
+        """Lose a share of the packets that a host sends, receives, or both, at random; 0 ends it.
+
+        They are dropped where they arrive: a sender would be notified, and send again sooner than on a real cable.
+        """
+        for way, (where, device) in zip(("sent", "received"), self._ends(host), strict=True):
+            table = f"add table netdev {device}; delete table netdev {device};"
+            if percent and ways in (way, "both"):
+                hook = f'type filter hook ingress device "{device}" priority 0;'
+                drop = f"numgen random mod 1000 < {round(10 * percent)} drop;"
+                table += f"table netdev {device} {{ chain lossy {{ {hook} {drop} }}; }}"
+            _run("ip", "netns", "exec", where, "nft", "-f", "-", given=table)
 
     def crossed(self, host: str) -> tuple[int, int]:
         """Bytes that a host has sent and received so far, with all headers."""
@@ -127,8 +173,9 @@ class Hosts:
         found = json.loads(subprocess.run(show, check=True, capture_output=True, text=True).stdout)[0]["stats64"]
         return found["rx"]["bytes"], found["tx"]["bytes"]
 
-    def _tc(self, verb: str, host: str, *words: str) -> None:
-        _ip("netns", "exec", self._switch, "tc", "qdisc", verb, "dev", host, "root", *words)
+    def _ends(self, host: str) -> tuple[tuple[str, str], tuple[str, str]]:
+        """Namespace and device at both ends of a host's cable, the switch's first."""
+        return (self._switch, host), (self._prefix + host, "cable")
 
     def _remove(self) -> None:
         for name in ("switch", *self._addresses):
@@ -136,15 +183,15 @@ class Hosts:
                 _ip("netns", "del", self._prefix + name)
 
 
-def _print_messages(rendezvous: list[str]) -> None:
+def _print_messages(network: NetworkSettings) -> None:
     """Print every status and event on the network as a line of JSON, until SIGTERM."""
 
     def received(sample: zenoh.Sample) -> None:
         message: dict[str, Any] = json.loads(sample.payload.to_bytes())
-        sys.stdout.write(json.dumps({"key": str(sample.key_expr), **message}) + "\n")
+        sys.stdout.write(json.dumps({"key": str(sample.key_expr), "at": time.time(), **message}) + "\n")
         sys.stdout.flush()
 
-    with join(NetworkSettings(rendezvous=rendezvous, insecure=True), listen=False) as session:
+    with join(network, listen=False) as session:
         for topic in ("status", "event"):
             session.declare_subscriber(topics.key(topic, "*"), received)
         signal.sigwait([signal.SIGTERM])
@@ -152,4 +199,4 @@ def _print_messages(rendezvous: list[str]) -> None:
 
 if __name__ == "__main__":
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
-    _print_messages(json.loads(sys.argv[1]))
+    _print_messages(NetworkSettings.model_validate_json(sys.argv[1]))

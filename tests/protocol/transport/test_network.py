@@ -32,11 +32,11 @@ class Listener:
         self.received.add(sample.payload.to_bytes())
 
 
-def receives(listener: Listener, speaker: zenoh.Session, word: bytes) -> None:
+def receives(listener: Listener, speaker: zenoh.Session, word: bytes, key: str = "t/word") -> None:
     """Publish a word until it is received: the first may go before the subscription is known."""
 
     def said() -> bool:
-        speaker.put("t/word", word)
+        speaker.put(key, word)
         return word in listener.received
 
     eventually(f"receiving {word!r}", said)

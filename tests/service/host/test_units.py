@@ -54,6 +54,15 @@ def test_the_plants_unit_may_use_its_bus_or_device_and_the_others_may_not(via: s
         assert "AF_CAN" not in made(name, *VIAS[via])["RestrictAddressFamilies"]
 
 
+def test_clients_get_a_unit_of_a_router_without_rights_and_peers_get_none() -> None:
+    client = load(overrides=["network.mode=client"])
+    assert units.units_of(client)[0] == "router"
+    assert "router" not in units.units_of(load())
+    router = made("router", "network.mode=client")
+    assert router["CapabilityBoundingSet"] == ""
+    assert "LimitRTPRIO" not in router
+
+
 def test_homes_are_hidden_unless_interpreter_or_configuration_lies_in_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -75,7 +84,7 @@ def test_homes_are_hidden_unless_interpreter_or_configuration_lies_in_one(
 def test_units_are_not_replaced_unless_forced_and_the_next_steps_start_every_daemon(
     capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    install = ["host", "units", "--install", str(tmp_path)]
+    install = ["host", "units", "--set", "network.mode=client", "--install", str(tmp_path)]
     assert run(install) == 0
     printed = capfd.readouterr().out
     *_, reload, enable, look = printed.splitlines()
@@ -90,7 +99,7 @@ def test_units_are_not_replaced_unless_forced_and_the_next_steps_start_every_dae
     assert mine.read_text() == "mine"
     assert run([*install, "--force"]) == 0
     capfd.readouterr()
-    assert run(["host", "units"]) == 0
+    assert run(install[:4]) == 0
     assert mine.read_text() in capfd.readouterr().out
     assert run(["host", "units", "--install", str(tmp_path / "nowhere")]) == 1
 
@@ -102,7 +111,8 @@ def test_systemd_finds_nothing_wrong_with_any_unit(via: str, tmp_path: Path) -> 
         pytest.skip("systemd-analyze is not installed")
     config = tmp_path / "aero loop.toml"
     config.touch()
-    source = Source(config, VIAS[via], load(overrides=VIAS[via]))
+    overrides = (*VIAS[via], "network.mode=client")
+    source = Source(config, overrides, load(overrides=overrides))
     paths = units.install(tmp_path, source)
     checked = subprocess.run(
         [systemd, "verify", "--man=no", *paths], capture_output=True, text=True, timeout=60, check=False

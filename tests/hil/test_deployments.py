@@ -1,0 +1,71 @@
+"""Deployments of the examples, each daemon on a host of its own: what the network's troubles cost, by the log.
+
+A watchdog of 0.5 s instead of 0.1 s allows for a busy machine, which must not trip the plant by itself. What is slower
+or longer, and with the examples' own settings, is measured by `tests/benchmarks/deployments.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.hil.test_clocks import python_clocks
+from tests.support.deployment import Deployment, Kind, Outcome
+from tests.support.namespaces import NoNamespacesError
+
+WATCHDOG_S = 0.5
+PATIENT = (
+    f"plant.watchdog_s={WATCHDOG_S}", f"controller.stale_s={WATCHDOG_S}", "wire.counter_bits=10", "loop.realtime=off",
+)  # fmt: skip
+SLACK_S = 0.5
+"""Beyond the watchdog: a process on a shared machine waits for hundreds of milliseconds now and then."""
+AGAIN_S = 5.0
+"""Until the plant is driven again: links take up to 1 s (retries), a claim 0.25 s, a daemon that starts 1 to 3 s."""
+
+
+def cables(hosts: Deployment) -> None:
+    hosts.cut_off_each()
+
+
+def loss_and_a_narrow_link(hosts: Deployment) -> None:
+    hosts.lossy(20, "both", 2.0)
+    hosts.slow(256, 2.0)
+    hosts.lossy(1, "both", 2.0)
+
+
+def cables_and_a_new_router(hosts: Deployment) -> None:
+    hosts.cut_off_each()
+    hosts.restart("router")
+
+
+def assert_cheap(outcome: Outcome) -> None:
+    """Only what the loop's frames pass may cost a trip; then 0 V in time, and the plant is driven again."""
+    if any(party in outcome.title for party in ("recorder", "operator", "1 % lost")):
+        assert outcome.trips == 0, outcome
+    elif "cable" in outcome.title or "ended" in outcome.title:
+        assert outcome.rest_s is not None, outcome
+        assert outcome.rest_s < WATCHDOG_S + SLACK_S, outcome
+        assert outcome.again_s is not None, outcome
+        assert outcome.again_s < AGAIN_S, outcome
+
+
+@pytest.mark.parametrize(
+    ("kind", "happens", "clocks_differ"),
+    [("peers", cables, False), ("peers", loss_and_a_narrow_link, False), ("router", cables_and_a_new_router, True)],
+)
+def test_the_plant_rests_in_time_is_driven_again_and_the_log_lacks_nothing(
+    tmp_path: Path, kind: Kind, happens: Callable[[Deployment], None], clocks_differ: bool
+) -> None:
+    """With the router, the clocks of the controller's and the recorder's hosts are an hour ahead from the start."""
+    ahead = python_clocks(tmp_path, CLOCK_STEP=str(tmp_path)) if clocks_differ else {}
+    try:
+        with Deployment(kind, tmp_path, PATIENT) as hosts:
+            hosts.start({"controller": ahead, "recorder": ahead})
+            happens(hosts)
+            for outcome in hosts.finish():
+                assert_cheap(outcome)
+            assert hosts.missed() == ({"controller": 0, "plant": 0}, 0)
+    except NoNamespacesError as error:
+        pytest.skip(f"no network namespaces here, or no nft or tc: {error}")

@@ -1,0 +1,210 @@
+"""Router: clients link to it and to nothing else, wait for it, and go on where they were when it is back."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Status
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join, visit
+from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
+from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
+from aeroloop.protocol.transport.security import Identity
+from aeroloop.service.host.operator import gather, stop
+from tests.protocol.transport.test_network import Listener, one_line, receives
+from tests.support.certificates import Authority
+from tests.support.zenoh_network import eventually, free_port
+
+ROUTER, SPEAKER = Identity(("router",)), Identity(("controller",), "aero")
+WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role="controller-1-abcd")
+"""What a controller may publish and hold, and an operator receive."""
+
+
+@pytest.fixture(params=["tcp", "tls"])
+def settings(request: pytest.FixtureRequest, tmp_path: Path) -> NetworkSettings:
+    """Of clients and their router, in plain text and with certificates."""
+    authority = Authority(tmp_path)
+    for role, vehicle in (("router", None), ("operator", None), ("controller", "aero")):
+        authority.issue(role, vehicle)
+    keys = {"security": {"directory": str(tmp_path), "vehicles": ["aero"]}, "loopback_secured": True}
+    secured = keys if request.param == "tls" else {}
+    rendezvous = [f"{request.param}/127.0.0.1:{free_port()}"]
+    return NetworkSettings.model_validate({"mode": "client", "rendezvous": rendezvous, **secured})
+
+
+@pytest.fixture
+def open_sessions() -> Iterator[ExitStack]:
+    """Closes what a test opens, the last first."""
+    with ExitStack() as stack:
+        yield stack
+
+
+def test_clients_link_to_the_router_alone_and_receive_through_it(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    router = open_sessions.enter_context(closing(route(settings, ROUTER)))
+    ear = Listener(open_sessions.enter_context(closing(join(settings))), WORD)
+    for client in [open_sessions.enter_context(closing(join(settings, SPEAKER))) for _ in range(2)]:
+        receives(ear, client, str(client.zid()).encode(), WORD)
+        assert [str(link.dst) for link in client.info.links()] == settings.rendezvous
+        assert list(client.info.routers_zid()) == [router.zid()]
+        assert not list(client.info.peers_zid())
+    assert set(ear.stamped) == {False}  # a router stamps messages by default
+
+
+def test_a_client_that_starts_first_waits_for_the_router(settings: NetworkSettings, open_sessions: ExitStack) -> None:
+    joined: list[zenoh.Session] = []
+    thread = threading.Thread(target=lambda: joined.append(join(settings)))
+    thread.start()
+    with pytest.raises(NetworkError):  # a command does not wait
+        visit(settings).__enter__()
+    assert not joined
+    open_sessions.enter_context(closing(route(settings, ROUTER)))
+    thread.join()
+    open_sessions.enter_context(closing(joined[0]))
+    with visit(settings) as here:
+        here.settle()
+        assert here.silent() == []
+
+
+def test_a_command_names_a_router_that_is_missing_or_hangs(settings: NetworkSettings) -> None:
+    with pytest.raises(NetworkError) as caught, visit(settings):
+        pass
+    assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
+    port = int(settings.rendezvous[0].rpartition(":")[2])
+    with (
+        socket.create_server(("127.0.0.1", port)),
+        pytest.raises(NetworkError, match="accepts connections and does not answer as a router"),
+        visit(settings),
+    ):
+        pass
+
+
+def test_what_was_published_while_the_router_was_away_is_recovered(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    """Its cache holds it. Tokens that were declared before are seen again, too."""
+    router = route(settings, ROUTER)
+    speaker = open_sessions.enter_context(closing(join(settings, SPEAKER)))
+    listener = open_sessions.enter_context(closing(join(settings)))
+    publisher, subscriber = CachedPublisher(speaker, WORD, 10.0), RecoveringSubscriber(listener, WORD)
+    tokens: list[zenoh.SampleKind] = []
+    seen = listener.liveliness().declare_subscriber(ALIVE, lambda token: tokens.append(token.kind), history=True)
+    token = speaker.liveliness().declare_token(ALIVE)
+    received: list[bytes] = []
+
+    def arrived(*words: bytes) -> bool:
+        received.extend(delivery.payload for delivery in subscriber.take())
+        return received == list(words)
+
+    publisher.put(b"before")
+    eventually("the first", lambda: arrived(b"before"))
+    router.close()
+    eventually("the token's end", lambda: tokens == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE])
+    publisher.put(b"away")
+    with closing(route(settings, ROUTER)):
+        eventually("the second", lambda: arrived(b"before", b"away"))
+        eventually("the token", lambda: len(tokens) == 3)
+        publisher.put(b"again")
+        eventually("the third", lambda: arrived(b"before", b"away", b"again"))
+    assert list(subscriber.missed()) == []
+    seen.undeclare()
+    token.undeclare()
+
+
+def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
+    """On hosts of their own both stand in the rendezvous; here all addresses are this host's."""
+    first, second = (NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"]) for _ in range(2))
+    open_sessions.enter_context(closing(route(first, ROUTER)))
+    open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}), ROUTER)))
+    near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
+    receives(Listener(near, WORD), far, b"over both", WORD)
+    with visit(first.model_copy(update={"connect": second.rendezvous})) as here:
+        here.settle()
+        assert here.silent() == []  # it links to one of them, and the other is well
+
+
+def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
+    ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
+    ours.issue("router")
+    foreign.issue("operator")
+    network = {"mode": "client", "rendezvous": f"tls/127.0.0.1:{free_port()}", "loopback_secured": True}
+    mine, theirs = (
+        NetworkSettings.model_validate({**network, "security": {"directory": str(each.folder), "vehicles": ["aero"]}})
+        for each in (ours, foreign)
+    )
+    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, visit(theirs):
+        pass
+    assert "not of this authority" in one_line(caught.value)
+
+
+def test_a_router_that_cannot_listen_says_so_in_one_line(settings: NetworkSettings) -> None:
+    with closing(route(settings, ROUTER)), pytest.raises(NetworkError) as caught:
+        route(settings, ROUTER)
+    assert f"cannot listen on {settings.rendezvous[0]}" in one_line(caught.value)
+
+
+def test_the_printed_configuration_is_the_routers_own_and_opens_one(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    text = zenohd_config(settings, ROUTER)
+    lines = [line for line in text.splitlines() if not line.startswith("//")]
+    assert json.loads("\n".join(lines)) == router_tree(settings, ROUTER)
+    router = open_sessions.enter_context(closing(zenoh.open(zenoh.Config.from_json5(text))))
+    client = open_sessions.enter_context(closing(join(settings)))
+    assert list(client.info.routers_zid()) == [router.zid()]
+
+
+def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
+    """A plant that hangs is off a router's network after a second, and nothing else names it."""
+    open_sessions.enter_context(closing(route(settings, ROUTER)))
+    member = open_sessions.enter_context(closing(join(settings, SPEAKER)))
+    token = member.liveliness().declare_token(ALIVE)
+    assert stop(settings).failures == ["aero has a controller, and no plant of it answers"]
+    token.undeclare()
+
+
+def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions: ExitStack) -> None:
+    """The router has rules, too: a claim of the controller passes it, one of a recorder does not."""
+    authority = Authority(tmp_path)
+    for role in ("router", "recorder", "operator"):
+        authority.issue(role)
+    for role in ("plant", "controller"):
+        authority.issue(role, "aero")
+    network = NetworkSettings.model_validate(
+        {"mode": "client", "rendezvous": f"tls/127.0.0.1:{free_port()}", "loopback_secured": True,
+         "security": {"directory": str(tmp_path), "vehicles": ["aero"]}}
+    )  # fmt: skip
+    names = ("router", "plant", "controller", "recorder")
+    roles = {name: open_sessions.enter_context(Role(name, "aero", network, {})) for name in names}
+    claims: list[bytes] = []
+    key = topics.key("claim", "aero")
+
+    def answer(query: zenoh.Query) -> None:
+        claims.append(query.payload.to_bytes() if query.payload else b"")
+        query.reply(key, b"granted")
+
+    roles["plant"].answer(key, answer)
+    for each in roles.values():
+        each.announce()
+        each.status(Status(role=each.role, state="idle", uptime_s=0.0, ticks=0, rate_hz=0.0, skipped=0))
+
+    def answers(role: str) -> list[bytes]:
+        replies = roles[role].zenoh.get(key, payload=role.encode(), timeout=1.0)
+        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+    eventually("the claim", lambda: answers("controller") == [b"granted"])
+    assert answers("recorder") == []
+    assert set(claims) == {b"controller"}
+    assert set(gather(network).statuses["aero"]) == set(names)

@@ -1,0 +1,183 @@
+"""Deployment: the daemons of an example configuration, each on a host of its own, and what a trouble costs them.
+
+Times come from the log: these hosts have one wall clock. So a message that a pulled cable holds back for seconds still
+says when the plant was at 0 V.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from subprocess import Popen
+from typing import Final, Literal, NamedTuple
+
+from aeroloop.protocol.messages.models import Event, Loss, Status
+from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.security import SecuritySettings
+from aeroloop.service.cli.show import EXAMPLES
+from aeroloop.service.review.review import read
+from aeroloop.service.testing.hil_log import HilLog
+from tests.support.certificates import Authority
+from tests.support.namespaces import STOP_WAIT_S, Hosts, Ways
+from tests.support.zenoh_network import eventually
+
+Kind = Literal["peers", "router"]
+HOSTS: Final = ("plant", "controller", "recorder", "operator", "router")
+"""In the order of their addresses."""
+AWAY_S: Final = 2.0
+"""Twice the lease, so that links are given up [s]."""
+
+
+class Outcome(NamedTuple):
+    """What a trouble cost.
+
+    Attributes:
+        title: What was done.
+        trips: How often the plant tripped.
+        rest_s: From its begin to the first trip, when the motors are at 0 V [s]; None without one.
+        again_s: From its end until the plant is driven and stays so [s]; None without a trip.
+    """
+
+    title: str
+    trips: int
+    rest_s: float | None
+    again_s: float | None
+
+    def __str__(self) -> str:
+        def in_s(value: float | None) -> str:
+            return "–" if value is None else f"{value:.3f}"
+
+        return f"{self.title:44} {self.trips:5} {in_s(self.rest_s):>9} {in_s(self.again_s):>9}"
+
+
+class Deployment(Hosts):
+    """Hosts of an example configuration, with a certificate each.
+
+    Attributes:
+        daemons: By host, once started.
+    """
+
+    def __init__(self, kind: Kind, folder: Path, overrides: Sequence[str] = ()) -> None:
+        super().__init__(HOSTS, folder, EXAMPLES / f"hosts-{kind}.toml")
+        self.kind = kind
+        self.daemons: dict[str, Popen[bytes]] = {}
+        self.log_file = folder / "log.mcap"
+        self._seen = folder / "seen"
+        self._overrides = overrides
+        self._keys = Authority(folder / "keys")
+        for role in HOSTS:
+            self._keys.issue(role, "aero" if role in ("plant", "controller") else None)
+        self._troubles: list[tuple[str, float, float]] = []  # title, begin and end [s since 1970]
+
+    def options(self, overrides: Sequence[str] = ()) -> list[str]:
+        """As of any hosts, with certificates for the example's."""
+        return super().options([f"network.security.directory={self._keys.folder}", *overrides])
+
+    @property
+    def network(self) -> NetworkSettings:
+        """As of any hosts, with certificates for the example's."""
+        return super().network.model_copy(
+            update={"security": SecuritySettings(directory=str(self._keys.folder), vehicles=["aero"])}
+        )
+
+    def start(self, environments: Mapping[str, Mapping[str, str]] | None = None) -> None:
+        """Start the daemons, each in its host's environment, and wait until the plant is driven."""
+        given = environments or {}
+        for host in ("recorder", "plant", "controller", *(["router"] if self.kind == "router" else [])):
+            self.start_daemon(host, given.get(host))
+        self.watch("operator", self._seen)
+        self.await_driven(0.0)
+
+    def start_daemon(self, host: str, environment: Mapping[str, str] | None = None) -> None:
+        """Start the daemon of a host."""
+        words = {"plant": ["emulator"], "controller": ["controller", "--auto-arm"], "router": ["router"],
+                 "recorder": ["recorder", "--log", str(self.log_file)]}[host]  # fmt: skip
+        self.daemons[host] = self.aeroloop(host, *words, overrides=self._overrides, environment=environment)
+
+    def suffer(self, title: str, begin: Callable[[], object], end: Callable[[], object], for_s: float = AWAY_S) -> None:
+        """Cause a trouble and end it; then wait until the plant is driven, or still is."""
+        begun = time.time()
+        begin()
+        time.sleep(for_s)
+        ended = time.time()
+        end()
+        self._troubles.append((title, begun, ended))
+        self.await_driven(time.time() + 0.5)  # by a later status: that one may have been under way
+
+    def cut_off(self, host: str, for_s: float = AWAY_S) -> None:
+        """Pull a host's cable, and put it back."""
+        self.suffer(
+            f"cable of the {host} out for {for_s:g} s", partial(self.pull, host), partial(self.plug, host), for_s
+        )
+
+    def cut_off_each(self) -> None:
+        """Pull the cable of each host in turn."""
+        for host in HOSTS:
+            if host in self.daemons or host == "operator":
+                self.cut_off(host)
+
+    def lossy(self, percent: float, ways: Ways, for_s: float) -> None:
+        """Lose a share of the plant's packets for a time."""
+        what = {"both": "sends and receives", "sent": "sends", "received": "receives"}[ways]
+        title = f"{percent:g} % lost of what the plant {what}"
+        self.suffer(title, partial(self.lose, "plant", percent, ways), partial(self.lose, "plant", 0), for_s)
+
+    def slow(self, kbit_per_s: int, for_s: float) -> None:
+        """Limit what the plant sends and what it receives for a time."""
+        title = f"{kbit_per_s} kbit/s to and from the plant"
+        self.suffer(title, partial(self.narrow, "plant", kbit_per_s, "both"), partial(self.plug, "plant"), for_s)
+
+    def restart(self, host: str) -> None:
+        """End the daemon of a host, and start it again."""
+
+        def end() -> None:
+            self.daemons[host].send_signal(signal.SIGTERM)
+            self.daemons[host].wait(STOP_WAIT_S)
+
+        self.suffer(f"the {host} ended, and started again", end, partial(self.start_daemon, host), 0.0)
+
+    def await_driven(self, since: float) -> None:
+        """Wait for a status of a driven plant that arrives after a time [s since 1970]."""
+        eventually("driving", lambda: any(
+            line.get("state") == "driven" and line["at"] > since
+            for line in map(json.loads, self._lines())
+        ))  # fmt: skip
+
+    def finish(self) -> list[Outcome]:
+        """End the daemons, the recorder after the ends, and read what each trouble cost from the log."""
+        for host in ("controller", "plant", "recorder"):
+            self.daemons[host].send_signal(signal.SIGTERM)
+            self.daemons[host].wait(STOP_WAIT_S)
+        return list(self._outcomes())
+
+    def missed(self) -> tuple[dict[str, int], int]:
+        """By the log: ticks of each end that are missing, and other messages that the recorder missed for good."""
+        losses = sum(loss.count for _, loss in HilLog(self.log_file).messages("loss") if isinstance(loss, Loss))
+        return dict(read(self.log_file).findings.missing_ticks), losses
+
+    def _outcomes(self) -> Iterator[Outcome]:
+        log = HilLog(self.log_file)
+        events = [(at * 1e-9, event) for at, event in log.messages("event") if isinstance(event, Event)]
+        trips = [at for at, event in events if event.kind == "tripped"]
+        states = sorted(
+            (at * 1e-9, status.state)
+            for at, status in log.messages("status")
+            if isinstance(status, Status) and status.role == "plant"
+        )
+        ends = [begun for _, begun, _ in self._troubles[1:]] + [float("inf")]
+        for (title, begun, ended), until in zip(self._troubles, ends, strict=True):
+            tripped = [at for at in trips if begun < at < until]
+            driven = [at for at, state in states if state == "driven" and tripped and tripped[-1] < at < until]
+            yield Outcome(
+                title,
+                len(tripped),
+                tripped[0] - begun if tripped else None,
+                max(0.0, driven[0] - ended) if driven else None,
+            )
+
+    def _lines(self) -> list[str]:
+        return [line for line in self._seen.read_text().splitlines() if line.endswith("}")]
