@@ -53,7 +53,10 @@ class Topic:
         rate: How often.
         model: Model of its messages or requests; None of frames, traces and tokens, and where a request is empty.
         decoded: For viewers: `always` or at most at the `limited` rate; None where nothing is shown.
-        limit: Most bytes of payload and attachment. What is longer is neither published nor received.
+        limit: Most bytes of payload and attachment of what is published or answered. What is longer is neither
+            published nor received.
+        request: Most bytes of a query, likewise.
+        per_s: Most queries a second that a process takes from one link; what comes sooner after another is dropped.
     """
 
     name: str
@@ -64,11 +67,18 @@ class Topic:
     model: type[Message] | None = None
     decoded: Literal["always", "limited"] | None = None
     limit: int = MESSAGE_BYTES
+    request: int = MESSAGE_BYTES
+    per_s: float = 50.0
 
     @property
     def recorded(self) -> bool:
         """Whether it is published from a cache and recorded: a subscriber that joins late recovers earlier messages."""
         return self.carries in ("trace", "json")
+
+    @property
+    def answered(self) -> bool:
+        """Whether roles answer queries on it."""
+        return self.carries == "query" or self.name in ("description", "status")
 
     @property
     def title(self) -> str:
@@ -88,7 +98,7 @@ TOPICS: Final = {
             "controller",
             "at a session's start and on change",
             SessionRecord,
-            limit=POINTS_BYTES,
+            request=POINTS_BYTES,
         ),
         Topic("arm", "arm", "query", "operator", "when needed"),
         Topic("stop", "stop", "query", "operator", "when needed"),
@@ -96,9 +106,9 @@ TOPICS: Final = {
         Topic("recall", "recall", "query", "operator", "when needed"),
         Topic("show", "show", "query", "operator", "when needed", limit=POINTS_BYTES),
         Topic("set_gains", "set-gains", "query", "operator", "when needed", Gains),
-        Topic("track", "track", "query", "operator", "when needed", Track, limit=POINTS_BYTES),
+        Topic("track", "track", "query", "operator", "when needed", Track, request=POINTS_BYTES),
         Topic("inject", "inject", "query", "operator", "when needed", Inject),
-        Topic("advance", "advance", "query", "operator", "when needed", Advance),
+        Topic("advance", "advance", "query", "operator", "when needed", Advance, per_s=1000.0),
         Topic(
             "description",
             "description/{role}",

@@ -39,6 +39,8 @@ _QUEUES: Final = (
     "data_low",
     "background",
 )
+HEADER_BYTES: Final = 65_536
+"""More than Zenoh adds to a payload: the key, and what goes with it."""
 HANDSHAKE_MS: Final = 2000
 """Time-out of the handshake with a program that accepts a connection and sends nothing [ms]."""
 VISIT_S: Final = 0.5
@@ -208,6 +210,7 @@ def _open(
     handshake_ms: int = HANDSHAKE_MS,
     retry_ms: tuple[int, int] = _RETRY_MS,
 ) -> zenoh.Session:
+    answered = {name: each for name, each in topics.TOPICS.items() if each.answered}
     tree: dict[str, Any] = {
         "mode": "peer",
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -220,13 +223,23 @@ def _open(
         # Before it is queued, parsed or stored: what waits in memory is bounded for every publisher.
         "low_pass_filter": [
             {
-                "id": topic.name,
+                "id": f"{topic.name} {messages[0]}",
                 "flows": ["ingress"],
-                "messages": ["put", "query", "reply"],
+                "messages": messages,
                 "key_exprs": [topics.key(topic.name, "*")],
-                "size_limit": topic.limit,
+                "size_limit": most,
             }
             for topic in topics.TOPICS.values()
+            for messages, most in ((["put", "reply"], topic.limit), (["query"], topic.request))
+        ],
+        # By link, whatever a message says of its sender: only a new link, with its handshake, is a new peer.
+        "downsampling": [
+            {
+                "id": "queries",
+                "flows": ["ingress"],
+                "messages": ["query"],
+                "rules": [{"key_expr": topics.key(name, "*"), "freq": each.per_s} for name, each in answered.items()],
+            }
         ],
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "transport": {
@@ -234,7 +247,10 @@ def _open(
             "shared_memory": {"enabled": False},
             # Zenoh's default is 1 for most priorities: a sending thread that is blocked for 2 ms then drops frames.
             # Late frames do no harm: the receiver refuses them by their tick.
-            "link": {"tx": {"lease": settings.lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
+            "link": {
+                "tx": {"lease": settings.lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}},
+                "rx": {"max_message_size": topics.POINTS_BYTES + HEADER_BYTES},  # of fragments: 1 GiB by default
+            },
             "unicast": {"open_timeout": handshake_ms, "accept_timeout": HANDSHAKE_MS},
         },
     }
