@@ -141,7 +141,8 @@ def main(seconds: float, flooders: int, names: list[str]) -> None:
             loop = RunningLoop(processes, settings.vehicle)
             for role in ("recorder", "plant", "controller"):
                 processes.start(role, environment={"PYTHONUNBUFFERED": "1"})  # an interpreter of its own
-                processes.await_role(role)
+                if role != "controller":  # whose token has a name of its own
+                    processes.await_role(role)
             loop.await_drive()
             aside = subprocess.Popen(words)
             try:
