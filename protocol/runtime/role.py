@@ -248,10 +248,12 @@ class Role:
             Ends it.
         """
         key = topics.key("alive", self.vehicle, role=name)
-        subscriber = self.zenoh.liveliness().declare_subscriber(
-            key, lambda sample: callback(sample.kind == zenoh.SampleKind.PUT), history=True
-        )
-        return subscriber.undeclare
+
+        def seen(sample: zenoh.Sample) -> None:
+            if str(sample.key_expr) == key:  # a token may have wildcards
+                callback(sample.kind == zenoh.SampleKind.PUT)
+
+        return self.zenoh.liveliness().declare_subscriber(key, seen, history=True).undeclare
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message: a cache for many messages a second takes a while."""

@@ -22,10 +22,8 @@ from aeroloop.protocol.transport.publication import WAITING, Delivery, Recoverin
 _MASK: Final = 0xFFFF_FFFF
 """Publishers' numbers have 32 bits and begin again at 0."""
 
-_RING_BYTES: Final = 67_108_864
-"""A ring holds no more than this of the longest messages of its topic, but `_LEAST_WAITING` of them in any case."""
-_LEAST_WAITING: Final = 8192
-"""The last minute of several vehicles, which caches send at once."""
+_RING_BYTES: Final = 16_777_216
+"""Payload of one topic that may wait: the last minute of several vehicles, which caches send at once, is less."""
 
 _Source = tuple[zenoh.ZenohId, int]
 """A publisher: an EntityGlobalId cannot be compared."""
@@ -43,7 +41,9 @@ class Subscriptions:
     def __init__(self, session: zenoh.Session, *, frames: bool = False, waiting: int = WAITING) -> None:
         self._waiting = waiting
         self._topics = {
-            key: RecoveringSubscriber(session, key, min(waiting, max(_LEAST_WAITING, _RING_BYTES // topic.limit)))
+            key: RecoveringSubscriber(session, key, waiting, _RING_BYTES)
+            if topic.limit >= topics.MESSAGE_BYTES
+            else RecoveringSubscriber(session, key, min(waiting, _RING_BYTES // topic.limit))
             for key, topic in ((topics.key(name, "*"), topics.TOPICS[name]) for name in topics.RECORDED)
         }
         self._frames = [

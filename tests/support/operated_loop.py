@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import pytest
+import zenoh
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
@@ -70,7 +71,7 @@ class Query:
         self.answers: list[Answer] = []
 
     def reply(self, key: str, payload: bytes) -> None:
-        assert key == self.key_expr
+        assert zenoh.KeyExpr(self.key_expr).includes(zenoh.KeyExpr(key))
         self.answers.append(Answer.model_validate_json(payload))
 
     def drop(self) -> None:
