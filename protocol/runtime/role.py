@@ -186,6 +186,7 @@ class Role:
         """
         key = topics.key(topic, self.vehicle)
         name = key.rpartition("/")[2]
+        intake.prepare(model)
 
         def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
             try:
