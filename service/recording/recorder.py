@@ -36,7 +36,7 @@ WORK_EVERY_S: Final = 0.5
 
 STATUS_EVERY_S: Final = 1.0
 
-TAKEN_BYTES: Final = 16_777_216
+TAKEN_BYTES: Final = 8_388_608
 """Payload taken before the status is published again."""
 
 DESCRIPTION_BYTES: Final = 4_194_304

@@ -22,7 +22,7 @@ from aeroloop.protocol.transport.publication import WAITING, Delivery, Recoverin
 _MASK: Final = 0xFFFF_FFFF
 """Publishers' numbers have 32 bits and begin again at 0."""
 
-_RING_BYTES: Final = 16_777_216
+_RING_BYTES: Final = 8_388_608
 """Payload of one topic that may wait: the last minute of several vehicles, which caches send at once, is less."""
 
 _Source = tuple[zenoh.ZenohId, int]

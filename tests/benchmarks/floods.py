@@ -90,7 +90,8 @@ def flood(rendezvous: str, name: str, seconds: float) -> None:
             if time.monotonic() > until:
                 break
             if topic.carries == "token":
-                tokens.append(session.liveliness().declare_token(f"aeroloop/aero/alive/{os.getpid()}-{number}"))
+                holder = (f"{os.getpid()}-{number}", "plant", "recorder", "*")[number % 4]
+                tokens.append(session.liveliness().declare_token(f"aeroloop/aero/alive/{holder}"))
                 if len(tokens) >= 1000:
                     while tokens:
                         tokens.pop().undeclare()
@@ -145,6 +146,7 @@ def main(seconds: float, flooders: int, names: list[str]) -> None:
                     processes.await_role(role)
             loop.await_drive()
             aside = subprocess.Popen(words)
+            os.nice(19)  # it watches tokens, too
             try:
                 targets = {"bystander": bystander, "flooded": settings.network.rendezvous[0]}
                 in_turns(loop, targets, seconds, flooders, names)
