@@ -183,7 +183,7 @@ class RecoveringSubscriber:
     """Subscriber that recovers earlier messages from publishers' caches.
 
     At most `waiting` messages wait to be taken, and no Python runs when one is received; if `waiting_bytes` bounds
-    their bytes, too, it does: for messages that may be long, and are few. The session outlives the subscriber.
+    their bytes, too, it does: for a process without a loop. The session outlives the subscriber.
     """
 
     def __init__(
