@@ -242,7 +242,7 @@ class Role:
     def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
         """Call back when a role's liveliness token appears (True) and disappears, in one of Zenoh's threads.
 
-        A token of another name calls no Python. Zenoh merges tokens of one name: the first appears, the last disappears.
+        A token of another name calls no Python. Zenoh merges those of one name: the first appears, the last disappears.
 
         Returns:
             Ends it.
