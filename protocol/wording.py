@@ -122,11 +122,16 @@ def problems(error: ValidationError, *models: type[BaseModel]) -> list[str]:
     return [_problem(shapes, dict(each)) for each in error.errors(include_url=False)]
 
 
+def problem(error: ValidationError, model: type[BaseModel]) -> str:
+    """What is wrong first: a sentence for one error, however many there are. The error is from the model."""
+    return _problem(Shapes(model), dict(error.errors(include_url=False)[0]))
+
+
 def closest(key: str, known: Iterable[str]) -> str | None:
     """The known key that is most like an unknown one: in its last part and in its section. None if none is."""
     section, _, name = key.rpartition(".")
     best, found = _ALIKE, None
-    for other in known:
+    for other in known if len(key) <= 2 * SHOWN else ():
         its_section, _, its_name = other.rpartition(".")
         likeness = _likeness(name, its_name)
         if section:
@@ -168,8 +173,8 @@ def _problem(shapes: Shapes, error: dict[str, Any]) -> str:
 
 
 def _unknown(shapes: Shapes, place: Sequence[str | int], key: str) -> str:
-    if not key.isprintable():  # the line stays one line
-        key = json.dumps(key)
+    if len(key) > SHOWN or not key.isprintable():  # the line stays one line, and no search for what is like it
+        key = _shown(key)
     found = closest(key, (name for name, _ in shapes.every_key()))
     if found is not None:
         return f"unknown key {key}: did you mean {found}?"

@@ -14,13 +14,22 @@ from datetime import UTC, datetime
 from typing import Final
 
 import zenoh
-from pydantic import ValidationError
+from zenoh.handlers import RingChannel
 
 from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
-from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, FaultStatus, Grant, Refusal, Release, SessionRecord, Status
+from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages.models import (
+    Claim,
+    FaultStatus,
+    Grant,
+    Refusal,
+    Release,
+    SessionRecord,
+    Status,
+    Tenure,
+)
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, batches_per_s
@@ -31,6 +40,8 @@ from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.transmit import SILENCE
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
+OTHERS_PERIOD_NS: Final = 10_000_000
+"""How often the statuses of another plant of this name are read, of those the newest."""
 
 
 class ZenohFront(Front):
@@ -63,8 +74,9 @@ class ZenohFront(Front):
         self._published_state = endpoint.state
         self._since = _now() if endpoint.cause else None
         self._status_tick = -1
-        self._status_due = 0
+        self._status_due = self._others_due = 0
         self._status_time = time.monotonic()
+        self._forget_holder: Callable[[], None] | None = None
 
     @property
     def link(self) -> ZenohLink | None:
@@ -81,17 +93,18 @@ class ZenohFront(Front):
         role.serve("show", Request, lambda _: self._show)
         role.serve("arm", Request, lambda _: self._arm)
         role.serve("stop", Request, lambda _: self._stop)
-        role.watch_tokens(self._token)
         if not self._loop.lockstep:
             role.datagrams.listen()
-        role.zenoh.declare_subscriber(
-            topics.key("status", role.vehicle, role=role.role), self._other_plant, allowed_origin=zenoh.Locality.REMOTE
+        self._others = role.zenoh.declare_subscriber(
+            topics.key("status", role.vehicle, role=role.role), RingChannel(1), allowed_origin=zenoh.Locality.REMOTE
         )
         role.announce()
         role.event("started", f"{role.vehicle} waits for a claim")
 
     def take_inbox(self) -> None:
-        """Process queued claims, releases and operator commands."""
+        """Process queued claims, releases and operator commands, and the status of another plant."""
+        if time.monotonic_ns() >= self._others_due:
+            self._read_others()
         if self._role.take_inbox():
             self.follow_session()
 
@@ -130,6 +143,8 @@ class ZenohFront(Front):
         if endpoint.session is None and self._link is not None:
             self._link.close()
             self._link = None
+            if self._forget_holder is not None:
+                self._forget_holder()
         if not endpoint.notices:
             return
         if endpoint.cause is None:
@@ -156,15 +171,20 @@ class ZenohFront(Front):
 
     # ── queries and tokens from Zenoh's threads, processed between ticks ──
 
-    def _token(self, name: str, appeared: bool) -> None:
-        if not appeared:
-            self._role.enqueue(lambda: self._endpoint.lost(name))
+    def _watch(self, holder: str) -> None:
+        def seen(appeared: bool) -> None:
+            if not appeared:
+                self._role.enqueue(lambda: self._endpoint.lost(holder))
 
-    def _other_plant(self, sample: zenoh.Sample) -> None:
+        self._forget_holder = self._role.watch_token(holder, seen)
+
+    def _read_others(self) -> None:
         """Another plant end publishes under this one's name, as after a network was cut and healed."""
-        with suppress(ValidationError):
-            other = Status.model_validate_json(sample.payload.to_bytes())
-            self._role.enqueue(lambda: self._contest(other.process))
+        self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
+        if (sample := self._others.try_recv()) is not None:
+            with suppress(intake.IntakeError):
+                self._contest(intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).process)
+                self.follow_session()
 
     def _contest(self, other: str) -> None:
         if self._endpoint.trip is not TripCause.DUPLICATE:
@@ -188,6 +208,7 @@ class ZenohFront(Front):
             mailbox=None if self._loop.lockstep and self._changed is None else Mailbox(self._changed),
             also=self._role.datagrams.session,
         )
+        self._watch(claim.controller)
         return answer
 
     def _release(self, release: Release) -> Answer:

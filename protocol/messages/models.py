@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, AwareDatetime, Field, PlainSerializer, StringConstraints
+from pydantic import AfterValidator, AwareDatetime, BaseModel, Field, PlainSerializer, StringConstraints
 
 from aeroloop.protocol.messages.operator import Gains, Message, Reference
 from aeroloop.protocol.messages.states import TripCause
@@ -36,11 +36,15 @@ SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"),
 """One chunk of a key, and not the first chunk of a topic's key."""
 
 
+RoleName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+"""One chunk of a liveliness token's key."""
+
+
 class Claim(Message):
     """A controller's request for the exclusive control of a plant."""
 
     protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md that the controller implements")
-    controller: str = Field(description="name of the controller and of its liveliness token")
+    controller: RoleName = Field(description="name of the controller and of its liveliness token")
     session: SessionName = Field(description="name of the session, in the keys of its frames; new for every claim")
     period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
     lockstep: bool = Field(description="the plant waits for each command before it steps")
@@ -187,6 +191,15 @@ class Status(Message):
     gains_from: Source | None = None
     reference: str | None = Field(default=None, description="controller: its reference, in words; likewise")
     reference_from: Source | None = None
+
+
+class Tenure(BaseModel, extra="ignore"):
+    """What another end reads of a plant's status, whatever else is in it: it takes a tenth of the time."""
+
+    state: str
+    process: str
+    session: str | None = None
+    cause: str | None = None
 
 
 class Telemetry(Message):

@@ -69,7 +69,10 @@ class Topic:
         receivers: Roles that subscribe to it, watch it or answer it.
         model: Model of its messages or requests; None of frames, traces and tokens, and where a request is empty.
         decoded: For viewers: `always` or at most at the `limited` rate; None where nothing is shown.
-        limit: Most bytes of payload and attachment. What is longer is neither published nor received.
+        limit: Most bytes of payload and attachment of what is published or answered. What is longer is neither
+            published nor received.
+        request: Most bytes of a query, likewise.
+        per_s: Most queries a second that a process takes from one link; what comes sooner after another is dropped.
     """
 
     name: str
@@ -80,11 +83,18 @@ class Topic:
     model: type[Message] | None = None
     decoded: Literal["always", "limited"] | None = None
     limit: int = MESSAGE_BYTES
+    request: int = MESSAGE_BYTES
+    per_s: float = 50.0
 
     @property
     def recorded(self) -> bool:
         """Whether it is published from a cache and recorded: a subscriber that joins late recovers earlier messages."""
         return self.carries in ("trace", "json")
+
+    @property
+    def answered(self) -> bool:
+        """Whether roles answer queries on it."""
+        return self.carries == "query" or self.name in ("description", "status")
 
     @property
     def title(self) -> str:
@@ -97,16 +107,16 @@ TOPICS: Final = {
     for topic in (
         Topic("claim", "claim", "query", _CONTROLLER, _PLANT, Claim, limit=POINTS_BYTES),
         Topic("release", "release", "query", _CONTROLLER, _PLANT, Release),
-        Topic("record", "record", "query", _CONTROLLER, _PLANT, SessionRecord, limit=POINTS_BYTES),
+        Topic("record", "record", "query", _CONTROLLER, _PLANT, SessionRecord, request=POINTS_BYTES),
         Topic("arm", "arm", "query", _OPERATOR, _PLANT),
         Topic("stop", "stop", "query", _OPERATOR, _PLANT),
         Topic("stand_down", "stand-down", "query", _OPERATOR, _CONTROLLER),
         Topic("recall", "recall", "query", _OPERATOR, _CONTROLLER),
         Topic("show", "show", "query", _READERS, _ENDS, limit=POINTS_BYTES),
         Topic("set_gains", "set-gains", "query", _OPERATOR, _CONTROLLER, Gains),
-        Topic("track", "track", "query", _OPERATOR, _CONTROLLER, Track, limit=POINTS_BYTES),
+        Topic("track", "track", "query", _OPERATOR, _CONTROLLER, Track, request=POINTS_BYTES),
         Topic("inject", "inject", "query", _OPERATOR, _PLANT, Inject),
-        Topic("advance", "advance", "query", _OPERATOR, _PLANT, Advance),
+        Topic("advance", "advance", "query", _OPERATOR, _PLANT, Advance, per_s=1000.0),
         Topic("description", "description/{role}", "json", _DAEMONS, _READERS, Description, limit=POINTS_BYTES),
         Topic("measurement", "{session}/measurement", "frame", _PLANT, _CONTROLLER + _READERS, limit=FRAME_BYTES),
         Topic("command", "{session}/command", "frame", _CONTROLLER, _PLANT + _READERS, limit=FRAME_BYTES),

@@ -22,7 +22,7 @@ import zenoh
 from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
 from aeroloop.protocol.messages.operator import Answer, Message
 from aeroloop.protocol.runtime.event_log import log_event
@@ -44,12 +44,18 @@ from aeroloop.protocol.transport.router import route
 from aeroloop.protocol.transport.security import TLS, Identity
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wording import problems
 
 M = TypeVar("M", bound=Message)
 _RECENT_S: Final = 10.0
 _SELDOM_PER_S: Final = 8.0
 """Cached messages per second of a topic that was not declared beforehand: statuses, events."""
+
+AT_ONCE: Final = 8
+"""Actions that run between two ticks; the others wait."""
+WAITING: Final = 64
+"""Queries that may wait to be answered between ticks; more are refused."""
+LONG_S: Final = 10.0
+"""Least time between two requests of a topic that are too long to be parsed in a fraction of a tick [s]."""
 
 Action = Callable[[], object]
 """A function to run between two ticks."""
@@ -117,6 +123,7 @@ class Role:
         self._publishers: dict[str, CachedPublisher] = {}
         self._inbox: deque[Action] = deque()
         self._throttle = Throttle()
+        self._long = Throttle(LONG_S)
         self._started = time.monotonic()
         self.publish_description(config)
         key = topics.key("description", vehicle, role=role)
@@ -211,7 +218,8 @@ class Role:
     def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
         """Answer a topic's queries between ticks, when the owner calls `take_inbox`.
 
-        A query whose key expression does not end with the topic's name is not answered and changes nothing.
+        A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
+        is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
 
         Args:
             topic: Name of a query in the table.
@@ -221,6 +229,7 @@ class Role:
         """
         key = topics.key(topic, self.vehicle)
         name = key.rpartition("/")[2]
+        intake.prepare(model)
 
         def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
             try:
@@ -234,11 +243,14 @@ class Role:
             if not str(query.key_expr).endswith(f"/{name}"):  # `**`, by which tools list a network, names no verb
                 query.drop()
                 return
+            payload = query.payload.to_bytes() if query.payload else b"{}"
+            if len(payload) > topics.TOPICS[topic].request:  # a key expression with wildcards passes Zenoh's filter
+                query.drop()
+                return
             try:
-                action = prepare(model.model_validate_json(query.payload.to_bytes() if query.payload else b"{}"))
-            except ValidationError as error:
-                text = f"not a {model.__name__}: {problems(error, model)[0]}"
-                guarded(query, lambda: Answer(done=False, text=text))
+                if len(self._inbox) >= WAITING:
+                    raise intake.IntakeError(f"{WAITING} requests wait already; ask again")
+                action = prepare(self._read(topic, model, payload))
             except AeroloopError as error:
                 refusal = Answer(done=False, text=str(error))
                 guarded(query, lambda: refusal)
@@ -247,32 +259,44 @@ class Role:
 
         self.answer(key, received)
 
+    def _read(self, topic: str, model: type[M], payload: bytes) -> M:
+        """Read a request. Raises IntakeError."""
+        if len(payload) <= topics.MESSAGE_BYTES and intake.few(payload):
+            return intake.read(model, payload)
+        if topics.TOPICS[topic].request <= topics.MESSAGE_BYTES:
+            return intake.read(model, payload)  # refuses it
+        if self._long.let_pass(topic) is None:
+            raise intake.IntakeError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
+        return intake.read(model, payload, intake.REFERENCE)
+
     def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
         self._inbox.append(action)
 
     def take_inbox(self) -> bool:
-        """Run the queued actions; whether there were any."""
+        """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""
         inbox = self._inbox
         if not inbox:
             return False
-        while inbox:
+        for _ in range(min(AT_ONCE, len(inbox))):
             inbox.popleft()()
         return True
 
-    def watch_tokens(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with the name of each role's liveliness token, and whether it appeared (True) or disappeared.
+    def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
+        """Call back when a role's liveliness token appears (True) and disappears, in one of Zenoh's threads.
 
-        The callback runs in one of Zenoh's threads.
+        A token of another name calls no Python. Zenoh merges those of one name: the first appears, the last disappears.
+
+        Returns:
+            Ends it.
         """
-        alive = topics.TOPICS["alive"]
+        key = topics.key("alive", self.vehicle, role=name)
 
         def seen(sample: zenoh.Sample) -> None:
-            address = topics.read_key(str(sample.key_expr))
-            if address is not None and address.topic is alive and address.role is not None:
-                callback(address.role, sample.kind == zenoh.SampleKind.PUT)
+            if str(sample.key_expr) == key:  # a token may have wildcards
+                callback(sample.kind == zenoh.SampleKind.PUT)
 
-        self.zenoh.liveliness().declare_subscriber(topics.key("alive", self.vehicle), seen, history=True)
+        return self.zenoh.liveliness().declare_subscriber(key, seen, history=True).undeclare
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message: a cache for many messages a second takes a while."""

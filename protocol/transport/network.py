@@ -60,6 +60,8 @@ _QUEUES: Final = (
     "data_low",
     "background",
 )
+HEADER_BYTES: Final = 65_536
+"""More than Zenoh adds to a payload: the key, and what goes with it."""
 HANDSHAKE_MS: Final = 2000
 """Time-out of the handshake with a program that accepts a connection and sends nothing [ms]."""
 VISIT_S: Final = 0.5
@@ -406,6 +408,7 @@ def session_tree(
     """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
     settings, certificate, vehicles = network
     lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms
+    answered = {name: each for name, each in topics.TOPICS.items() if each.answered}
     tree: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -418,13 +421,14 @@ def session_tree(
         # Before it is queued, parsed or stored: what waits in memory is bounded for every publisher.
         "low_pass_filter": [
             {
-                "id": topic.name,
+                "id": f"{topic.name} {messages[0]}",
                 "flows": ["ingress"],
-                "messages": ["put", "query", "reply"],
+                "messages": messages,
                 "key_exprs": [topics.key(topic.name, "*")],
-                "size_limit": topic.limit,
+                "size_limit": most,
             }
             for topic in topics.TOPICS.values()
+            for messages, most in ((["put", "reply"], topic.limit), (["query"], topic.request))
         ],
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "transport": {
@@ -432,7 +436,10 @@ def session_tree(
             "shared_memory": {"enabled": False},
             # Zenoh's default is 1 for most priorities: a sending thread that is blocked for 2 ms then drops frames.
             # Late frames do no harm: the receiver refuses them by their tick.
-            "link": {"tx": {"lease": lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}}},
+            "link": {
+                "tx": {"lease": lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}},
+                "rx": {"max_message_size": topics.POINTS_BYTES + HEADER_BYTES},  # of fragments: 1 GiB by default
+            },
             "unicast": {
                 "open_timeout": handshake_ms,
                 "accept_timeout": HANDSHAKE_MS,
@@ -440,6 +447,10 @@ def session_tree(
             },
         },
     }
+    if mode != "client":  # a client's one link carries the queries of all: its router limits each of them
+        # By link, whatever a message says of its sender: only a new link, with its handshake, is a new peer.
+        rules = [{"key_expr": topics.key(name, "*"), "freq": each.per_s} for name, each in answered.items()]
+        tree["downsampling"] = [{"id": "queries", "flows": ["ingress"], "messages": ["query"], "rules": rules}]
     if certificate is not None:
         tree["transport"]["link"]["tls"] = tls_tree(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.

@@ -13,11 +13,12 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from math import ceil
-from typing import Final, NamedTuple
+from threading import Lock
+from typing import Any, Final, NamedTuple
 
 import zenoh
 import zenoh.ext
-from zenoh.handlers import FifoChannel, Handler, RingChannel
+from zenoh.handlers import Callback, FifoChannel, Handler, RingChannel
 
 KEPT_S: Final = 65.0
 """A cache holds the messages of this time at the topic's rate [s]: 60 s and the duration of a restart."""
@@ -150,20 +151,55 @@ class CacheQuery:
         return self._session.get(self._key, channel, consolidation=zenoh.ConsolidationMode.NONE, timeout=CACHE_S)
 
 
-class RecoveringSubscriber:
-    """Subscriber that recovers earlier messages from publishers' caches. No Python runs when a message is received.
+class ByteRing:
+    """Samples that wait to be taken, bounded in number and in bytes of payload: the oldest are dropped."""
 
-    At most `waiting` messages wait to be taken. The session outlives the subscriber.
+    def __init__(self, most: int, most_bytes: int) -> None:
+        self._most, self._most_bytes = most, most_bytes
+        self._samples: deque[tuple[zenoh.Sample, int]] = deque()
+        self._bytes = 0
+        self._lock = Lock()
+
+    def put(self, sample: zenoh.Sample) -> None:
+        """Add a sample, in one of Zenoh's threads."""
+        size = len(sample.payload)
+        with self._lock:
+            self._samples.append((sample, size))
+            self._bytes += size
+            while len(self._samples) > self._most or self._bytes > self._most_bytes:
+                self._bytes -= self._samples.popleft()[1]
+
+    def try_recv(self) -> zenoh.Sample | None:
+        """Remove and return the oldest sample; None if there is none."""
+        with self._lock:
+            if not self._samples:
+                return None
+            sample, size = self._samples.popleft()
+            self._bytes -= size
+            return sample
+
+
+class RecoveringSubscriber:
+    """Subscriber that recovers earlier messages from publishers' caches.
+
+    At most `waiting` messages wait to be taken, and no Python runs when one is received; if `waiting_bytes` bounds
+    their bytes, too, it does: for a process without a loop. The session outlives the subscriber.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, waiting: int = WAITING) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, waiting: int = WAITING, waiting_bytes: int | None = None
+    ) -> None:
+        bounded = None if waiting_bytes is None else ByteRing(waiting, waiting_bytes)
+        # Any: the stubs have a type for each kind of handler.
+        ring: Any = RingChannel(waiting) if bounded is None else Callback(bounded.put, indirect=False)
         self._subscriber = zenoh.ext.declare_advanced_subscriber(
             session,
             key,
-            RingChannel(waiting),
+            ring,
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
         )
+        self._received = bounded or self._subscriber
         self._misses = self._subscriber.sample_miss_listener(RingChannel(1024))
         self._session = session
         self._known: set[_Publisher] = set()
@@ -180,7 +216,7 @@ class RecoveringSubscriber:
 
         If `held`, also those that are held back until a cache has answered.
         """
-        while (sample := self._subscriber.try_recv()) is not None:
+        while (sample := self._received.try_recv()) is not None:
             received = read_sample(sample)
             if received.source is None:
                 yield received

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
@@ -27,6 +29,8 @@ from aeroloop.service.theorem.extremes import BoundlessError
 KEPT: Final = 8
 """Cached verdicts: a few for the running configuration, and for pending changes."""
 
+PAUSE_S: Final = 0.5
+"""Pause between two certificates of changes that follow each other fast [s]."""
 GIVE_WAY_S: Final = 1e-4
 """Longest that a thread computing a certificate delays the loop, each time the loop becomes ready [s]."""
 
@@ -81,6 +85,7 @@ class CertificateGate:
         self._now = gains_of(settings.law), reference
         self._verdict: Verdict | None = self.verdict_of(*self._now)
         self._published = ""
+        self._computing = False
 
     # ── in any thread ──
 
@@ -133,16 +138,26 @@ class CertificateGate:
             self.publish()
             return
 
-        def verdict_of() -> None:
-            verdict = self.verdict_of(gains, reference)
-            self._role.enqueue(lambda: take_verdict(verdict))
+        if not self._computing:
+            self._computing = True
+            threading.Thread(target=self._compute, name="verdict_of", daemon=True).start()
 
-        def take_verdict(verdict: Verdict) -> None:
-            if self._now == (gains, reference):
-                self._verdict = verdict
-                self.publish()
+    def _compute(self) -> None:
+        """Compute verdicts until that of what is in force is known, with a pause before each further one."""
+        while True:
+            now = self._now
+            verdict = self.verdict_of(*now)
+            self._role.enqueue(partial(self._take_verdict, now, verdict))
+            self._computing = False
+            if self._now == now:
+                return
+            self._computing = True
+            time.sleep(PAUSE_S)
 
-        threading.Thread(target=verdict_of, name="verdict_of", daemon=True).start()
+    def _take_verdict(self, of: tuple[Gains, Reference], verdict: Verdict) -> None:
+        if self._now == of:
+            self._verdict = verdict
+            self.publish()
 
     def publish(self) -> None:
         """Publish the verdict, if it differs from the last one published."""

@@ -88,8 +88,9 @@ class ClaimClient:
             return
 
         def answered(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                self._kept = record
+            with suppress(ValidationError):
+                if reply.ok and Answer.model_validate_json(reply.ok.payload.to_bytes()).done:
+                    self._kept = record
 
         self._role.zenoh.get(
             topics.key("record", self._role.vehicle),

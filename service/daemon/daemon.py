@@ -13,11 +13,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-import zenoh
-from pydantic import ValidationError
+from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import SessionRecord, Status
+from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages.models import SessionRecord, Status, Tenure
 from aeroloop.protocol.messages.operator import Answer, Hold, Reference, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
@@ -42,6 +41,10 @@ LOCKSTEP_PATIENCE_S: Final = 2.0
 """Longest wait for the first measurement in lockstep [s]; between steps a plant may pause for any time."""
 WAIT_S: Final = 0.02
 """How often the session is checked while nothing is received [s]."""
+STATUSES: Final = 4
+"""Statuses of the plant that wait to be read; the newest of more."""
+READ_S: Final = 0.01
+"""How often they are read [s]."""
 STALL_TICKS: Final = 10
 """Ticks missed in a row that cause a warning."""
 
@@ -78,8 +81,10 @@ class Daemon:
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
-        self._recorders = 0
-        self._plant: Status | None = None
+        self._recorded = False
+        self._plant: Tenure | None = None
+        self._plant_due = 0.0
+        self._plants = 0  # how often a plant's token has appeared or disappeared
         self._granted = False  # whether the plant's status has ever named this session
         self._lost = ""
         self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = self._stale = 0
@@ -104,8 +109,11 @@ class Daemon:
         role.serve("stand_down", Request, lambda _: self._stand_down)
         role.serve("recall", Request, lambda _: self._recall)
         role.serve("show", Request, lambda _: lambda: self._changes.record)
-        role.watch_tokens(self._token)
-        role.zenoh.declare_subscriber(topics.key("status", role.vehicle, role="plant"), self._receive_plant)
+        self._plant_statuses = role.zenoh.declare_subscriber(
+            topics.key("status", role.vehicle, role="plant"), RingChannel(STATUSES)
+        )
+        role.watch_token("recorder", self._see_recorder)
+        role.watch_token("plant", self._see_plant)
         role.announce()
         role.event("started", f"{role.name} looks for {role.vehicle}")
         try:
@@ -201,6 +209,7 @@ class Daemon:
         tick, session = now.tick, self._claims.session
         assert session is not None
         self._ticks += 1
+        self._read_plant()
         if now.frame != SILENCE:
             self._received += 1
         self._skipped += now.missed
@@ -235,7 +244,7 @@ class Daemon:
     # ── the session ──
 
     def _may_claim(self) -> bool:
-        recorded = self._recorders > 0 or not self._settings.require_recorder
+        recorded = self._recorded or not self._settings.require_recorder
         blocks = self._gate.blocks
         if recorded or blocks:
             self._gate.publish()
@@ -251,7 +260,7 @@ class Daemon:
             return None
         session = self._claims.session
         assert session is not None
-        self._granted = self._plant is not None and self._plant.session == session
+        self._granted = False
         self._machine.fire(Trigger.GRANT)
         self._status_due = 0
         self._trace.session = session
@@ -261,7 +270,7 @@ class Daemon:
 
     def _is_lost(self, silent_s: float) -> str | None:
         """Why the session is lost, if it is: the plant has ended it, is gone, or has been silent for too long."""
-        plant = self._plant
+        plant = self._read_plant()
         if plant is not None and self._granted and plant.session != self._claims.session:
             return f"the plant ended the session{': ' + plant.cause if plant.cause else ''}"
         # In lockstep a granted plant may pause between steps: it is lost only when its session ends or it is gone.
@@ -288,19 +297,34 @@ class Daemon:
             self._role.datagrams.close()  # the next claim connects anew: the plant may be another one
         self._status_due = 0
 
-    def _token(self, name: str, appeared: bool) -> None:
-        if name == "recorder":
-            self._recorders = max(0, self._recorders + (1 if appeared else -1))
-        elif name == "plant" and not appeared:
+    def _see_recorder(self, appeared: bool) -> None:
+        self._recorded = appeared
+
+    def _see_plant(self, appeared: bool) -> None:
+        self._plants += 1
+        if not appeared:
+            while self._plant_statuses.try_recv() is not None:
+                """Its last ones."""
             self._plant = None
 
-    def _receive_plant(self, sample: zenoh.Sample) -> None:
-        try:
-            self._plant = plant = Status.model_validate_json(sample.payload.to_bytes())
-        except ValidationError:
-            self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
-        else:
+    def _read_plant(self) -> Tenure | None:
+        """The plant's newest status; None before the first, and once the plant is gone. Reads what came, at times."""
+        now, plants = time.monotonic(), self._plants
+        if now < self._plant_due:
+            return self._plant
+        self._plant_due = now + READ_S
+        for _ in range(STATUSES):
+            if (sample := self._plant_statuses.try_recv()) is None:
+                break
+            try:
+                plant = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS)
+            except intake.IntakeError:
+                self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
+                continue
+            if plants == self._plants:
+                self._plant = plant
             self._granted = self._granted or plant.session == self._claims.session is not None
+        return self._plant
 
     # ── an operator's requests, taken between ticks ──
 

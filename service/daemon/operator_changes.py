@@ -13,10 +13,10 @@ from collections.abc import Callable
 from math import degrees, pi, radians
 from typing import Any, Final
 
-import zenoh
-from pydantic import ValidationError
+from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.messages import topics
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import SessionRecord, Source
 from aeroloop.protocol.messages.operator import (
     Answer,
@@ -34,7 +34,6 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.attitude import distance
-from aeroloop.protocol.wording import problems
 from aeroloop.service.control.approach import Approach, nearest_turn
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
@@ -43,6 +42,8 @@ from aeroloop.service.daemon.certificate_gate import CertificateGate, Uncertifie
 from aeroloop.service.daemon.session_start import found, remaining
 from aeroloop.service.settings import ControllerSettings
 
+SETPOINTS: Final = 4
+"""Set-points of a stream that are read before a tick; of more, the newest."""
 START_S: Final = 1.0
 """Least time to reach a reference that no operator gave a time for, at a session's start or a reload [s]."""
 
@@ -105,7 +106,6 @@ class OperatorChanges:
         self._started_near = True
         self._stream = reference if isinstance(reference, Stream) else None
         self._last_setpoint_s = 0.0
-        self._setpoint: tuple[Hold, Plan] | None = None  # the newest, not yet taken by a tick
         self._gains_from: Source = "configured"
         self._reference_from: Source = "configured"
         self._within_s = 0.0
@@ -135,7 +135,7 @@ class OperatorChanges:
         role = self._role
         role.serve("set_gains", Gains, self._prepare_gains)
         role.serve("track", Track, self._prepare_reference)
-        role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), self._receive_setpoint)
+        self._setpoints = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
 
     def prospect(self, law: LawSettings, reference: Reference) -> tuple[Gains, Reference]:
         """The gains and the reference after `adopt`, without adopting."""
@@ -176,6 +176,7 @@ class OperatorChanges:
         controller.set_gains(self._gains)
         controller.motion.follow(Plan.of(self._reference), 0.0)
         self._started_near = False
+        self._forget_setpoints()
         self._trace.changes.append(Change(session=session, tick=0, gains=self._gains, reference=self._reference))
         self._note()
         self.certify()
@@ -217,7 +218,6 @@ class OperatorChanges:
     def _begin_with(self, reference: Reference, source: Source) -> None:
         self._reference, self._reference_from, self._within_s = reference, source, 0.0
         self._stream = reference if isinstance(reference, Stream) else None
-        self._setpoint = None  # one from before the session is no longer of now
 
     def before_tick(self, k: int, frame: bytes) -> None:
         """Apply the changes received since the last tick, from tick k on. The frame is the measurement of that tick."""
@@ -350,7 +350,7 @@ class OperatorChanges:
         self._reference, self._reference_from = held, source
         self._within_s, self._since_tick = approach.within_s, self._k
         self._stream = reference if isinstance(reference, Stream) else None
-        self._setpoint = None  # of the previous stream
+        self._forget_setpoints()
         self._last_setpoint_s = time.monotonic()
         self._record(reference=held, **approach._asdict())
         self._note()
@@ -358,27 +358,33 @@ class OperatorChanges:
         self._role.event("changed", text, self._session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle} {text}")
 
-    def _receive_setpoint(self, sample: zenoh.Sample) -> None:
-        """Receive a set-point of a stream; the newest wins."""
-        if self._stream is None:
-            return
-        try:
-            hold = Hold(attitude=Setpoint.model_validate_json(sample.payload.to_bytes()).attitude)
-            plan = self.plan(hold)
-        except (ValidationError, FollowError) as error:
-            self._refuse(error)
-            return
-        self._setpoint = hold, plan
+    def _forget_setpoints(self) -> None:
+        """Those received before now are of the previous stream or session."""
+        while self._setpoints.try_recv() is not None:
+            pass
+
+    def _newest_setpoint(self) -> tuple[Hold, Plan] | None:
+        """The newest set-point received since the last tick that is not refused."""
+        newest = None
+        for _ in range(SETPOINTS):
+            if (sample := self._setpoints.try_recv()) is None:
+                break
+            try:
+                hold = Hold(attitude=intake.read(Setpoint, sample.payload.to_bytes()).attitude)
+                newest = hold, self.plan(hold)
+            except (intake.IntakeError, FollowError) as error:
+                self._refuse(error)
+        return newest
 
     def _follow_stream(self, stream: Stream) -> None:
-        now = time.monotonic()
-        if self._setpoint is None:
+        now, newest = time.monotonic(), self._newest_setpoint()
+        if newest is None:
             if self._last_setpoint_s and now - self._last_setpoint_s > stream.timeout_s:
                 self._last_setpoint_s = 0.0
                 text = f"no set-point for {stream.timeout_s:g} s: holds the last one"
                 self._role.event("lost", text, self._session, self._k)
             return
-        (hold, plan), self._setpoint, self._last_setpoint_s = self._setpoint, None, now
+        (hold, plan), self._last_setpoint_s = newest, now
         motion, t = self._running().motion, self._time
         try:
             approach = motion.to_set_point(plan, t, stream.within_s, self._limits)
@@ -389,10 +395,9 @@ class OperatorChanges:
         self._reference = hold
         self._record(reference=hold, **approach._asdict())
 
-    def _refuse(self, error: Exception) -> None:
+    def _refuse(self, error: AeroloopError) -> None:
         self.refused += 1
-        why = problems(error, Setpoint)[0] if isinstance(error, ValidationError) else str(error)
-        self._role.warn("set-point", "fault", f"set-point refused: {why}", self._session)
+        self._role.warn("set-point", "fault", f"set-point refused: {error}", self._session)
 
     @property
     def _time(self) -> float:

@@ -16,9 +16,7 @@ from collections import Counter
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from pydantic import ValidationError
-
-from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import Description, Loss, Status
 from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.protocol.messages.trace import read_batch
@@ -37,6 +35,12 @@ WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
 
 STATUS_EVERY_S: Final = 1.0
+
+TAKEN_BYTES: Final = 8_388_608
+"""Payload taken before the status is published again."""
+
+DESCRIPTION_BYTES: Final = 4_194_304
+"""Descriptions read meanwhile: at full length, each takes 20 ms."""
 
 AT_ONCE: Final = 2000
 """Messages written before messages are taken from the rings again."""
@@ -132,15 +136,20 @@ class Recorder:
 
     def _take(self, *, held: bool = False) -> int:
         """Take the received messages and write some of those waiting. Returns the number received."""
-        count, now = 0, time.time_ns()
+        count, size, described, now = 0, 0, 0, time.time_ns()
         for received in self._subscriptions.take(held=held):
             count += 1
+            size += len(received.payload)
             address = _address(received.key)
             if address is not None and address.topic.name == "description":
-                self._configure(received)  # at once: other messages are decoded by it
+                described += len(received.payload)
+                if described <= DESCRIPTION_BYTES:
+                    self._configure(received)  # at once: other messages are decoded by it
             if not self._backlog.room(received):
                 self._write()
             self._backlog.put(received, now)
+            if size > TAKEN_BYTES and not held:
+                break  # a flood; the rest waits, or is dropped
         self._write()
         return count
 
@@ -170,8 +179,8 @@ class Recorder:
 
     def _configure(self, received: Delivery) -> None:
         try:
-            description = Description.model_validate_json(received.payload)
-        except ValidationError:
+            description = intake.read(Description, received.payload, intake.REFERENCE)
+        except intake.IntakeError:
             self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
         self.log.add_description(received.key, received.payload)

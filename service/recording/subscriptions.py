@@ -1,6 +1,6 @@
 """Subscriptions of the recorder: traces and JSON messages of all vehicles, and the count of those lost.
 
-Messages wait in rings that Zenoh's own threads fill, until they are taken. A publisher numbers its messages; the
+Messages wait in rings, bounded in bytes, until they are taken. A publisher numbers its messages; the
 subscriber queries its cache for missing ones and reports those that the cache no longer holds. A number that is neither
 taken nor reported was dropped by a full ring.
 """
@@ -22,10 +22,11 @@ from aeroloop.protocol.transport.publication import WAITING, Delivery, Recoverin
 _MASK: Final = 0xFFFF_FFFF
 """Publishers' numbers have 32 bits and begin again at 0."""
 
-_RING_BYTES: Final = 67_108_864
-"""A ring holds no more than this of the longest messages of its topic, but `_LEAST_WAITING` of them in any case."""
-_LEAST_WAITING: Final = 8192
-"""The last minute of several vehicles, which caches send at once."""
+_RING_BYTES: Final = 8_388_608
+"""Payload of one topic that may wait: the last minute of several vehicles, which caches send at once, is less."""
+
+_SAMPLES: Final = 20_480
+"""Messages of a topic of small ones that may wait, of 40 MiB at most: no Python runs when they are received."""
 
 _Source = tuple[zenoh.ZenohId, int]
 """A publisher: an EntityGlobalId cannot be compared."""
@@ -37,13 +38,15 @@ class Subscriptions:
     Args:
         session: An open session; it outlives the subscriptions.
         frames: Receive the loop's frames, too; these have no numbers, so their losses are not counted.
-        waiting: Most messages of one topic that may wait to be taken; fewer where they may be long.
+        waiting: Most messages of one topic that may wait to be taken, fewer where they may be long.
     """
 
     def __init__(self, session: zenoh.Session, *, frames: bool = False, waiting: int = WAITING) -> None:
         self._waiting = waiting
         self._topics = {
-            key: RecoveringSubscriber(session, key, min(waiting, max(_LEAST_WAITING, _RING_BYTES // topic.limit)))
+            key: RecoveringSubscriber(session, key, waiting, _RING_BYTES)
+            if topic.limit >= topics.MESSAGE_BYTES
+            else RecoveringSubscriber(session, key, min(waiting, _SAMPLES))
             for key, topic in ((topics.key(name, "*"), topics.TOPICS[name]) for name in topics.RECORDED)
         }
         self._frames = [

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import signal
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Condition
@@ -61,6 +62,7 @@ class Hil:
         self._logs: list[HilLog] = []
         self._changed = Condition()
         self._statuses: dict[str, Status] = {}
+        self._may_query: defaultdict[str, float] = defaultdict(float)  # of each topic, from when on
         self._requested_ticks = 0
         self.events: list[Event] = []
 
@@ -308,9 +310,11 @@ class Hil:
         """Query the emulator, whose queries for tests are no operator's."""
         self._check_running()
         key = topics.key(topic, self.settings.vehicle)
+        time.sleep(max(0.0, self._may_query[topic] - time.monotonic()))
         for reply in self.processes.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
             if reply.ok is not None:
                 answer = Answer.model_validate_json(reply.ok.payload.to_bytes())
+                self._may_query[topic] = time.monotonic() + 1 / topics.TOPICS[topic].per_s  # sooner, it is dropped
                 if not answer.done:
                     raise HilError(answer.text)
                 return

@@ -125,9 +125,11 @@ class Ends:
         return next(event.text for event in self.events if event.kind == "tripped")
 
     def _ask(self, topic: str, payload: bytes) -> bytes:
-        for reply in self._session.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
-            if reply.ok is not None:
-                return reply.ok.payload.to_bytes()
+        for _ in range(20):
+            for reply in self._session.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
+                if reply.ok is not None:
+                    return reply.ok.payload.to_bytes()
+            time.sleep(2 / topics.TOPICS[topic].per_s)  # it came too soon after the last, and was dropped
         raise AssertionError(f"no reply to {topic!r}")
 
     def _on_event(self, sample: zenoh.Sample) -> None:

@@ -7,6 +7,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from aeroloop.protocol.wording import Shapes, words
 from aeroloop.service.config import ENV_PREFIX, ConfigError, Settings, from_description, load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, replay
+from tests.support.hostile import mutated
 from tests.support.made_log import make_log
 
 SHAPES = Shapes(Settings)
@@ -209,3 +211,18 @@ def test_a_log_of_a_run_along_a_file_is_replayed_byte_for_byte_without_the_file(
     (tmp_path / "ref.csv").unlink()
     both = replay([tmp_path / "a.mcap"])
     assert both.controller == both.plant == EndReplay(ticks=600, differ=0)
+
+
+@settings(max_examples=40)
+@given(chance=st.randoms(use_true_random=False))
+def test_a_mutated_configuration_is_loaded_or_refused_in_one_line(
+    chance: Random, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "mutated.toml"
+    path.write_bytes(mutated(Settings().toml().encode(), chance))
+    said = ""
+    try:
+        assert isinstance(load(path), Settings)
+    except ConfigError as error:
+        said = str(error)
+    assert len(said.splitlines()) <= 1

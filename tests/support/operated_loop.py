@@ -6,12 +6,15 @@ callbacks. Time stands still unless the test moves it (fixture `time` of tests/s
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from math import atan2, degrees, radians, sin
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import pytest
+import zenoh
+from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, SessionRecord
@@ -26,7 +29,7 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.law import LawSettings
 from aeroloop.service.daemon import operator_changes
 from aeroloop.service.daemon.certificate_gate import CertificateGate
-from aeroloop.service.daemon.operator_changes import OperatorChanges
+from aeroloop.service.daemon.operator_changes import SETPOINTS, OperatorChanges
 from aeroloop.service.settings import ControllerSettings
 
 PERIOD = 0.002
@@ -68,7 +71,7 @@ class Query:
         self.answers: list[Answer] = []
 
     def reply(self, key: str, payload: bytes) -> None:
-        assert key == self.key_expr
+        assert zenoh.KeyExpr(self.key_expr).includes(zenoh.KeyExpr(key))
         self.answers.append(Answer.model_validate_json(payload))
 
     def drop(self) -> None:
@@ -81,14 +84,16 @@ class Network:
     def __init__(self) -> None:
         self.put: list[tuple[str, bytes]] = []
         self.queryables: dict[str, Callable[[Any], None]] = {}
-        self.subscribers: dict[str, Callable[[Any], None]] = {}
+        self.received: dict[str, deque[SimpleNamespace]] = {}
 
     def declare_queryable(self, key: str, callback: Callable[[Any], None], *, complete: bool) -> None:
         assert complete
         self.queryables[key] = callback
 
-    def declare_subscriber(self, key: str, callback: Callable[[Any], None]) -> None:
-        self.subscribers[key] = callback
+    def declare_subscriber(self, key: str, ring: RingChannel[Any]) -> SimpleNamespace:
+        assert isinstance(ring, RingChannel)
+        waiting = self.received[key] = deque[SimpleNamespace](maxlen=SETPOINTS)
+        return SimpleNamespace(try_recv=lambda: waiting.popleft() if waiting else None)
 
     def close(self) -> None:
         """Nothing to close."""
@@ -207,7 +212,7 @@ class Loop:
 
     def raw(self, payload: bytes) -> None:
         """Bytes come where set-points should."""
-        self.network.subscribers[topics.key("reference", "aero")](SimpleNamespace(payload=_bytes(payload)))
+        self.network.received[topics.key("reference", "aero")].append(SimpleNamespace(payload=_bytes(payload)))
 
     def read_again(self, law: LawSettings, reference: Reference) -> None:
         """A configuration is read again, as reload.py's SIGHUP does."""

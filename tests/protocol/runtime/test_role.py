@@ -1,22 +1,27 @@
-"""Role on the network: which queries act."""
+"""Role on the network: which queries act, at what cost, and whose token counts."""
 
 from __future__ import annotations
 
+import time as clock
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.intake import FEW
 from aeroloop.protocol.messages.models import Event, Status
-from aeroloop.protocol.messages.operator import Answer, Request
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.messages.operator import Answer, Message, Points, Request, Track
+from aeroloop.protocol.runtime.role import AT_ONCE, LONG_S, WAITING, Role
 from aeroloop.protocol.transport.certificate import read_certificate
 from aeroloop.protocol.transport.network import NetworkSettings, join
 from aeroloop.protocol.transport.security import Identity, SecuritySettings
 from aeroloop.service.host.operator import gather
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
+from tests.support.operated_loop import LEVEL as AT_REST
+from tests.support.operated_loop import FakeTime, Loop, Query
 from tests.support.zenoh_network import Gathering, eventually
 
 
@@ -39,6 +44,7 @@ def test_only_a_query_that_names_its_verb_acts() -> None:
 
         def answers(key: str) -> list[str]:
             got: list[str] = []
+            clock.sleep(2 / topics.TOPICS["stop"].per_s)  # sooner after the last query, this one is dropped
             session.get(
                 key, lambda reply: got.append(str(reply.ok and reply.ok.key_expr)), target=zenoh.QueryTarget.ALL
             )
@@ -84,3 +90,105 @@ def test_the_owner_has_an_event_of_each_peer_that_has_no_right_here(
     assert "links as controller/aero-2" in texts[0]
     assert "certificate is not of this authority" in texts[1]
     assert len(texts) == 2
+
+
+@pytest.fixture
+def time(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
+    return FakeTime(monkeypatch)
+
+
+LONG = Track(reference=Points(times=[float(n) for n in range(FEW)], attitudes=[(0.0, 0.0, 0.0)] * FEW))
+
+
+def asked(role: Role, loop: Loop, topic: str, payload: bytes) -> Query:
+    query = Query(topics.key(topic, "aero"), payload)
+    loop.network.queryables[topics.key(topic, "aero")](query)
+    role.take_inbox()
+    return query
+
+
+def done() -> Message:
+    return Answer(done=True, text="done")
+
+
+def test_of_requests_that_take_long_to_parse_one_is_parsed_in_ten_seconds(time: FakeTime) -> None:
+    """And short ones meanwhile as ever; garbage counts, as it takes as long."""
+    loop, taken = Loop(AT_REST), list[Track]()
+
+    def prepare(track: Track) -> Callable[[], Message]:
+        taken.append(track)
+        return done
+
+    loop.role.serve("track", Track, prepare)
+
+    def ask(payload: bytes) -> str:
+        (answer,) = asked(loop.role, loop, "track", payload).answers
+        return answer.text
+
+    time.now += LONG_S
+    assert ask(LONG.encode()) == "done"
+    assert "one in 10 s is taken" in ask(LONG.encode())
+    assert ask(Track(reference=AT_REST).encode()) == "done"
+    time.now += LONG_S
+    assert "not a Track" in ask(b"[" + b"0," * 2000 + b"0]")
+    assert "one in 10 s is taken" in ask(LONG.encode())
+    time.now += LONG_S
+    assert ask(LONG.encode()) == "done"
+    assert taken == [LONG, Track(reference=AT_REST), LONG]
+
+
+def test_a_request_longer_than_its_topics_is_dropped_whatever_its_key_is() -> None:
+    """Zenoh's filter applies to keys that a topic's includes: one with more wildcards passes it."""
+    loop, prepared = Loop(AT_REST), list[Message]()
+    loop.role.serve("stop", Request, lambda request: prepared.append(request) or done)  # type: ignore[func-returns-value]
+    for size, answers in ((topics.TOPICS["stop"].request, 1), (topics.TOPICS["stop"].request + 1, 0)):
+        query = Query("aeroloop/**/stop", b"{}".ljust(size))
+        loop.network.queryables[topics.key("stop", "aero")](query)
+        loop.role.take_inbox()
+        assert (len(query.answers), len(prepared)) == (answers, 1)
+
+
+def test_what_waits_for_the_loop_is_bounded_and_so_is_what_it_does_between_two_ticks() -> None:
+    loop, acted = Loop(AT_REST), list[int]()
+
+    def act() -> Message:
+        acted.append(1)
+        return done()
+
+    loop.role.serve("stop", Request, lambda _: act)
+    queries = [Query(topics.key("stop", "aero"), b"{}") for _ in range(WAITING + 1)]
+    for query in queries:
+        loop.network.queryables[topics.key("stop", "aero")](query)
+    (refusal,) = queries[-1].answers
+    assert refusal == Answer(done=False, text=f"{WAITING} requests wait already; ask again")
+    assert loop.role.take_inbox()
+    assert len(acted) == AT_ONCE
+    while loop.role.take_inbox():
+        pass
+    assert len(acted) == WAITING
+
+
+def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing() -> None:
+    """Zenoh merges tokens of one name, so a second one neither appears nor disappears."""
+    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+        seen = list[bool]()
+        role.watch_token("controller", seen.append)
+        marks = list[bool]()
+        role.watch_token("mark", marks.append)
+        controller, stranger = gathering.join(), gathering.join()
+        genuine = controller.liveliness().declare_token("aeroloop/aero/alive/controller")
+        eventually("it appears", lambda: seen == [True])
+
+        def forge(name: str) -> None:
+            token = stranger.liveliness().declare_token(f"aeroloop/aero/alive/{name}")
+            token.undeclare()
+            mark = stranger.liveliness().declare_token("aeroloop/aero/alive/mark")  # after it, by the same link
+            eventually("the mark", lambda: bool(marks) and marks[-1])
+            mark.undeclare()
+            eventually("no mark", lambda: not marks[-1])
+
+        for name in ("controller", "controller-2", "plant", "**"):
+            forge(name)
+        assert seen == [True]
+        genuine.undeclare()
+        eventually("it disappears", lambda: seen == [True, False])

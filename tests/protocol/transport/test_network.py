@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
@@ -209,15 +210,13 @@ def test_network_settings_out_of_bounds_are_refused_by_name(broken: dict[str, ob
 def test_what_exceeds_its_topics_limit_is_not_received(topic: Topic) -> None:
     """Neither published nor asked nor answered, while the longest that is allowed is; its publisher is a stranger."""
     key = topics.key(topic.name, "aero", session="s1", role="plant")
-    config = zenoh.Config()
-    config.insert_json5("scouting/multicast/enabled", "false")
     with Gathering() as gathering:
         member = gathering.join()
-        config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{gathering.ports[0]}"]')
-        with zenoh.open(config) as stranger:
+        with stranger_of(gathering) as stranger:
             received, answered = list[int](), list[int]()
             subscriber = member.declare_subscriber(key, lambda sample: received.append(len(sample.payload.to_bytes())))
             fits, exceeds = bytes(topic.limit), bytes(topic.limit + 1)
+            asks, asks_more = bytes(topic.request), bytes(topic.request + 1)
 
             def arrives() -> bool:
                 stranger.put(key, exceeds)
@@ -234,6 +233,40 @@ def test_what_exceeds_its_topics_limit_is_not_received(topic: Topic) -> None:
                 query.reply(key, fits)
 
             member.declare_queryable(key, answer)
-            eventually("an answer", lambda: any(reply.ok for reply in stranger.get(key, payload=fits)))
-            assert not list(stranger.get(key, payload=exceeds, timeout=1.0))
-            assert set(answered) == {topic.limit}
+            eventually("an answer", lambda: any(reply.ok for reply in stranger.get(key, payload=asks)))
+            time.sleep(2 / topic.per_s)  # a query that comes sooner is dropped whatever its length
+            assert not list(stranger.get(key, payload=asks_more, timeout=1.0))
+            assert set(answered) == {topic.request}
+
+
+def stranger_of(gathering: Gathering) -> zenoh.Session:
+    """A session with none of this project's settings, linked to the gathering's first process."""
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{gathering.ports[0]}"]')
+    return zenoh.open(config)
+
+
+@pytest.mark.parametrize("key", ["aeroloop/aero/stop", "aeroloop/*/stop", "aeroloop/**", "**"])
+def test_who_queries_too_often_is_answered_at_the_topics_rate_and_keeps_nobody_else_out(key: str) -> None:
+    """By link: another one is answered at once while the first floods. A dropped query ends without an answer."""
+    with Gathering() as gathering:
+        answers = list[float]()
+
+        def answer(query: zenoh.Query) -> None:
+            answers.append(time.monotonic())
+            query.reply("aeroloop/aero/stop", b"stopped")
+
+        gathering.join().declare_queryable("aeroloop/aero/stop", answer)
+        with stranger_of(gathering) as stranger, stranger_of(gathering) as operator:
+            eventually("a link", lambda: any(reply.ok for reply in operator.get("aeroloop/aero/stop")))
+            eventually("a link", lambda: any(reply.ok for reply in stranger.get("aeroloop/aero/stop")))
+            time.sleep(2 / TOPICS["stop"].per_s)  # since their last queries
+            answers.clear()
+            begun, asked = time.monotonic(), 0
+            while len(answers) < 5:
+                list(stranger.get(key))
+                asked += 1
+            assert len(answers) <= 1 + (time.monotonic() - begun) * TOPICS["stop"].per_s * 1.01
+            assert asked > len(answers)
+            assert any(reply.ok for reply in operator.get("aeroloop/aero/stop"))

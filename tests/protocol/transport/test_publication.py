@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.transport import publication
-from aeroloop.protocol.transport.publication import CachedPublisher, Delivery, RecoveringSubscriber
+from aeroloop.protocol.transport.publication import ByteRing, CachedPublisher, Delivery, RecoveringSubscriber
 from tests.support.zenoh_network import Gathering, eventually
 
 KEY = "aeroloop/aero/trace/plant"
@@ -160,3 +163,25 @@ def test_a_cache_that_never_answers_holds_messages_back_for_a_while_only(
     eventually("giving up", join.finished)
     assert unreachable.left < 999
     assert join.deliver() == [first]
+
+
+@given(sizes=st.lists(st.integers(0, 40), max_size=30), most=st.integers(1, 8), most_bytes=st.integers(40, 100))
+def test_a_byte_ring_keeps_the_newest_that_fit_in_order(sizes: list[int], most: int, most_bytes: int) -> None:
+    ring = ByteRing(most, most_bytes)
+    samples: list[Any] = [SimpleNamespace(payload=bytes(size), number=number) for number, size in enumerate(sizes)]
+    for sample in samples:
+        ring.put(sample)
+    kept = list(iter(ring.try_recv, None))
+    fit = 0
+    while fit < min(most, len(sizes)) and sum(sizes[len(sizes) - fit - 1 :]) <= most_bytes:
+        fit += 1
+    assert kept == samples[len(sizes) - fit :]
+    assert ring.try_recv() is None
+
+
+def test_a_subscriber_that_bounds_bytes_recovers_what_was_published_before(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(network.settings), KEY, per_s=100)
+    for number in range(100):
+        publisher.put(number.to_bytes(4, "big") * 250)
+    received = collect(RecoveringSubscriber(network.join(network.settings), ANY, 1000, 200_000), 100)
+    assert [one.sequence for one in received] == list(range(100))

@@ -8,10 +8,12 @@ import pytest
 
 from aeroloop.protocol.messages.operator import Gains, Hold, Reference, Sinusoid, Stream, Track
 from aeroloop.service.control.law import LawSettings
-from aeroloop.service.daemon.certificate_gate import UncertifiedError, gains_of
+from aeroloop.service.daemon import certificate_gate
+from aeroloop.service.daemon.certificate_gate import UncertifiedError, Verdict, gains_of
 from aeroloop.service.settings import ControllerSettings
 from tests.support.certified import certified_settings
-from tests.support.operated_loop import LAW, Loop
+from tests.support.operated_loop import LAW, LEVEL, Loop, gains_with
+from tests.support.zenoh_network import PATIENCE_S, eventually
 
 FAILING = Gains(C2=(0.03, 0.03, 0.03))
 BETTER = Gains(C2=(0.2, 0.2, 0.2))
@@ -161,3 +163,28 @@ def test_what_must_hold_and_does_not_is_not_admitted(certified: Certified) -> No
     certified.gate.admit(gains_of(of(FAILING)), Sinusoid(), required=False)
     certified.gate.required = False
     certified.gate.admit(gains_of(of(FAILING)), Sinusoid())
+
+
+def test_of_changes_that_follow_each_other_fast_the_first_and_the_last_are_certified(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One thread at a time: an operator whose program runs wild would have as many as changes."""
+    gate = Loop(LEVEL).gate
+    begun, may_end = list[Gains](), threading.Event()
+    verdict = gate.verdict_of(Gains(), LEVEL)
+
+    def slow(gains: Gains, _: Reference) -> Verdict:
+        begun.append(gains)
+        may_end.wait(PATIENCE_S)
+        return verdict
+
+    monkeypatch.setattr(gate, "verdict_of", slow)
+    monkeypatch.setattr(certificate_gate, "PAUSE_S", 0.0)
+    changes = [gains_with(C1=(1.0 + number / 8, 1.0, 1.0)) for number in range(5)]
+    gate.take(changes[0], LEVEL)
+    eventually("the first", lambda: begun == changes[:1])
+    for change in changes[1:]:
+        gate.take(change, LEVEL)
+    may_end.set()
+    eventually("the last", lambda: begun[-1:] == changes[-1:])
+    assert begun == [changes[0], changes[-1]]

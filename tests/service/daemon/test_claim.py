@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Grant, SessionRecord, Status
-from aeroloop.protocol.messages.operator import Gains, Hold, Message
+from aeroloop.protocol.messages.operator import Answer, Gains, Hold, Message
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -39,6 +39,10 @@ def record(yaw: float) -> SessionRecord:
     )  # fmt: skip
 
 
+def reply(answer: Answer) -> SimpleNamespace:
+    return SimpleNamespace(ok=SimpleNamespace(payload=SimpleNamespace(to_bytes=answer.encode)))
+
+
 def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_changes() -> None:
     queries = Queries()
     role = cast(Role, SimpleNamespace(zenoh=queries, vehicle="aero"))
@@ -52,11 +56,14 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
     queries.answer(SimpleNamespace(ok=None))  # a time-out
     claims.keep(first)
     assert queries.sent == [(topics.key("record", "aero"), first)] * 3
-    queries.answer(SimpleNamespace(ok=object()))
+    queries.answer(reply(Answer(done=False, text="a request as long as this one was taken 2 s ago")))
     claims.keep(first)
-    assert len(queries.sent) == 3
+    assert queries.sent[3:] == [(topics.key("record", "aero"), first)]
+    queries.answer(reply(Answer(done=True, text="kept")))
+    claims.keep(first)
+    assert len(queries.sent) == 4
     claims.keep(second)
-    assert queries.sent[3:] == [(topics.key("record", "aero"), second)]
+    assert queries.sent[4:] == [(topics.key("record", "aero"), second)]
 
 
 class Plant:

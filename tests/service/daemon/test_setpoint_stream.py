@@ -85,6 +85,7 @@ def test_refused_set_points_are_reported_at_most_once_in_ten_seconds(streaming: 
     start = time.now
     while time.now < start + 25.0:
         streaming.raw(b"junk")
+        streaming.tick()
         time.now += 0.25
     assert streaming.live.refused == 100
     assert len(streaming.events("fault")) == 3  # at 0 s, 10 s and 20 s

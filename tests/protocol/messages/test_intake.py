@@ -1,0 +1,94 @@
+"""Intake: whatever comes, it is the message or one short line, and the work is bounded."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol import wording
+from aeroloop.protocol.messages.intake import FEW, REFERENCE, STATUS, IntakeError, read
+from aeroloop.protocol.messages.models import FaultStatus, Status, Tenure
+from aeroloop.protocol.messages.operator import MAX_POINTS, Gains, Inject, Message, Points, Request, Track
+from aeroloop.protocol.messages.topics import POINTS_BYTES, STATUS_BYTES, TOPICS
+from tests.support.every_message import MESSAGES
+from tests.support.hostile import mutated
+
+MODELS = sorted({type(message) for message in MESSAGES}, key=lambda model: model.__name__)
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
+@settings(max_examples=60)
+@given(chance=st.randoms(use_true_random=False))
+def test_a_mutated_message_is_read_or_refused_in_one_short_line(message: Message, chance: Random) -> None:
+    payload = mutated(message.encode(), chance)
+    for model in (type(message), chance.choice(MODELS)):
+        try:
+            assert isinstance(read(model, payload), model)
+        except IntakeError as error:
+            (line,) = str(error).splitlines()
+            assert len(line) < 2000
+
+
+@settings(max_examples=100)
+@given(payload=st.binary(max_size=200))
+def test_any_bytes_are_read_or_refused(payload: bytes) -> None:
+    for model in MODELS:
+        with suppress(IntakeError):
+            read(model, payload)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
+def test_more_values_than_a_message_may_have_are_refused_unparsed(
+    model: type[Message], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: list[int] = []
+    monkeypatch.setattr(model, "model_validate_json", lambda payload: parsed.append(len(payload)))
+    fits = "{" + ",".join(f'"k{number}":0' for number in range(FEW)) + "}"
+    read(model, fits.encode())
+    with pytest.raises(IntakeError, match=f"not a {model.__name__}: more than {FEW} values"):
+        read(model, fits.replace("{", '{"more":0,').encode())
+    assert parsed == [len(fits)]
+
+
+def test_every_message_that_a_role_may_send_is_read() -> None:
+    """The longest reference, and a status with every fault that may act."""
+    triple = (-179.123456789012345, 1 / 3, 123.456789012345678)
+    points = Points(times=[n * 1.000123456789 for n in range(MAX_POINTS)], attitudes=[triple] * MAX_POINTS)
+    track = Track(reference=points).encode()
+    assert len(track) <= TOPICS["track"].request == POINTS_BYTES
+    assert read(Track, track, REFERENCE).reference == points
+    longest = Inject(faults=[f"command:delay={n / 7:.15f}@1.5..2.5" for n in range(64)])
+    assert read(Inject, longest.encode()) == longest
+    assert all(read(type(message), message.encode()) == message for message in MESSAGES)
+    status = next(message for message in MESSAGES if isinstance(message, Status))
+    fault = next(message for message in MESSAGES if isinstance(message, FaultStatus))
+    full = status.model_copy(update={"faults": [fault] * 256, "process": "here, pid 7"}).encode()
+    assert len(full) <= STATUS_BYTES
+    assert read(Tenure, full, STATUS).process == "here, pid 7"
+
+
+def test_only_the_first_of_many_errors_is_put_into_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Words for all of them took a second."""
+    said, say = list[str](), wording._problem
+
+    def counted(shapes: wording.Shapes, error: dict[str, Any]) -> str:
+        said.append(say(shapes, error))
+        return said[-1]
+
+    monkeypatch.setattr(wording, "_problem", counted)
+    keys = "{" + ",".join(f'"k{number}":0' for number in range(FEW)) + "}"
+    with pytest.raises(IntakeError) as refused:
+        read(Gains, keys.encode())
+    assert said == [str(refused.value).removeprefix("not a Gains: ")]
+    assert said[0].startswith("unknown key k0")
+
+
+def test_an_unknown_key_of_any_length_is_shown_in_part() -> None:
+    with pytest.raises(IntakeError) as refused:
+        read(Request, b'{"' + b"x" * 16_000 + b'":0}')
+    assert len(str(refused.value)) < 200
