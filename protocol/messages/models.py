@@ -36,15 +36,15 @@ SessionName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{1,64}$"),
 """One chunk of a key, and not the first chunk of a topic's key."""
 
 
-RoleName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-"""One chunk of a liveliness token's key."""
+TokenName = Annotated[str, StringConstraints(pattern=r"^[^/*$#?]{1,64}$")]
+"""One chunk of a liveliness token's key, without wildcards."""
 
 
 class Claim(Message):
     """A controller's request for the exclusive control of a plant."""
 
     protocol: int = Field(default=PROTOCOL_VERSION, description="version of SPEC.md that the controller implements")
-    controller: RoleName = Field(description="name of the controller and of its liveliness token")
+    controller: TokenName = Field(description="name of the controller and of its liveliness token")
     session: SessionName = Field(description="name of the session, in the keys of its frames; new for every claim")
     period_ns: int = Field(gt=0, description="period of the controller's law [ns]")
     lockstep: bool = Field(description="the plant waits for each command before it steps")
