@@ -2,12 +2,13 @@
 
 Plant and controller are on hosts of their own (network namespaces), at 500 Hz with the default settings; the recorder
 is on the controller's. A row is a run of one transport and one condition, which begins once the plant is driven and
-lasts for SECONDS. It shows the plant's trips, z_track, that as a multiple of the transport's first row, ticks of either
-end that the log lacks, the latency at the plant, and what crosses its cable with all headers.
+lasts for SECONDS. It shows the plant's trips, z_track, that as a multiple of the first row of its kind, ticks of either
+end that the log lacks, the latency at the plant, what crosses its cable with all headers, and processor time.
 
-    … [--seconds 60] [--transport tcp mixed] [--certificates] [--set KEY=VALUE] [-- CONDITION…]
+    … [--seconds 60] [--transport tcp mixed] [--links plain certificates] [--turns 1] [--set KEY=VALUE] [-- CONDITION…]
 
 A condition is words joined by commas: `loss=20` (percent, both ways), `from_plant=5`, `to_plant=1`, `kbit=512` (both).
+What certificates and access rules cost: `--links plain certificates --turns 3 --seconds 15 -- loss=0`.
 """
 
 from __future__ import annotations
@@ -18,16 +19,21 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from aeroloop.service.lab.soak import usage_of
 from tests.support.certificates import Authority
 from tests.support.namespaces import Hosts
 from tests.support.zenoh_network import eventually
 
 LOSSES: Final = ["loss=0", "loss=1", "loss=5", "loss=20", "from_plant=20", "to_plant=20"]
 NARROW: Final = ["kbit=1000", "kbit=512", "kbit=256"]
-COLUMNS: Final = "transport, condition, trips, z_track, ×, ticks missing, latency p50/p99/max ms, kbit/s from/to plant"
+COLUMNS: Final = (
+    "transport, condition, trips, z_track, ×, ticks missing, latency p50/p99/max ms, kbit/s from/to plant, "
+    "% of a core plant/controller"
+)
 SETTLE_S: Final = 2.0
 RECOVERY_S: Final = 10.0
 """Time to recover what was lost, afterwards [s]: a publisher repeats its last number every 2 s."""
@@ -38,36 +44,49 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--transport", nargs="+", default=["tcp", "mixed"])
-    parser.add_argument("--certificates", action="store_true", help="mutual TLS, and QUIC with it")
+    parser.add_argument("--links", nargs="+", default=["plain"], help="plain, certificates: mutual TLS, QUIC, rules")
+    parser.add_argument("--turns", type=int, default=1)
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("conditions", nargs="*", default=[*LOSSES, *NARROW])
     given = parser.parse_args()
     names = COLUMNS.split(", ")
     print("| " + " | ".join(names) + " |\n|" + len(names) * "---|")
-    for transport in given.transport:
-        first = 0.0
-        for condition in given.conditions:
-            overrides = [f"network.transport={transport}", "controller.after_restart=configured", *given.overrides]
-            found, kbit = run(overrides, condition, given.seconds, certificates=given.certificates)
-            error, latency = found["z_track"] or 0.0, found["latency_us"] or {}
-            first = first or error
-            row = [
-                transport + (", certificates" if given.certificates else ""),
-                condition,
-                len(found["trips"]),
-                f"{error:.2e}",
-                f"{error / first:.2f}" if first else "–",
-                sum(found["missing_ticks"].values()),
-                "/".join(f"{1e-3 * latency.get(which, 0):.1f}" for which in ("p50", "p99", "max")),
-                "/".join(f"{rate:.0f}" for rate in kbit),
-            ]
-            print("| " + " | ".join(map(str, row)) + " |", flush=True)
+    first: dict[tuple[str, str], float] = {}
+    for _, condition, transport, links in product(range(given.turns), given.conditions, given.transport, given.links):
+        overrides = [f"network.transport={transport}", "controller.after_restart=configured", *given.overrides]
+        found = run(overrides, condition, given.seconds, certificates=links == "certificates")
+        error, latency = found.review["z_track"] or 0.0, found.review["latency_us"] or {}
+        reference = first.setdefault((transport, links), error)
+        row = [
+            f"{transport}, {links}",
+            condition,
+            len(found.review["trips"]),
+            f"{error:.2e}",
+            f"{error / reference:.2f}" if reference else "–",
+            sum(found.review["missing_ticks"].values()),
+            "/".join(f"{1e-3 * latency.get(which, 0):.2f}" for which in ("p50", "p99", "max")),
+            "/".join(f"{rate:.0f}" for rate in found.kbit_per_s),
+            "/".join(f"{100 * share:.0f}" for share in found.cores),
+        ]
+        print("| " + " | ".join(map(str, row)) + " |", flush=True)
 
 
-def run(
-    overrides: list[str], condition: str, seconds: float, *, certificates: bool = False
-) -> tuple[dict[str, Any], list[float]]:
-    """Make one run. Returns the review of its longest session, and the rates from and to the plant [kbit/s]."""
+class Found(NamedTuple):
+    """What a run gave.
+
+    Attributes:
+        review: Of its log's longest session, as `log review --json`.
+        kbit_per_s: What crossed the plant's cable, from and to it [kbit/s].
+        cores: Processor time of plant and controller, as a share of a core.
+    """
+
+    review: dict[str, Any]
+    kbit_per_s: list[float]
+    cores: list[float]
+
+
+def run(overrides: list[str], condition: str, seconds: float, *, certificates: bool = False) -> Found:
+    """Make one run."""
     words = {name: float(value) for name, _, value in (word.partition("=") for word in condition.split(","))}
     both = words.get("loss", 0.0)
     with tempfile.TemporaryDirectory() as name, Hosts(["plant", "controller"], Path(name)) as hosts:
@@ -85,9 +104,10 @@ def run(
             hosts.lose(host, loss, "received")
             if "kbit" in words:
                 hosts.narrow(host, round(words["kbit"]))
-        before = hosts.crossed("plant")
+        ends = [processes[1].pid, processes[0].pid]
+        before, busy = hosts.crossed("plant"), [usage_of(pid).cpu_s for pid in ends]
         time.sleep(seconds)
-        after = hosts.crossed("plant")
+        after, busy_after = hosts.crossed("plant"), [usage_of(pid).cpu_s for pid in ends]
         for host in ("plant", "controller"):
             hosts.lose(host, 0)
             hosts.plug(host)
@@ -97,7 +117,8 @@ def run(
             process.wait()
         command = [sys.executable, "-m", "aeroloop", "log", "review", str(log), "--json"]
         review: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
-        return review, [8e-3 * (late - early) / seconds for early, late in zip(before, after, strict=True)]
+        rates = [8e-3 * (late - early) / seconds for early, late in zip(before, after, strict=True)]
+        return Found(review, rates, [(late - early) / seconds for early, late in zip(busy, busy_after, strict=True)])
 
 
 def issue(folder: Path) -> Path:
