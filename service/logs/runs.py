@@ -313,10 +313,12 @@ class TraceJoin:
         """Complete blocks; with `finished`, all remaining rows."""
         limit = inf if finished else self._limit
         while len(self._controller) > 1:  # a block has no gap within it
-            last = float(self._controller[0].ticks[-1])
-            if last > limit:
-                break
-            yield from self._until(last)
+            ticks = self._controller[0].ticks
+            if len(ticks):  # else all of them were in earlier blocks
+                last = float(ticks[-1])
+                if last > limit:
+                    break
+                yield from self._until(last)
             self._controller.popleft()
         yield from self._until(limit)
         self._yielded = limit

@@ -174,7 +174,9 @@ class TickReader:
 
 def _column(rows: Rows, at: Integers, name: str) -> Integers:
     """A column's values at places of rows; −1 where the place is −1. Shape (n,)."""
-    return np.where(at >= 0, rows[name][at].astype(np.int64), -1) if rows else np.full(len(at), -1)
+    if not rows or not len(rows[name]):  # no batch of the end at all, or none of this block
+        return np.full(len(at), -1)
+    return np.where(at >= 0, rows[name][at].astype(np.int64), -1)
 
 
 def _is(rows: Rows, at: Integers, name: str, *kinds: int) -> Flags:

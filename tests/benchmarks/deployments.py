@@ -19,6 +19,8 @@ from tests.support.namespaces import Ways
 LOSSY_S: Final = 10.0
 AWAY_S: Final = 30.0
 SETTLE_S: Final = 2.0
+RELINK_S: Final = 15.0
+"""After a host was away for `AWAY_S`: the pauses between TCP's attempts to connect have grown to some 10 s."""
 LOSSES: Final[tuple[Ways, ...]] = ("both", "sent", "received")
 
 
@@ -36,7 +38,7 @@ def main(kind: Kind) -> None:
         if kind == "router":
             hosts.restart("router")
         hosts.cut_off("recorder", AWAY_S)
-        time.sleep(SETTLE_S)
+        time.sleep(RELINK_S)
         print(f"{'':44} trips  0 V [s]  again [s]")
         for outcome in hosts.finish():
             print(outcome)

@@ -40,7 +40,8 @@ def messages(data: bytes) -> None:
     try:
         read(MODELS[data[0] % len(MODELS)] if data else MODELS[0], data[1:], REFERENCE if data[:1] > b"\x80" else FEW)
     except IntakeError as error:
-        assert len(str(error).splitlines()) == 1
+        if len(str(error).splitlines()) != 1:
+            raise ValueError(f"not one line: {error}") from None
 
 
 def batches(data: bytes) -> None:

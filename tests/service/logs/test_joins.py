@@ -237,3 +237,15 @@ def test_a_row_that_is_not_what_was_done_is_found_at_either_end(tmp_path: Path) 
     difference = other.plants[0].first_difference
     assert difference is not None
     assert (difference.session_tick, difference.field) == (77, "voltages")
+
+
+@pytest.mark.parametrize("end", ["plant", "controller"])
+def test_an_end_that_is_missing_for_long_costs_its_rows_and_nothing_else(end: str, tmp_path: Path) -> None:
+    """As after a recorder's cable was out: some blocks have no row of that end."""
+    settings = load()
+    messages = made(settings, 9000)
+    batches = [m for m in messages if end_of(m) == end]
+    gone = batches[3:-3]
+    write(tmp_path / "a.mcap", settings, [m for m in messages if m not in gone])
+    whole = read(tmp_path / "a.mcap").findings.missing_ticks
+    assert whole == {"controller": 0, "plant": 0} | {end: sum(map(rows_of, gone))}
