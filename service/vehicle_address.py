@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, Field, StringConstraints, ValidationError, model_validator
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wording import closest, problems
 from aeroloop.service.config_sources import ConfigError, merge, sources
 

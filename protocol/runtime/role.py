@@ -30,14 +30,8 @@ from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.datagrams import Datagrams
-from aeroloop.protocol.transport.network import (
-    VISIT_S,
-    NetworkSettings,
-    join,
-    protected,
-    unlinked,
-    visit,
-)
+from aeroloop.protocol.transport.network import VISIT_S, join, unlinked, visit
+from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
 from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
 from aeroloop.protocol.transport.refusal import RefusalWatch
 from aeroloop.protocol.transport.router import route

@@ -21,7 +21,9 @@ from typing import Final
 
 import zenoh
 
-from aeroloop.protocol.transport.network import NetworkSettings, is_free, leaves_host, open_session, protected
+from aeroloop.protocol.transport.network import open_session
+from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
+from aeroloop.protocol.transport.places import is_free, leaves_host
 from aeroloop.protocol.transport.security import Identity
 
 LINK_S: Final = 5.0

@@ -13,17 +13,11 @@ from typing import Any
 
 import zenoh
 
-from aeroloop.protocol.transport.network import (
-    NetworkError,
-    NetworkSettings,
-    is_own,
-    open_tree,
-    protected,
-    reason,
-    session_tree,
-    warn_of_plain,
-)
+from aeroloop.protocol.transport.network import warn_of_plain
+from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings, protected
+from aeroloop.protocol.transport.places import is_own
 from aeroloop.protocol.transport.security import Identity
+from aeroloop.protocol.transport.session_tree import open_tree, reason, session_tree
 
 
 def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:

@@ -20,7 +20,9 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
-from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, NetworkSettings, Visit, is_own, visit
+from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, Visit, visit
+from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.transport.places import is_own
 from aeroloop.protocol.transport.refusal import refusal
 from aeroloop.protocol.transport.security import READER, Identity
 

@@ -20,7 +20,8 @@ import zenoh
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 
 _VEHICLE: Final = "aero"

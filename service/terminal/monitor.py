@@ -23,7 +23,8 @@ from rich.text import Text
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import angle, to_euler
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.host.bandwidth import PayloadRate

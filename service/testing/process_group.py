@@ -25,7 +25,9 @@ import zenoh
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.network import POLL_S, NetworkSettings, accepting, join
+from aeroloop.protocol.transport.network import POLL_S, join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.transport.places import accepting
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server

@@ -22,7 +22,8 @@ from zenoh.handlers import RingChannel
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.transport.publication import Delivery, RecoveringSubscriber, read_sample
 from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoder, topic_of
 from aeroloop.service.viewers.schemas import Decoded, Shape

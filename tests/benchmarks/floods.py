@@ -27,7 +27,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Event, Loss, SessionRecord
 from aeroloop.protocol.messages.operator import Advance, Gains, Hold, Inject, Request, Setpoint, Sinusoid, Track
 from aeroloop.protocol.messages.topics import Topic
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.bench.running import ROLES, RunningLoop
 from aeroloop.service.config import Settings

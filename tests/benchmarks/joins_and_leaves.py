@@ -29,7 +29,8 @@ from typing import Final, NamedTuple
 import zenoh
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.recording.subscriptions import Subscriptions
 from tests.support.namespaces import Hosts
 

@@ -17,7 +17,8 @@ import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Truth
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.cable import Cable

@@ -17,7 +17,8 @@ from typing import Any, Final, Literal, Self
 import zenoh
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.vehicle_address import load_vehicle_address
 
 STOP_WAIT_S: Final = 10.0

@@ -22,7 +22,7 @@ from aeroloop.protocol.messages.operator import Answer, Change, Gains, Hold, Mes
 from aeroloop.protocol.messages.trace import TraceWriter
 from aeroloop.protocol.runtime import role, throttle
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller

@@ -10,7 +10,8 @@ from typing import Self
 
 import zenoh
 
-from aeroloop.protocol.transport.network import NetworkSettings, join
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 
 PATIENCE_S = 20.0

@@ -17,7 +17,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import OccupiedError, Role
 from aeroloop.protocol.transport.link import ZenohLink
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.transport.publication import RecoveringSubscriber
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec

@@ -9,10 +9,10 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.messages.topics import key
-from aeroloop.protocol.transport import datagrams, network
+from aeroloop.protocol.transport import datagrams, network_settings
 from aeroloop.protocol.transport.datagrams import Datagrams
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.transport.security import Identity
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
@@ -26,7 +26,7 @@ FAR = "tcp/192.0.2.1:7447"
 @pytest.fixture
 def beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loopback counts as a network beyond it, so that one host will do."""
-    for module in (network, datagrams):
+    for module in (network_settings, datagrams):
         monkeypatch.setattr(module, "leaves_host", lambda place: place.startswith(("tcp/", "tls/")))
 
 

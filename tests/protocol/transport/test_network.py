@@ -16,7 +16,9 @@ from pydantic import ValidationError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import TOPICS, Topic
 from aeroloop.protocol.runtime.processes import listener, name_process
-from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, accepting, visit
+from aeroloop.protocol.transport.network import visit
+from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
+from aeroloop.protocol.transport.places import accepting
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 

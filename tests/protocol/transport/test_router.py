@@ -15,7 +15,8 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.network import NetworkError, NetworkSettings, join, visit
+from aeroloop.protocol.transport.network import join, visit
+from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
 from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
 from aeroloop.protocol.transport.security import Identity

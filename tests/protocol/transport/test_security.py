@@ -16,7 +16,8 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
-from aeroloop.protocol.transport.network import NetworkSettings, join, protected, visit
+from aeroloop.protocol.transport.network import join, visit
+from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
 from aeroloop.protocol.transport.refusal import PLAIN_S, RefusalWatch, refusal
 from aeroloop.protocol.transport.security import (
     READER,

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.lab.zenoh_bytes import CountingRelay, count_bytes
 
 SEVEN, THREE = b"1234567", b"123"

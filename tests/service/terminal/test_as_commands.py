@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.models import SessionRecord
 from aeroloop.protocol.messages.operator import Gains, Hold, Message, Points, Reference, Sinusoid, Stream, Track
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.cli.main import execute
 from aeroloop.service.host import operator
 from aeroloop.service.terminal.as_commands import WITHIN_S, as_commands

@@ -22,7 +22,7 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.protocol.messages.models import Claim, Event, Status
 from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.network import NetworkSettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import Quaternion, angle, distance
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load

@@ -1,0 +1,138 @@
+"""Zenoh's configuration of every session: bounded queues and sizes, rates of queries, certificates, access rules."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import struct
+from contextlib import suppress
+from typing import Any, Final, Literal
+
+import zenoh
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.access import access_control
+from aeroloop.protocol.transport.network_settings import Protected
+from aeroloop.protocol.transport.security import tls_tree
+
+Mode = Literal["peer", "client", "router"]
+QUEUE: Final = 16
+"""Batches that may wait to be sent on a link, per priority; the most that Zenoh allows."""
+_QUEUES: Final = (
+    "control",
+    "real_time",
+    "interactive_high",
+    "interactive_low",
+    "data_high",
+    "data",
+    "data_low",
+    "background",
+)
+HEADER_BYTES: Final = 65_536
+"""More than Zenoh adds to a payload: the key, and what goes with it."""
+HANDSHAKE_MS: Final = 2000
+"""Time-out of the handshake with a program that accepts a connection and sends nothing [ms]."""
+PATIENT_LEASE_MS: Final = 10_000
+"""Least lease where frames have a transport of their own: a link of TCP is silent for seconds at 20 % loss [ms]."""
+RETRY_MS: Final = (50, 1000)
+"""First and longest pause between two attempts to connect to an endpoint [ms]."""
+
+# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which
+# then carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14, with these threads 0 of 6.
+# One pool for all tasks would save a fifth of the loop's latency, but after such a link later joins cost sessions.
+# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
+os.environ.setdefault(
+    "ZENOH_RUNTIME",
+    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
+    "app: (worker_threads: 4))",
+)
+
+
+def session_tree(
+    network: Protected,
+    mode: Mode,
+    listen: list[str],
+    places: list[str],
+    handshake_ms: int = HANDSHAKE_MS,
+    retry_ms: tuple[int, int] = RETRY_MS,
+) -> dict[str, Any]:
+    """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
+    settings, certificate, vehicles = network
+    lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms
+    answered = {name: each for name, each in topics.TOPICS.items() if each.answered}
+    tree: dict[str, Any] = {
+        "mode": mode,
+        "listen": {"endpoints": listen, "exit_on_failure": True},
+        "connect": {
+            "endpoints": [*settings.connect, *places],
+            "exit_on_failure": False,
+            "retry": {"period_init_ms": retry_ms[0], "period_max_ms": retry_ms[1], "period_increase_factor": 1.5},
+        },
+        "open": {"return_conditions": {"connect_scouted": False}},  # otherwise it takes 0.5 s, whatever is linked
+        # Before it is queued, parsed or stored: what waits in memory is bounded for every publisher.
+        "low_pass_filter": [
+            {
+                "id": f"{topic.name} {messages[0]}",
+                "flows": ["ingress"],
+                "messages": messages,
+                "key_exprs": [topics.key(topic.name, "*")],
+                "size_limit": most,
+            }
+            for topic in topics.TOPICS.values()
+            for messages, most in ((["put", "reply"], topic.limit), (["query"], topic.request))
+        ],
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
+        "transport": {
+            # No use for frames of seven bytes, and a killed process leaves its files behind.
+            "shared_memory": {"enabled": False},
+            # Zenoh's default is 1 for most priorities: a sending thread that is blocked for 2 ms then drops frames.
+            # Late frames do no harm: the receiver refuses them by their tick.
+            "link": {
+                "tx": {"lease": lease_ms, "queue": {"size": dict.fromkeys(_QUEUES, QUEUE)}},
+                "rx": {"max_message_size": topics.POINTS_BYTES + HEADER_BYTES},  # of fragments: 1 GiB by default
+            },
+            "unicast": {
+                "open_timeout": handshake_ms,
+                "accept_timeout": HANDSHAKE_MS,
+                "compression": {"enabled": settings.mixed},
+            },
+        },
+    }
+    if mode != "client":  # a client's one link carries the queries of all: its router limits each of them
+        # By link, whatever a message says of its sender: only a new link, with its handshake, is a new peer.
+        rules = [{"key_expr": topics.key(name, "*"), "freq": each.per_s} for name, each in answered.items()]
+        tree["downsampling"] = [{"id": "queries", "flows": ["ingress"], "messages": ["query"], "rules": rules}]
+    if certificate is not None:
+        tree["transport"]["link"]["tls"] = tls_tree(certificate)
+        # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
+        tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
+        tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
+    return tree
+
+
+def open_tree(tree: dict[str, Any]) -> zenoh.Session:
+    """Open a session with a configuration of Zenoh. Raises zenoh.ZError."""
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
+    session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
+    return session
+
+
+def reason(error: Exception) -> str:
+    """Zenoh's message without the source locations it carries."""
+    return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")
+
+
+def _do_not_linger() -> None:
+    """Make closing a TCP socket of this process return at once.
+
+    Why: Zenoh sets SO_LINGER to 10 s. When a peer's cable is pulled, closing its link then blocks the thread that also
+    carries other peers' frames until the peer acknowledges what was sent: the loop stood for 1 to 2 s.
+    """
+    for name in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # closed in the meantime
+            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                continue
+            with socket.socket(fileno=os.dup(int(name))) as each:
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
