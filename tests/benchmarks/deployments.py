@@ -19,8 +19,8 @@ from tests.support.namespaces import Ways
 LOSSY_S: Final = 10.0
 AWAY_S: Final = 30.0
 SETTLE_S: Final = 2.0
-RELINK_S: Final = 15.0
-"""After a host was away for `AWAY_S`: the pauses between TCP's attempts to connect have grown to some 10 s."""
+RELINK_S: Final = 10.0
+"""More, after a host was away for `AWAY_S`: the pauses between TCP's attempts to connect have grown to some 10 s."""
 LOSSES: Final[tuple[Ways, ...]] = ("both", "sent", "received")
 
 

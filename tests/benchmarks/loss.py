@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 
 from aeroloop.service.lab.soak import usage_of
 from tests.support.certificates import Authority
-from tests.support.namespaces import Hosts
+from tests.support.namespaces import RECOVERY_S, Hosts
 from tests.support.zenoh_network import eventually
 
 LOSSES: Final = ["loss=0", "loss=1", "loss=5", "loss=20", "from_plant=20", "to_plant=20"]
@@ -35,8 +35,6 @@ COLUMNS: Final = (
     "% of a core plant/controller"
 )
 SETTLE_S: Final = 2.0
-RECOVERY_S: Final = 10.0
-"""Time to recover what was lost, afterwards [s]: a publisher repeats its last number every 2 s."""
 
 
 def main() -> None:

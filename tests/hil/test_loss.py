@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import pytest
 
-from tests.support.namespaces import Hosts, NoNamespacesError
+from tests.support.namespaces import RECOVERY_S, Hosts, NoNamespacesError
 from tests.support.zenoh_network import eventually
 
 pytestmark = pytest.mark.processes
@@ -42,6 +42,7 @@ def review(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
             time.sleep(LOST_FOR_S)
             for host in ("plant", "controller"):
                 hosts.lose(host, 0)
+            time.sleep(RECOVERY_S)
             for party in parties:
                 party.terminate()
                 party.wait()

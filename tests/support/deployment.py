@@ -22,7 +22,7 @@ from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil_log import HilLog
 from tests.support.certificates import Authority
-from tests.support.namespaces import STOP_WAIT_S, Hosts, Ways
+from tests.support.namespaces import RECOVERY_S, STOP_WAIT_S, Hosts, Ways
 from tests.support.zenoh_network import eventually
 
 Kind = Literal["peers", "router"]
@@ -148,7 +148,11 @@ class Deployment(Hosts):
         ))  # fmt: skip
 
     def finish(self) -> list[Outcome]:
-        """End the daemons, the recorder after the ends, and read what each trouble cost from the log."""
+        """End the daemons, the recorder after the ends, and read what each trouble cost from the log.
+
+        Not before `RECOVERY_S`: nothing shows from outside when the recorder has all that it asks the ends' caches for.
+        """
+        time.sleep(RECOVERY_S)
         for host in ("controller", "plant", "recorder"):
             self.daemons[host].send_signal(signal.SIGTERM)
             self.daemons[host].wait(STOP_WAIT_S)

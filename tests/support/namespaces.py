@@ -22,6 +22,8 @@ from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.vehicle_address import load_vehicle_address
 
 STOP_WAIT_S: Final = 10.0
+RECOVERY_S: Final = 10.0
+"""After a trouble, until a recorder has what it missed [s]: TCP waits seconds after many losses, and links are new."""
 
 
 class NoNamespacesError(Exception):
