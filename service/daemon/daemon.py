@@ -303,8 +303,8 @@ class Daemon:
     def _see_plant(self, appeared: bool) -> None:
         self._plants += 1
         if not appeared:
-            while self._plant_statuses.try_recv() is not None:
-                """Its last ones."""
+            while self._plant_statuses.try_recv() is not None:  # its last ones
+                pass
             self._plant = None
 
     def _read_plant(self) -> Tenure | None:

@@ -16,6 +16,7 @@ from uuid import uuid4
 
 from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePublicKey
 from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.x509.oid import NameOID
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.transport.certificate import (
@@ -27,6 +28,7 @@ from aeroloop.protocol.transport.certificate import (
     load,
     names_of,
     read_certificate,
+    read_common_name,
 )
 from aeroloop.service.host import authority
 
@@ -105,11 +107,15 @@ def issue_requested(directory: Path, file: Path, days: int = DAYS) -> Path:
     """Issue the certificate that a request asks for. Returns its file, beside the request.
 
     Raises:
-        CertificateError: The file is no request of a role, or the authority's key is not here.
+        CertificateError: The file is no request of a role, is named as another role's, or the authority's key is not
+            here.
     """
     whose, public = authority.read_request(file)
+    asks = str(whose.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
     out = file.with_suffix(".pem")
     _refuse_existing(out)
+    if out != file_of(file.parent, *cast(tuple[str, str | None], read_common_name(asks))):
+        raise CertificateError(f"{file} asks for a certificate of {asks}, which its name does not say: not signed")
     _write(out, authority.pem(authority.sign(directory, whose, public, days)), 0o644)
     return out
 

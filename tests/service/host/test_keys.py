@@ -76,6 +76,14 @@ def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -
     assert files(folder) == before
 
 
+def test_a_request_for_more_than_its_name_says_is_not_signed(folder: Path, tmp_path: Path) -> None:
+    asked = keys.request(tmp_path / "far", "operator", "Eve")
+    harmless = shutil.copy(asked, tmp_path / "observer.csr")
+    with pytest.raises(CertificateError, match="asks for a certificate of operator, which its name does not say"):
+        keys.issue_requested(folder, Path(harmless))
+    assert not (tmp_path / "observer.pem").exists()
+
+
 def test_a_request_is_signed_and_its_key_stays_where_it_was_made(folder: Path, tmp_path: Path) -> None:
     far, here = tmp_path / "far", tmp_path / "here"
     here.mkdir()
