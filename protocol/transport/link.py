@@ -109,9 +109,10 @@ class Mailbox:
 
     def wait(self, timeout_s: float) -> Arrival | None:
         """As `take`, but wait up to `timeout_s` for a frame."""
+        due = time.monotonic() + timeout_s
         self._changed.clear()  # of a frame that was taken without waiting
-        if not self._arrivals:
-            self._changed.wait(timeout_s)
+        while not self._arrivals and (left_s := due - time.monotonic()) > 0:
+            self._changed.wait(left_s)  # may end too soon: a frame can be taken between its append and its set
         return self.take()
 
 

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, ZenohLink
+from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, Wake, ZenohLink
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 
@@ -211,6 +211,21 @@ def test_a_frame_that_was_taken_does_not_end_the_next_wait() -> None:
     started = time.monotonic()
     assert mailbox.wait(0.05) is None
     assert time.monotonic() - started >= 0.05
+
+
+def test_a_frame_taken_while_it_is_put_does_not_end_the_next_wait() -> None:
+    # `put` appends, then wakes: a reader in between takes the frame and waits for the next one before the wake comes.
+    changed = Wake()
+    mailbox = Mailbox(changed)
+    received: list[Arrival | None] = []
+    waiting = threading.Thread(target=lambda: received.append(mailbox.wait(PATIENCE_S)))
+    waiting.start()
+    time.sleep(SETTLE_S)
+    changed.set()  # of the frame taken before
+    time.sleep(SETTLE_S)
+    mailbox.put(b"1")
+    waiting.join()
+    assert [arrival and arrival.frame for arrival in received] == [b"1"]
 
 
 def test_a_mailbox_holds_as_many_frames_as_its_depth_and_gives_the_oldest_first() -> None:
