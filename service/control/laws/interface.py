@@ -1,0 +1,132 @@
+"""Law interface: settings, and one tick, as CasADi expressions or as Python.
+
+Each tick the controller gives a law the attitude and rate as received, the desired motion and the errors between them,
+and takes voltages. What a law carries from tick to tick is its named state: it is in snapshots, telemetry and logs, so
+that a replay can begin anywhere. Gains are those of its settings that an operator may change while it runs.
+
+A law of expressions is one compiled function with decoding, reference and quantizers; experiments and readers of logs
+run it over thousands of ticks at once. A law in Python runs wherever the other does, tick by tick.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from aeroloop.protocol.lazy import casadi as ca
+from aeroloop.protocol.messages.operator import MAX_GAIN
+
+Floats = npt.NDArray[np.float64]
+X = TypeVar("X")
+S = TypeVar("S", bound="LawSettings")
+
+PositiveGain = Annotated[float, Field(gt=0, le=MAX_GAIN)]
+"""A gain that must act; bounded, so that no typing error makes it a hundred times too large."""
+Gain = Annotated[float, Field(ge=0, le=MAX_GAIN)]
+"""A gain that may be 0."""
+Gains3 = tuple[Gain, Gain, Gain]
+"""One for each body axis: x, y, z."""
+
+
+class LawSettings(BaseModel):
+    """Settings of a law: `[law]` of the configuration. A law's own model derives from it and adds fields with units."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: str = Field(description="which law: one of ours, an entry point of aeroloop.laws, or package.module:Class")
+
+
+class Now(NamedTuple, Generic[X]):
+    """What a law computes a tick from, as CasADi columns or as arrays.
+
+    Attributes:
+        attitude: q, body relative to inertial, as received; scalar part first [1]. Shape (4,).
+        rate: ω as received, body frame [rad/s]. Shape (3,).
+        desired_attitude: q_d [1]. Shape (4,).
+        desired_rate: ω_d, *inertial* frame [rad/s]. Shape (3,).
+        desired_acceleration: Its derivative, inertial frame [rad/s²]. Shape (3,).
+        attitude_error: e = q_d⁻¹ ∘ q, (C.16): from desired to received; ±e are the same attitude [1]. Shape (4,).
+        rate_error: ω − R(q)ᵀω_d, (C.18), body frame [rad/s]. Shape (3,).
+        gains: The present value of each of `Law.gains`, by name. Shape (1,) for a number, else its length.
+        state: The named state after the last tick. Each in the shape that the law gave it.
+    """
+
+    attitude: X
+    rate: X
+    desired_attitude: X
+    desired_rate: X
+    desired_acceleration: X
+    attitude_error: X
+    rate_error: X
+    gains: Mapping[str, X]
+    state: Mapping[str, X]
+
+
+class Law(ABC, Generic[S]):
+    """A control law. Derive from `ExpressionLaw` or `PythonLaw`.
+
+    Args:
+        settings: An instance of the class's `Settings`.
+        period: Time between ticks [s].
+        actuators: Number of voltages to give.
+
+    Raises:
+        ValueError: These settings are no law for so many actuators; the text says why.
+
+    Attributes:
+        Settings: The model of its settings.
+        gains: Names of those settings that may change while it runs: numbers, or tuples of them.
+    """
+
+    Settings: ClassVar[type[LawSettings]]
+    gains: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, settings: S, period: float, actuators: int) -> None:
+        self.settings = settings
+        self.period = period
+        self.actuators = actuators
+
+    @classmethod
+    def certify(cls, configured: Any) -> Mapping[str, Any] | None:
+        """What is proven of a configuration with this law: `holds` and `verdict`, with whatever else; None if nothing.
+
+        Args:
+            configured: The whole configuration, with sections as in the TOML file.
+        """
+        return None
+
+
+class ExpressionLaw(Law[S]):
+    """A law of CasADi expressions."""
+
+    def initial(self) -> Mapping[str, Sequence[float]]:
+        """The named state before the first tick; its names and sizes are those of every tick."""
+        return {}
+
+    @abstractmethod
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """The voltages before quantization [V], shape (actuators,), and the named state after this tick."""
+
+
+class PythonLaw(Law[S]):
+    """A law in plain Python. `step` runs once a tick, between a received frame and the sent one: it must not block.
+
+    Attributes:
+        state: All that it carries from tick to tick, by name. What is kept elsewhere is not in logs, so a replay that
+            begins in mid-session differs.
+    """
+
+    state: dict[str, Floats]
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Set `state` to what it is before the first tick."""
+
+    @abstractmethod
+    def step(self, now: Now[Floats]) -> Sequence[float] | Floats:
+        """The voltages before quantization [V], shape (actuators,). Sets `state` to what it is after this tick."""
