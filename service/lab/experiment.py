@@ -166,6 +166,8 @@ def through_frames(
         command = controller.tick(measurement, k)
         if command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
+            if controller.fault is not None:
+                trips = [controller.fault]
             raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
             score.error(k, controller.attitude_error, sent=measurement != SILENCE)

@@ -139,7 +139,7 @@ def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX
     z2 = omega_e - alpha  # (C.19), (C.40)
     alpha_bar = -s / 2 * C1 @ (eta_e * I + S(eps_e)) @ omega_e  # (C.46), for α̇ (Remark 6)
 
-    g = gravity_torque(p, q)  # (C.45)
+    g = -gravity_torque(p, q)  # (C.45)
     Psi = -S(omega) @ (J @ omega) - g  # (C.43)
     Phi = ca.diag(-omega)  # (C.44)
     u = voltages_for(
