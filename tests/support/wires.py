@@ -42,6 +42,6 @@ specs = st.builds(
     attitude=signals(),
     rate=signals(),
     voltage=signals(),
-    actuators=st.sampled_from([2, 3]),
+    actuators=st.integers(1, MAX_ACTUATORS),
     counter_bits=any_counter_bits,
 )
