@@ -110,9 +110,7 @@ class OwnPlant(Plant):
             ) from None
         length = hypot(w, x, y, z)
         if isfinite(length) and abs(length - 1) > _UNIT:
-            raise self._failure(
-                f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)"
-            )
+            raise self._failure(f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)")
         return Measurement((w, x, y, z), (a, b, c))
 
     def truth(self) -> State | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, SignalSpec, WireSpec
 
 COUNTER_BITS = range(4, 17)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import CanError, CanSettings, Heartbeat, check_widths, fingerprint
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
 from tests.support.can_in_process import PAPER
 from tests.support.wires import wire_of
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
 from tests.support.wires import COUNTER_BITS, any_counter_bits, wire_of, wires
 
 Widths = tuple[int | None, ...]
