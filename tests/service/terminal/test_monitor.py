@@ -45,7 +45,7 @@ def top_of(**messages: Message) -> Top:
 
 TELEMETRY = Telemetry(
     session="s", tick=1, counter=1, attitude_error=(0.0, 0.0, 0.008726535), rate_error=(0.0, 0.0, 0.0),
-    desired=(1.0, 0.0, 0.0, 0.0), damping_estimate=(0.0, 0.0, 0.0), voltages=(12.5, -3.0), sign=1,
+    desired=(1.0, 0.0, 0.0, 0.0), state={"damping_estimate": (0.0, 0.0, 0.0), "sign": (1.0,)}, voltages=(12.5, -3.0),
 )  # fmt: skip
 
 
