@@ -79,7 +79,14 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
             event__plant=Event(role="recorder", kind="tripped", text="no fresh command for 100 ms: 0 V"),
         )
     )
-    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "28.0 + 12.0 kbit/s", "aero plant: no fresh command"):
+    for words in (
+        "yaw   +90.0°",
+        "error  1.00°",
+        "+12.5",
+        "-3.0",
+        "28.0 + 12.0 kbit/s",
+        "aero plant: no fresh command",
+    ):
         assert words in shown
 
 
