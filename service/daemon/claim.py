@@ -152,6 +152,7 @@ class ClaimClient:
             if reply.ok is None:
                 continue
             payload = reply.ok.payload.to_bytes()
+            model: type[Grant | Refusal | Answer]
             for model in (Grant, Refusal, Answer):
                 with suppress(intake.IntakeError):
                     read = intake.read(model, payload, intake.REFERENCE)
