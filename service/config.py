@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
@@ -25,7 +25,8 @@ from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
 from aeroloop.service.config_sources import merge, sources, tree_of
 from aeroloop.service.config_text import toml
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.registry import LawSection
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
 from aeroloop.service.vehicle_address import VehicleAddress
@@ -63,7 +64,9 @@ class Settings(VehicleAddress):
     loop: LoopSettings = Field(default=LoopSettings(), description="tick grid and process set-up of both ends")
     wire: WireSpec = Field(default=WireSpec(), description="quantizers and frames, on which both ends must agree")
     reference: OneReference = Field(default=Sinusoid(), description="attitude to follow over time")
-    law: LawSettings = Field(default=LawSettings(), description="model of the plant and gains of the law")
+    law: SerializeAsAny[LawSection] = Field(
+        default=AdaptiveSettings(), description="which law, its model of the plant and its gains"
+    )
     controller: ControllerSettings = Field(default=ControllerSettings(), description="the controller daemon")
     plant: PlantSettings = Field(default=PlantSettings(), description="the plant end: plant, sensors, faults, limits")
     can: CanSettings = Field(default=CanSettings(), description="the CAN bus, for plant.via = 'can'")

@@ -27,8 +27,9 @@ from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import LawSettings
-from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
+from aeroloop.service.control.laws.interface import LawSettings
+from aeroloop.service.control.laws.registry import gains_of
+from aeroloop.service.daemon.certificate_gate import CertificateGate
 from aeroloop.service.daemon.claim import ClaimClient, SessionLostError
 from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.daemon.telemetry import telemetry_of
@@ -55,7 +56,8 @@ class Daemon:
     """The controller end as a process. The role's name must be unique: the plant identifies its holder by it.
 
     Raises:
-        ValueError: The law's B cannot be inverted.
+        LawError: The law cannot be used.
+        PluginError: There is no such law.
     """
 
     def __init__(
@@ -74,7 +76,7 @@ class Daemon:
         self._own_grid = settings.pace == "clock" and not loop.lockstep
         self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm, own_grid=self._own_grid)
         begins = reference if settings.after_restart == "configured" else Hold()
-        self._gate = CertificateGate(role, configured, begins)
+        self._gate = CertificateGate(role, configured, gains_of(law), begins)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
             role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators == 3
@@ -225,9 +227,9 @@ class Daemon:
     def _advance_state(self, tick: int) -> None:
         """Move the state machine after an answer."""
         before, session, role = self._machine.state, self._claims.session, self._role
-        if self._controller.failed:
+        if self._controller.fault is not None:
             self._machine.fire(Trigger.FAULT)
-            self._lost = "the law gave no number"
+            self._lost = self._controller.fault
             role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session, tick)
         elif self._controller.tick_index != tick:
             if before is not State.READY:

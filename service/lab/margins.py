@@ -25,6 +25,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.lab.experiment import LoopEndedError, run_experiment
 from aeroloop.service.lab.workers import Workers
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import beyond, premises
 from aeroloop.service.theorem.extremes import extremes
 from aeroloop.service.theorem.invariant import reach
@@ -138,7 +139,7 @@ def measure_margins(
         duration_s=duration_s,
         diverged=DIVERGED,
         watchdog_ms=settings.plant.watchdog_s * 1e3,
-        damping_bound=settings.law.damping_bound,
+        damping_bound=with_theorem(settings).law.damping_bound,
         margins=[_margin(*row, *found[2 * i : 2 * i + 2]) for i, row in enumerate(rows)],
     )
 
@@ -232,7 +233,7 @@ def largest_error(settings: Settings, duration_s: float, *, delay: int = 0, lost
         lost: Commands lost between two that act.
     """
     settings = three_torques(settings)
-    loop, law = settings.loop, settings.law
+    loop, law = settings.loop, with_theorem(settings).law
     body = settings.plant.build(loop.period)
     controller = Controller(settings.wire, law, settings.reference, loop.period)
     rows = list[tuple[float, ...]]()
@@ -240,7 +241,9 @@ def largest_error(settings: Settings, duration_s: float, *, delay: int = 0, lost
     def watch(k: int, _measurement: bytes, _command: bytes) -> None:
         if 2 * k >= loop.ticks(duration_s):
             true, c = body.truth(), controller
-            rows.append((*true.attitude, *true.rate, *c.attitude, *c.rate, *c.rate_error, *c.desired, c.sign))
+            rows.append(
+                (*true.attitude, *true.rate, *c.attitude, *c.rate, *c.rate_error, *c.desired, *c.law_state["sign"])
+            )
 
     try:
         run_experiment(settings, duration_s, watch=watch, plant=Late(body, delay, lost), controller=controller)
@@ -256,7 +259,7 @@ def three_torques(settings: Settings) -> Settings:
 
     An Aero becomes a body as the law assumes it, with θ = θ̂(0) and u₁ quantized as the others are.
     """
-    plant, law, wire = settings.plant, settings.law, settings.wire
+    plant, law, wire = settings.plant, with_theorem(settings).law, settings.wire
     if plant.kind == "aero":
         motors = np.array(law.allocation)[1:, 1:]
         allocation = np.diag([np.linalg.norm(motors, 2), 0.0, 0.0])
