@@ -18,14 +18,13 @@ Riccati Equations, International Journal of Control 77(8), 2004.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, Literal
 
 from pydantic import Field
 
 from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.lazy import numpy as np
-from aeroloop.service.control.laws.body import Diagonal, Vector
-from aeroloop.service.control.laws.interface import Floats, Gains3, Now
+from aeroloop.service.control.laws.interface import Diagonal, Floats, Gains3, Now, Vector
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_lqr
 
@@ -37,7 +36,7 @@ _DOUBLINGS: Final = 60
 class LQRSettings(TrackingSettings):
     """Model of the plant and weights. The default weights are those of the tuning rule."""
 
-    kind: str = Field(default="lqr", description="which law")
+    kind: Literal["lqr"] = Field(default="lqr", description="which law")
     attitude_weight: Diagonal = Field(
         default=_TUNED["attitude_weight"], description="q_φ, of the angle's square against the torque's [(N·m/rad)²]"
     )

@@ -15,6 +15,7 @@ and R. Panja, Globally Asymptotically Stable 'PD+' Controller for Robot Manipula
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 from pydantic import Field
 
@@ -29,7 +30,7 @@ _TUNED = tune_pd(PAPER_BODY, PAPER)
 class PDSettings(TrackingSettings):
     """Model of the plant and gains. The default gains are those of the tuning rule."""
 
-    kind: str = Field(default="pd", description="which law")
+    kind: Literal["pd"] = Field(default="pd", description="which law")
     kp: Gains3 = Field(default=_TUNED["kp"], description="gain of the attitude error ε̃ [N·m]")
     kd: Gains3 = Field(default=_TUNED["kd"], description="gain of the rate error [N·m·s/rad]")
 

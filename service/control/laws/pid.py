@@ -17,12 +17,13 @@ and T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd edition, 1995
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.service.control.laws.body import Diagonal, check_allocation
-from aeroloop.service.control.laws.interface import Gains3, Now
+from aeroloop.service.control.laws.body import check_allocation
+from aeroloop.service.control.laws.interface import Diagonal, Gains3, Now
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, VOLTAGE_LIMIT, tune_pid
 
@@ -32,7 +33,7 @@ _TUNED = tune_pid(PAPER_BODY, PAPER)
 class PIDSettings(TrackingSettings):
     """Model of the plant, gains and anti-windup. The defaults are those of the tuning rule."""
 
-    kind: str = Field(default="pid", description="which law")
+    kind: Literal["pid"] = Field(default="pid", description="which law")
     kp: Gains3 = Field(default=_TUNED["kp"], description="gain of the attitude error ε̃ [N·m]")
     kd: Gains3 = Field(default=_TUNED["kd"], description="gain of the rate error [N·m·s/rad]")
     ki: Gains3 = Field(default=_TUNED["ki"], description="gain of the integral [N·m/rad]")
@@ -50,6 +51,7 @@ class PID(TrackingLaw[PIDSettings]):
 
     Settings = PIDSettings
     gains = ("kp", "kd", "ki")
+    units: ClassVar = {"integral": "rad"}
 
     def initial(self) -> Mapping[str, Sequence[float]]:
         """Nothing integrated yet."""

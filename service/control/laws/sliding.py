@@ -18,13 +18,13 @@ Tracking Maneuvers, Journal of Guidance, Control, and Dynamics 18(6), 1995. The 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 from pydantic import Field
 
 from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.attitude import S
-from aeroloop.service.control.laws.body import Diagonal
-from aeroloop.service.control.laws.interface import Gains3, Now
+from aeroloop.service.control.laws.interface import Diagonal, Gains3, Now
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_sliding
 
@@ -34,7 +34,7 @@ _TUNED = tune_sliding(PAPER_BODY, PAPER)
 class SlidingSettings(TrackingSettings):
     """Model of the plant, surface and layer. The defaults are those of the tuning rule."""
 
-    kind: str = Field(default="sliding", description="which law")
+    kind: Literal["sliding"] = Field(default="sliding", description="which law")
     slope: Gains3 = Field(default=_TUNED["slope"], description="λ, slope of the surface [1/s]")
     strength: Gains3 = Field(default=_TUNED["strength"], description="K, largest torque towards the surface [N·m]")
     layer: Diagonal = Field(default=_TUNED["layer"], description="Φ, thickness of the boundary layer [rad/s]")

@@ -27,11 +27,11 @@ from pydantic import Field
 
 from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.attitude import R, S
-from aeroloop.service.control.laws.body import BodySettings, Vector, gravity_torque, voltages_for
-from aeroloop.service.control.laws.interface import ExpressionLaw, Now
+from aeroloop.service.control.laws.body import gravity_torque, voltages_for
+from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings, Now, Vector
 
 
-class TrackingSettings(BodySettings):
+class TrackingSettings(LawSettings):
     """Model of the plant, and when the nearer of the two equilibria is chosen anew."""
 
     damping_estimate: Vector = Field(

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from math import sqrt
 from typing import Final, NamedTuple
 
-from aeroloop.service.control.laws.body import BodySettings, Vector
+from aeroloop.service.control.laws.interface import LawSettings, Vector
 
 VOLTAGE_LIMIT: Final = 24.0
 """Largest voltage of the Aero's supply [V]."""
@@ -50,12 +50,12 @@ def response_of(inertia: Vector, C1: Vector, C2: Vector) -> Response:
     return Response(*(_vector(values, digits=15) for values in (bandwidth, damping)))
 
 
-def tune_pd(body: BodySettings, response: Response) -> Fields:
+def tune_pd(body: LawSettings, response: Response) -> Fields:
     """J(s² + 2ζωₙs + ωₙ²) with kp on ε̃ = φ/2."""
     return _each(body, response, lambda J, wn, zeta: {"kp": 2 * J * wn**2, "kd": 2 * J * zeta * wn})
 
 
-def tune_pid(body: BodySettings, response: Response) -> Fields:
+def tune_pid(body: LawSettings, response: Response) -> Fields:
     """J(s² + 2ζωₙs + ωₙ²)(s + a) = Js³ + kd s² + (kp/2 + ki)s + ki c/2, with a = ωₙ/10 and c = ωₙ/2."""
 
     def one(J: float, wn: float, zeta: float) -> Mapping[str, float]:
@@ -67,7 +67,7 @@ def tune_pid(body: BodySettings, response: Response) -> Fields:
     return _each(body, response, one)
 
 
-def tune_sliding(body: BodySettings, response: Response) -> Fields:
+def tune_sliding(body: LawSettings, response: Response) -> Fields:
     """Poles at −λ/2 and −K/(JΦ), both ωₙ; K half of the torque."""
     torques = [_TORQUE_SHARE * VOLTAGE_LIMIT * sum(map(abs, row)) for row in body.allocation]
     rows = zip(torques, body.inertia, response.bandwidth, strict=True)
@@ -75,7 +75,7 @@ def tune_sliding(body: BodySettings, response: Response) -> Fields:
     return _columns(found)
 
 
-def tune_lqr(body: BodySettings, response: Response) -> Fields:
+def tune_lqr(body: LawSettings, response: Response) -> Fields:
     """Weights against the square of torque, so that τ = −Jωₙ²φ − 2ζωₙJφ̇ is optimal in continuous time."""
     return _each(
         body,
@@ -87,7 +87,7 @@ def tune_lqr(body: BodySettings, response: Response) -> Fields:
     )
 
 
-RULES: Final[Mapping[str, Callable[[BodySettings, Response], Fields]]] = {
+RULES: Final[Mapping[str, Callable[[LawSettings, Response], Fields]]] = {
     "pd": tune_pd,
     "pid": tune_pid,
     "sliding": tune_sliding,
@@ -96,7 +96,7 @@ RULES: Final[Mapping[str, Callable[[BodySettings, Response], Fields]]] = {
 """By the kind of law. The law without adaptation has the paper's own gains."""
 
 
-def _each(body: BodySettings, response: Response, one: Callable[[float, float, float], Mapping[str, float]]) -> Fields:
+def _each(body: LawSettings, response: Response, one: Callable[[float, float, float], Mapping[str, float]]) -> Fields:
     return _columns([one(*axis) for axis in zip(body.inertia, *response, strict=True)])
 
 
@@ -110,6 +110,6 @@ def _vector(values: list[float], digits: int = 5) -> Vector:
     return x, y, z
 
 
-PAPER_BODY: Final = BodySettings(kind="Table C.1")
+PAPER_BODY: Final = LawSettings(kind="Table C.1")
 PAPER: Final = response_of(PAPER_BODY.inertia, (0.3, 0.3, 0.3), (0.15, 0.15, 0.15))
 """Of Table C.1."""
