@@ -105,10 +105,10 @@ def test_at_the_reference_a_law_holds_the_weight_and_nothing_else(kind: str, mot
 
 
 POLES = {
-    "pd": lambda wn, pair: pair,
-    "lqr": lambda wn, pair: pair,
+    "pd": lambda _, pair: pair,
+    "lqr": lambda _, pair: pair,
     "pid": lambda wn, pair: [*pair, -wn / 10],
-    "sliding": lambda wn, pair: [-wn, -wn],
+    "sliding": lambda wn, _: [-wn, -wn],
 }
 
 
@@ -134,8 +134,8 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
             further = [(after[1 + axis] - state[1 + axis]) / PERIOD] if extra else []
             return np.array([x[1], body.omega_dot(q, omega, torque)[axis], *further])
 
-        size = 2 + bool(extra)
-        A = np.column_stack([slope_of(lambda h, i=i: derivative(h * np.eye(size)[i])) for i in range(size)])
+        one_by_one = np.eye(2 + bool(extra))
+        A = np.column_stack([slope_of(lambda h, x=x: derivative(h * x)) for x in one_by_one])
         wn, zeta = response.bandwidth[axis], response.damping[axis]
         pair = np.roots([1, 2 * zeta * wn, wn**2])
         expected = POLES.get(kind, POLES["pd"])(wn, pair)
@@ -170,12 +170,12 @@ def test_the_lyapunov_function_of_pd_falls_by_the_damping_alone() -> None:
     for _ in range(5):
         at, *_ = moving(body, rng)
 
-        def V(t: float, at: Any = at) -> float:
+        def falling(t: float, at: Any = at) -> float:
             e, omega_e = at(t)
             return float(2 * 1.3 * (1 - e[0]) + omega_e @ (body.J * omega_e) / 2)
 
         omega_e = at(0)[1]
-        assert slope_of(V) == pytest.approx(-omega_e @ (np.array(body.p.kd) * omega_e), rel=1e-6)
+        assert slope_of(falling) == pytest.approx(-omega_e @ (np.array(body.p.kd) * omega_e), rel=1e-6)
 
 
 def test_the_sliding_law_moves_straight_to_its_surface() -> None:
@@ -209,13 +209,13 @@ def test_the_lyapunov_function_of_pid_falls_until_body_and_integral_rest() -> No
     for _ in range(200):
         at, integral, rate = moving(body, rng)
 
-        def V(t: float, at: Any = at, integral: Array = integral, rate: Array = rate) -> float:
+        def falling(t: float, at: Any = at, integral: Array = integral, rate: Array = rate) -> float:
             e, omega_e = at(t)
             kept = 2 * kp * (1 - e[0]) + J * omega_e @ omega_e / 2 + c * J * e[1:] @ omega_e
             e_I = integral + t * rate
             return float(kept + ki / 2 * e_I @ e_I)
 
-        assert slope_of(V) < 0
+        assert slope_of(falling) < 0
 
 
 def test_the_other_equilibrium_is_approached_only_once_it_is_nearer_by_the_hysteresis() -> None:
@@ -255,7 +255,7 @@ def test_without_adaptation_the_voltages_are_the_papers_with_its_first_estimate(
     for law in laws:
         state = [value for values in initial_state(law).values() for value in values]
         gains = [value for gain in configured_gains(law).values() for value in gain]
-        found.append(law_function(law)(last=q, state=state, gains=gains, eps=q[1:], q_d=unit(rng) * 0 + q, **motion))
+        found.append(law_function(law)(last=q, state=state, gains=gains, eps=q[1:], q_d=q, **motion))
     assert np.array(found[0]["u"]).tolist() == np.array(found[1]["u"]).tolist()
     assert laws[1].initial().keys() == {"sign"}
 
