@@ -11,9 +11,9 @@ from aeroloop.service.control.laws.interface import LawSettings
 
 
 def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
-    """g of (C.45): torque of the weight about the origin at attitude q, body frame [N·m]. Shape (3,)."""
+    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,)."""
     weight = ca.vertcat(0, 0, -p.mass * p.gravity)
-    return -S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
+    return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
 
 
 def voltages_for(p: LawSettings, torque: ca.SX, actuators: int) -> ca.SX:

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError, cre
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Gains
-from aeroloop.protocol.plugins import PluginError, find, own_words
+from aeroloop.protocol.plugins import PluginError, find, own_words, source_of
 from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import Law, LawSettings
@@ -89,6 +89,11 @@ def own_settings(section: LawSettings) -> LawSettings:
 def law_class(section: LawSettings) -> type[Law[Any]]:
     """The class of the law that a section configures. Raises PluginError."""
     return find("law.kind", section.kind, GROUP, BUILT_IN, Law)
+
+
+def version_of(section: LawSettings) -> dict[str, str]:
+    """Which source a user's law is of, for descriptions; nothing of ours. Raises PluginError."""
+    return {} if section.kind in BUILT_IN else {f"law {section.kind}": source_of(law_class(section))}
 
 
 def gains_of(section: LawSettings) -> Gains:
