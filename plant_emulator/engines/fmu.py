@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.plugins import PluginError, own_words
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import from_euler
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.protocol.wording import closest, either
@@ -33,6 +33,7 @@ Name = Annotated[str, Field(min_length=1, max_length=500)]
 Names3 = tuple[str, str, str]
 
 _DEGREE: Final = 0.017453292519943295
+_FMI2: Final = 2
 _FATAL: Final = 4
 """FMI's status after which the FMU must not be called again."""
 
@@ -217,13 +218,16 @@ class FmuPlant(Plant):
         index = 0
         if name not in variables and element and element[1] in variables:
             name, index = element[1], int(element[2]) - 1
-        fitting = [each for each, variable in variables.items() if variable.causality == causes[0]]
+        real = "Real" if self._description.fmiMajorVersion == _FMI2 else "Float64"
+        fitting = [
+            each for each, known in variables.items() if known.causality == causes[0] and known.type == real
+        ]
         self._known(variables, name, fitting)
         variable = variables[name]
-        if variable.causality not in causes or variable.type not in ("Real", "Float64"):
+        if variable.causality not in causes or variable.type != real:
             raise FmuError(
-                f"{self._name}: {name} is {_kind(variable)}, not an {causes[0]} of type Real or Float64; "
-                f"its {causes[0]}s are {_listed(fitting)}"
+                f"{self._name}: {name} is {_kind(variable)}, not an {causes[0]} of type {real}; "
+                f"of those it has {_listed(fitting)}"
             )
         if not 0 <= index < prod(variable.shape):
             raise FmuError(f"{self._name}: {name} has {prod(variable.shape)} elements, and {index + 1} is none of them")
@@ -258,10 +262,9 @@ class FmuPlant(Plant):
         if isinstance(error, FmuError):
             return error
         self._fatal |= getattr(error, "status", None) == _FATAL
-        raised = f"{error}".rstrip(".") if hasattr(error, "status") else own_words(error)
         step = self._step_that_does_not_divide(fixed=False)
         hint = f" (it prefers steps of {step:g} s, and the loop's period is {self._period:g} s)" if step else ""
-        return FmuError(f"{self._name}: {what}: {' '.join(raised.split())}{self._own_words()}{hint}")
+        return FmuError(f"{self._name}: {what}: {_text(error)}{self._own_words()}{hint}")
 
     def _sample(self) -> None:
         values, into = self._outputs.values, self._read.inputs["values"]
@@ -319,8 +322,8 @@ def _description(file: Path) -> Any:
             files = archive.namelist()
         version = description.fmiMajorVersion
     except Exception as error:
-        raise FmuError(f"{file} is not an FMU: {own_words(error)}") from None
-    if version not in (2, 3):
+        raise FmuError(f"{file} is not an FMU: {_text(error)}") from None
+    if version not in (_FMI2, 3):
         raise FmuError(f"{file.name} is of FMI {description.fmiVersion}: export it for FMI 2 or 3")
     if description.coSimulation is None:
         raise FmuError(f"{file.name} is for model exchange only: export it for co-simulation")
@@ -332,6 +335,11 @@ def _description(file: Path) -> Any:
         remedy = f"`fmpy compile {file}` builds one from its sources" if sources else "export it on this platform"
         raise FmuError(f"{file.name} has no binary for {platform}, only for {either(others or ['none'])}: {remedy}")
     return description
+
+
+def _text(error: Exception) -> str:
+    """An exception's text in one line."""
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
 
 
 def _kind(variable: Any) -> str:
