@@ -85,7 +85,8 @@ class Instance:
                 f"{self._name}: {name} is {_kind(variable)}, not an {causalities[0]} of type {real}; "
                 f"of those it has {_listed(fitting)}"
             )
-        if not 0 <= index < (size := prod(variable.shape)):
+        size = prod(variable.shape)
+        if not 0 <= index < size:
             raise FmuError(f"{self._name}: {name} has {size} elements, and none is {name}[{index + 1}]")
         declared = variable.unit or getattr(variable.declaredType, "unit", None)
         if declared != unit and {declared, unit} <= {"rad", "deg", "rad/s", "deg/s"}:
@@ -157,7 +158,7 @@ class Instance:
 
     def _known(self, name: str, fitting: Iterable[str]) -> Any:
         if name not in self._variables:
-            alike = closest(name, fitting) or closest(name, self._variables)
+            alike = closest(name, fitting)
             hint = f": did you mean {alike}?" if alike else f"; it has {_listed(fitting)}"
             raise FmuError(f"{self._name} has no variable {name}{hint}")
         return self._variables[name]
@@ -228,9 +229,9 @@ def _description(file: Path) -> Any:
     if not file.is_file():
         raise FmuError(f"there is no file {file}: set plant.own.file")
     try:
-        description = fmpy.read_model_description(file, validate=False)
-        with ZipFile(file) as archive:
-            files = archive.namelist()
+        with file.open("rb") as opened:  # FMPy would not close it
+            description = fmpy.read_model_description(opened, validate=False)
+            files = ZipFile(opened).namelist()
         version = description.fmiMajorVersion
     except Exception as error:
         raise FmuError(f"{file} is not an FMU: {' '.join(str(error).split())}") from None
@@ -256,4 +257,4 @@ def _kind(variable: Any) -> str:
 
 def _listed(names: Iterable[str]) -> str:
     some = list(names)
-    return ", ".join(some[:8]) + (f" and {len(some) - 8} others" if len(some) > 8 else "") or "none"
+    return ", ".join(some[:8]) + (f" and {len(some) - 8} more" if len(some) > 8 else "") or "none"

@@ -14,12 +14,15 @@ from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import casadi as ca
-import fmpy
+import pytest
 
 from aeroloop.plant_emulator.model.emulated import step_function
 from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, PlantSettings
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
+if COMPILER is None:
+    pytest.skip("no C compiler on PATH to build an FMU with", allow_module_level=True)
+fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: it comes with aeroloop[fmi]")
 PERIOD, SUBSTEPS = 0.002, 2
 IDEAL = PlantSettings(ideal=True, substeps=SUBSTEPS)
 
@@ -111,4 +114,16 @@ def _packed(folder: Path, description: str, files: dict[str, Path]) -> Path:
         archive.writestr("modelDescription.xml", description)
         for name, file in files.items():
             archive.write(file, name)
+    return path
+
+
+def altered(fmu: Path, path: Path, *edits: tuple[str, str], files: tuple[str, str] = ("", "")) -> Path:
+    """A copy with other words in its description, and with other names of its files."""
+    with ZipFile(fmu) as old, ZipFile(path, "w", ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            content = old.read(name)
+            for was, now in edits if name.endswith(".xml") else ():
+                assert was in content.decode()
+                content = content.replace(was.encode(), now.encode())
+            new.writestr(name.replace(*files), content)
     return path
