@@ -1,7 +1,7 @@
 """FMU as a plant: a model that Simulink, OpenModelica, Dymola or another tool exported for co-simulation, FMI 2 or 3.
 
-FMPy loads it. Once a period the voltages are set, the FMU advances by one communication step, the loop's period, and
-the outputs that the settings name are read. What they give is both the true state and what the sensors measure.
+FMPy loads it. Once a period the voltages are set, the FMU advances by the period in equal communication steps, and the
+outputs that the settings name are read. What they give is both the true state and what the sensors measure.
 
 From roll φ, pitch θ and yaw ψ, yaw about z first, then pitch, then roll, the body rates are
 
@@ -52,6 +52,7 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
     )
     angle_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of angles")
     rate_unit: Literal["rad/s", "deg/s"] = Field(default="rad/s", description="unit of rate and angle_rates")
+    substeps: int = Field(default=1, ge=1, le=100, description="communication steps of the FMU a period")
     start: dict[str, bool | int | float | str | list[float]] = Field(
         default={}, description="start values and parameters, by the FMU's names, in the FMU's units"
     )
@@ -85,7 +86,7 @@ class FmuPlant(Plant):
 
     Args:
         settings: Which FMU, and its variables.
-        period: The loop's period, and the FMU's communication step [s].
+        period: The loop's period [s].
 
     Raises:
         FmuError: FMPy is not installed, or the FMU cannot be used with these settings; from `advance`: it failed.
@@ -96,7 +97,8 @@ class FmuPlant(Plant):
 
     def __init__(self, settings: FmuSettings, period: float) -> None:
         self.actuators = len(settings.voltages)
-        self._fmu = fmu = Instance(settings.file, period, settings.log)
+        self._fmu = fmu = Instance(settings.file, period / settings.substeps, settings.log)
+        self._substeps = settings.substeps
         inputs = [fmu.element(name, ("input",), "V") for name in settings.voltages]
         outputs = [fmu.element(name, ("output", "local"), unit) for name, unit in settings.outputs.items()]
         self._release = finalize(self, fmu.close)
@@ -118,7 +120,7 @@ class FmuPlant(Plant):
 
     def advance(self) -> None:
         """Advance the FMU by one period."""
-        self._fmu.step(self._inputs, self._outputs)
+        self._fmu.step(self._inputs, self._outputs, self._substeps)
         self._sample()
 
     def measure(self) -> Measurement:

@@ -41,15 +41,15 @@ class Instance:
 
     Args:
         file: The FMU.
-        period: Communication step [s].
+        length: Communication step [s].
         log: Whether it logs all that it can.
 
     Raises:
         FmuError: FMPy is not installed, or the file is no FMU that runs here. From any method: it fails.
     """
 
-    def __init__(self, file: Path, period: float, log: bool) -> None:
-        self._file, self._name, self._period, self._log = file, file.name, period, log
+    def __init__(self, file: Path, length: float, log: bool) -> None:
+        self._file, self._name, self._length, self._log = file, file.name, length, log
         self._description = _description(file)
         self._variables: Mapping[str, Any] = {each.name: each for each in self._description.modelVariables}
         self._fmu: Any = None
@@ -57,10 +57,11 @@ class Instance:
         self._steps = 0
         self._fatal = False
         self._said: tuple[int, str] = (-1, "")
-        if step := self._step_that_does_not_divide(fixed=True):
+        fixed = float(self._description.coSimulation.fixedInternalStepSize or 0)  # of FMI 3
+        if fixed and not (round(length / fixed) and isclose(length / fixed, round(length / fixed))):
             raise FmuError(
-                f"{self._name} has steps of {step:g} s, and the loop's period, {period:g} s, is no multiple of them: "
-                "set loop.rate_hz, or export the FMU with another step"
+                f"{self._name} has steps of {fixed:g} s, of which {length:g} s, the loop's period or its part by "
+                "plant.own.substeps, is no multiple: set loop.rate_hz, or export the FMU with another step"
             )
 
     def element(self, name: str, causalities: Sequence[str], unit: str) -> Element:
@@ -121,18 +122,18 @@ class Instance:
         """Access to some of its numbers, with their present values."""
         return Signals(self._fmu, elements)
 
-    def step(self, inputs: Signals, outputs: Signals) -> None:
-        """Set its inputs, let one communication step pass, and read its outputs."""
-        time = self._steps * self._period
+    def step(self, inputs: Signals, outputs: Signals, count: int) -> None:
+        """Set its inputs, let `count` communication steps pass, and read its outputs."""
         try:
             inputs.write()
-            ended = self._fmu.doStep(time, self._period)
+            for _ in range(count):
+                ended = self._fmu.doStep(self._steps * self._length, self._length)
+                self._steps += 1
+                if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
+                    raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._own_words()}")
             outputs.read()
         except Exception as error:
-            raise self._failure(f"it failed at {time:g} s", error) from None
-        if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
-            raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._own_words()}")
-        self._steps += 1
+            raise self._failure(f"it failed at {self._steps * self._length:g} s", error) from None
 
     def close(self) -> None:
         """End and free it, and remove its unpacked files. A second call does nothing."""
@@ -163,13 +164,6 @@ class Instance:
             raise FmuError(f"{self._name} has no variable {name}{hint}")
         return self._variables[name]
 
-    def _step_that_does_not_divide(self, fixed: bool) -> float | None:
-        """Its own step [s] if the period is no multiple of it: FMI 3's fixed one, else the one that it prefers."""
-        preferred = getattr(self._description.defaultExperiment, "stepSize", None)
-        step = float(self._description.coSimulation.fixedInternalStepSize or (0 if fixed else preferred) or 0)
-        steps = self._period / step if step else 1.0
-        return None if round(steps) >= 1 and isclose(steps, round(steps)) else step
-
     def _listen(self, *said: Any) -> None:
         """Keep the gravest of its messages, and of those the last. FMI 2 gives its name too, before these three."""
         status, _, message = said[-3:]
@@ -184,8 +178,12 @@ class Instance:
             return error
         self._fatal |= getattr(error, "status", None) == _FATAL
         text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        step = self._step_that_does_not_divide(fixed=False)
-        hint = f" (it prefers steps of {step:g} s, and the loop's period is {self._period:g} s)" if step else ""
+        preferred = float(getattr(self._description.defaultExperiment, "stepSize", None) or self._length)
+        hint = (
+            ""
+            if isclose(preferred, self._length)
+            else f" (steps are of {self._length:g} s, and it prefers {preferred:g} s: see plant.own.substeps)"
+        )
         return FmuError(f"{self._name}: {what}: {text}{self._own_words()}{hint}")
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -191,7 +193,8 @@ def test_an_fmu_that_does_not_fit_is_one_line(fmus: dict[str, Path], case: str) 
 
 
 FMI1 = '"1.0" modelIdentifier="aero" numberOfContinuousStates="0" numberOfEventIndicators="0"'
-PLATFORM = fmpy.platform
+PLATFORM, LIBRARY = fmpy.platform, f"aero{fmpy.sharedLibraryExtension}"
+FATAL = 4
 BROKEN: dict[str, tuple[str, tuple[tuple[str, str], ...], tuple[str, str], str]] = {
     "no description": ("fmi2", (), ("modelDescription.xml", "x.xml"), 'is not an FMU: "There is no item named'),
     "no XML": ("fmi2", (("<?xml", "xml"),), ("", ""), "is not an FMU: Start tag expected"),
@@ -203,7 +206,7 @@ BROKEN: dict[str, tuple[str, tuple[tuple[str, str], ...], tuple[str, str], str]]
         "is for model exchange only: export it",
     ),
     "no binary": ("fmi2", (), (PLATFORM, "win99"), f"has no binary for {PLATFORM}, only for win99: export it on"),
-    "sources": ("fmi2", (), (f"binaries/{PLATFORM}/aero.so", "sources/a.c"), "only for none: `fmpy compile "),
+    "sources": ("fmi2", (), (f"binaries/{PLATFORM}/{LIBRARY}", "sources/a.c"), "only for none: `fmpy compile "),
     "GUID": (
         "fmi2",
         (('guid="aero"', 'guid="other"'),),
@@ -214,7 +217,7 @@ BROKEN: dict[str, tuple[str, tuple[tuple[str, str], ...], tuple[str, str], str]]
         "fmi3",
         (('fixedInternalStepSize="0.001"', 'fixedInternalStepSize="0.003"'),),
         ("", ""),
-        "has steps of 0.003 s, and the loop's period, 0.002 s, is no multiple of them: set loop.rate_hz, or export",
+        "has steps of 0.003 s, of which 0.002 s, the loop's period or its part by plant.own.substeps, is no multiple",
     ),
 }
 
@@ -234,25 +237,53 @@ def test_casadis_export_alone_is_for_model_exchange_and_refused_as_that(tmp_path
         FmuPlant(settings_of(fmi3(tmp_path / "me", co_simulation=False), "joints"), PERIOD)
 
 
-@pytest.mark.parametrize("status", [2, 3, 4])
+@pytest.mark.parametrize("status", [2, 3, FATAL])
 def test_a_step_that_fails_is_one_line_with_its_time_and_the_fmus_own_words(fmus: dict[str, Path], status: int) -> None:
     start = {"fails_at": 0.1, "fails_with": status}
     plant = FmuPlant(settings_of(fmus["fmi2"], start=start), PERIOD)
     with pytest.raises(FmuError) as failed:
         driven(plant, WOBBLE)
-    name = {2: "discard", 3: "error", 4: "fatal"}[status]
+    name = {2: "discard", 3: "error", FATAL: "fatal"}[status]
     assert str(failed.value) == (
         f"aero.fmu: it failed at 0.1 s: fmi2DoStep failed with status {status} ({name}): the motor burnt at 0.1 s"
     )
     plant.close()
     plant.close()
+    assert len(freed) == (status != FATAL)  # after that, FMI forbids any call
 
 
-def test_a_first_step_of_another_length_than_it_prefers_says_which(fmus: dict[str, Path]) -> None:
-    plant = FmuPlant(settings_of(fmus["fmi2"]), 0.003)
-    with pytest.raises(FmuError, match=r"no step but 0.002 s \(it prefers steps of 0.002 s, and the loop's p"):
+def test_a_library_that_cannot_be_loaded_is_one_line(fmus: dict[str, Path], tmp_path: Path) -> None:
+    broken = altered(fmus["fmi2"], tmp_path / "broken.fmu", files=(LIBRARY, "other"))
+    with ZipFile(broken, "a") as archive:
+        archive.writestr(f"binaries/{PLATFORM}/{LIBRARY}", "no library")
+    with pytest.raises(FmuError, match="broken.fmu: it does not start: Failed to load shared library") as refused:
+        FmuPlant(settings_of(broken), PERIOD)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_plant_that_is_dropped_without_close_is_freed(fmus: dict[str, Path], unpacked: Path) -> None:
+    plant = FmuPlant(settings_of(fmus["fmi2"]), PERIOD)
+    assert list(unpacked.iterdir())
+    del plant
+    gc.collect()
+    assert not list(unpacked.iterdir())
+
+
+def test_a_step_of_another_length_than_it_prefers_says_which(fmus: dict[str, Path]) -> None:
+    plant = FmuPlant(settings_of(fmus["fmi2"]), 0.004)
+    with pytest.raises(
+        FmuError,
+        match=r"0 s: .*: no step but 0.002 s \(steps are of 0.004 s, and it prefers 0.002 s: see plant.own.subs",
+    ):
         plant.advance()
     plant.close()
+
+
+def test_substeps_are_equal_communication_steps_of_a_period(fmus: dict[str, Path]) -> None:
+    """An FMU that takes only steps of 2 ms runs at 4 ms, and is then where two periods of 2 ms lead."""
+    slow = FmuPlant(settings_of(fmus["fmi2"], substeps=2), 2 * PERIOD)
+    fast = FmuPlant(settings_of(fmus["fmi2"]), PERIOD)
+    assert driven(slow, WOBBLE) == driven(fast, [volts for volts in WOBBLE for _ in range(2)])[::2]
 
 
 def test_an_fmu_that_ends_by_itself_says_when(fmus: dict[str, Path]) -> None:
@@ -313,7 +344,7 @@ def test_lab_experiment_gives_the_figures_of_our_ideal_aero(
     theirs = json.loads(capsys.readouterr().out)
     assert execute([*cell, "--set", "plant.ideal=true"]) == 0
     ours = json.loads(capsys.readouterr().out)
-    for name in FIGURES[:3]:  # compiled or frame by frame, CasADi or C: sums differ by some units in the last place
+    for name in FIGURES[:3]:  # compiled or frame by frame: sums differ by some units in the last place
         assert theirs[name] == pytest.approx(ours[name], rel=1e-9)
 
 
