@@ -1,0 +1,1 @@
+"""Plants computed by simulation engines that are optional extras."""
