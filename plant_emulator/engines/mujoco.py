@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from math import ceil, copysign, exp, isfinite, log
+from math import ceil, copysign, exp, hypot, inf, isfinite, log
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.model.sensors import NO_MEASUREMENT, Sensors, SensorSettings
@@ -22,7 +22,14 @@ from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
-_SHIPPED: Final = {path.stem: path for path in sorted((Path(__file__).parent / "models").glob("*.xml"))}
+SHIPPED: Final = {path.stem: path for path in sorted((Path(__file__).parent / "models").glob("*.xml"))}
+"""Our models, by name."""
+
+
+def _has_a_direction(attitude: Quaternion) -> Quaternion:
+    if not 0 < hypot(*attitude) < inf:
+        raise ValueError("a quaternion of any finite length but zero")
+    return attitude
 
 
 class MujocoSettings(BaseModel, extra="forbid"):
@@ -35,7 +42,7 @@ class MujocoSettings(BaseModel, extra="forbid"):
     keyframe: str | None = Field(
         default=None, description="the model's keyframe to start from; its controls are those at 0 V, else 0"
     )
-    attitude: Quaternion | None = Field(
+    attitude: Annotated[Quaternion, AfterValidator(_has_a_direction)] | None = Field(
         default=None, description="q of the body at the start [1]; for a body on a free or ball joint"
     )
     allocation: list[list[float]] | None = Field(
@@ -142,9 +149,9 @@ class MujocoPlant(Plant):
         try:
             if model.lstrip().startswith("<"):
                 return load.from_xml_string(model)
-            path = _SHIPPED.get(model, Path(model).expanduser())
+            path = SHIPPED.get(model, Path(model).expanduser())
             if not path.is_file():
-                raise PluginError(f"there is no MJCF file {model}; ours are {', '.join(_SHIPPED)}")
+                raise PluginError(f"there is no MJCF file {model}; ours are {', '.join(SHIPPED)}")
             return load.from_xml_path(str(path))
         except ValueError as error:
             said = " ".join(str(error).split())
@@ -170,9 +177,7 @@ class MujocoPlant(Plant):
             return np.eye(controls)
         widths = {len(row) for row in allocation}
         if len(allocation) != controls or len(widths) != 1 or 0 in widths:
-            raise PluginError(
-                f"allocation must have {controls} rows of equal length, one for each actuator of the MJCF"
-            )
+            raise PluginError(f"allocation needs {controls} rows of one length: the MJCF has so many actuators")
         return np.array(allocation)
 
     def _turn(self, attitude: Quaternion) -> None:

@@ -1,0 +1,339 @@
+"""MuJoCo plant: the Aero's twin agrees with ours, bodies fly through full turns, runs repeat, errors are one line.
+
+The twin is written in MuJoCo's own terms and stepped by its integrator. What differs is Coulomb friction: ours changes
+its torque smoothly within 0.01 rad/s, MuJoCo's is a constraint that holds still. So without it the two agree tightly.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from math import degrees, inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aeroloop.plant_emulator.engines.mujoco import SHIPPED, MujocoPlant, MujocoSettings, lagged
+from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
+from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
+from aeroloop.protocol.plugins import PluginError
+from aeroloop.service.config import Settings
+from aeroloop.service.lab.experiment import through_frames
+from tests.support.numpy_twin import Array
+
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
+
+PERIOD = 0.002
+DURATION = 12.0
+"""Of a run along the paper's experiment [s]: pitch and yaw each turn back once."""
+
+AERO = SHIPPED["aero"].read_text()
+SMOOTH = AERO.replace(' frictionloss="0.003040"', "").replace(' frictionloss="0.0009"', "")
+"""The Aero without Coulomb friction."""
+
+TOP = """
+<mujoco>
+  <option integrator="RK4" timestep="0.0005" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body name="arm" quat="0.8 0 0.6 0">
+      <body name="top" quat="0.6 0 0 0.8">
+        <joint type="ball"/>
+        <inertial pos="0.01 0.02 -0.03" mass="1.2" fullinertia="{inertia}"/>
+        <site name="origin"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor site="origin" gear="0 0 0 0.02 0 0.001"/>
+    <motor site="origin" gear="0 0 0 0 0.01 0"/>
+    <motor site="origin" gear="0 0 0 0.003 0 0.03"/>
+  </actuator>
+</mujoco>
+"""
+
+
+class Recorded(Plant):
+    """Passes everything on to a plant and keeps what it was given and what became of it."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.actuators = plant.actuators
+        self.voltages: list[tuple[float, ...]] = []
+        self.states: list[State] = []
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        self.voltages.append(tuple(voltages))
+        self.plant.actuate(voltages)
+
+    def advance(self) -> None:
+        self.plant.advance()
+        self.states.append(self.plant.truth())  # type: ignore[attr-defined]  # of both kinds used here
+
+    def measure(self) -> Measurement:
+        return self.plant.measure()
+
+    def close(self) -> None:
+        self.plant.close()
+
+
+def _apart(some: Sequence[State], others: Sequence[State]) -> float:
+    """The largest angle between two courses of attitudes [deg]; precise near 0, where an arc cosine is not."""
+    p, q = (np.array([state.attitude for state in states]) for states in (some, others))
+    chord = np.minimum(np.linalg.norm(p - q, axis=1), np.linalg.norm(p + q, axis=1))
+    return degrees(4 * np.arcsin(chord / 2).max())
+
+
+def _experiment(coulomb: bool, bits: int | str) -> Settings:
+    """The paper's experiment on our Aero with perfect sensors."""
+    edge = {"attitude": 1.0, "rate": 1.0, "voltage": 24.0}
+    return Settings.model_validate(
+        {
+            "plant": {
+                "friction": FrictionSettings() if coulomb else FrictionSettings(coulomb=()),
+                "sensors": IDEAL_SENSORS,
+            },
+            "wire": {signal: {"bits": bits, "limit": limit} for signal, limit in edge.items()},
+            "controller": {"after_restart": "configured"},
+        }
+    )
+
+
+def test_accelerations_of_the_aero_are_ours_at_any_state() -> None:
+    model = mujoco.MjModel.from_xml_string(SMOOTH)
+    data, ours, friction = mujoco.MjData(model), aero_dynamics(AeroSettings()), FrictionSettings()
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        pitch, yaw = rng.uniform(-3, 3, 2)
+        rates, u = rng.normal(size=2) * 3, rng.uniform(-24, 24, 2)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (yaw, pitch), rates[::-1], u
+        mujoco.mj_forward(model, data)
+        load = -np.array(friction.viscous) * rates
+        expected = np.array(ours([pitch, yaw, *rates], u, load)).ravel()[2:]
+        assert data.qacc[::-1] == pytest.approx(expected, rel=1e-9, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("coulomb", "bits", "held_deg", "closed_deg"),
+    [
+        (False, "cont", 0.003, 0.0005),  # the rotor's lag is held over a step of 1 ms
+        (False, 8, 0.01, 0.15),  # a level of the quantizers, now and then one tick earlier
+        (True, 8, 1.5, 0.5),
+    ],
+)
+def test_the_aero_follows_ours_along_the_papers_experiment(
+    coulomb: bool, bits: int | str, held_deg: float, closed_deg: float
+) -> None:
+    settings = _experiment(coulomb, bits)
+    twin = MujocoSettings(model=AERO if coulomb else SMOOTH, rotor=RotorSettings())
+
+    ours = Recorded(settings.plant.build(PERIOD))
+    figures = through_frames(settings, DURATION, plant=ours)
+
+    same_voltages = Recorded(MujocoPlant(twin, PERIOD))
+    for voltages in ours.voltages:
+        same_voltages.actuate(voltages)
+        same_voltages.advance()
+    assert _apart(ours.states, same_voltages.states) < held_deg
+
+    same_law = Recorded(MujocoPlant(twin, PERIOD))
+    other_figures = through_frames(settings, DURATION, plant=same_law)
+    assert _apart(ours.states, same_law.states) < closed_deg
+    within = 0.02 if coulomb else 0.005
+    assert other_figures.z_track == pytest.approx(figures.z_track, rel=within)
+    assert other_figures.u_total == pytest.approx(figures.u_total, rel=within)
+
+
+def test_a_top_on_a_ball_joint_is_our_free_body() -> None:
+    """An inclined joint, a start that is not the model's, a centre of mass off every axis, motors that act on two."""
+    J, m, r = np.diag([0.02, 0.03, 0.025]), 1.2, np.array([0.01, 0.02, -0.03])
+    central = J - m * (r @ r * np.eye(3) - np.outer(r, r))
+    xx, yy, zz, xy, xz, yz = (central[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+    start = (0.5, -0.5, 0.1, 0.7)
+    text = TOP.format(inertia=f"{xx} {yy} {zz} {xy} {xz} {yz}")
+    top = Recorded(MujocoPlant(MujocoSettings(model=text, body="top", attitude=start), PERIOD))
+    body = RigidBodySettings(
+        inertia=(0.02, 0.03, 0.025),
+        mass=m,
+        centre_of_mass=(0.01, 0.02, -0.03),
+        allocation=((0.02, 0.0, 0.003), (0.0, 0.01, 0.0), (0.001, 0.0, 0.03)),
+        damping=(0.0, 0.0, 0.0),
+        attitude=start,
+    )
+    free = PlantSettings(
+        kind="rigid_body",
+        rigid_body=body,
+        rotor=IDEAL_ROTOR,
+        friction=IDEAL_FRICTION,
+        sensors=IDEAL_SENSORS,
+        substeps=4,
+    )
+    ours = Recorded(free.build(PERIOD))
+    assert np.array(top.measure().attitude) == pytest.approx(np.array(ours.measure().attitude), abs=1e-12)
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        voltages = rng.uniform(-5, 5, 3)
+        for plant in (top, ours):
+            plant.actuate(voltages.tolist())
+            for _ in range(50):
+                plant.advance()
+    assert _apart(top.states, ours.states) < 1e-5
+    rates = (np.array([state.rate for state in plant.states]) for plant in (top, ours))
+    assert np.subtract(*rates) == pytest.approx(0.0, abs=1e-6)
+
+
+QUADROTOR = MujocoSettings(
+    model="quadrotor",
+    keyframe="hover",
+    allocation=[[0.0, -0.02, 0.02], [0.02, 0.0, -0.02], [0.0, 0.02, 0.02], [-0.02, 0.0, -0.02]],  # N/V
+)
+
+
+def _eased(times: Array, begin: float, end: float) -> Array:
+    """From 0 to 1, at rest at both ends."""
+    s: Array = np.clip((times - begin) / (end - begin), 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def _full_turns() -> Settings:
+    """The paper's law turns the quadrotor twice about roll, then twice about yaw."""
+    times = np.linspace(0.0, 15.0, 301)
+    attitudes = np.column_stack([720 * _eased(times, 1, 7), 0 * times, 720 * _eased(times, 8, 14)])
+    torque, drag = 2 * 0.17 * 0.02, 4 * 0.016 * 0.02
+    return Settings.model_validate(
+        {
+            "wire": {"actuators": 3, "attitude": {"bits": 10, "limit": 1.0}, "rate": {"bits": 10, "limit": 6.0}},
+            "law": {
+                "inertia": [0.00232, 0.00232, 0.004],
+                "mass": 0.5,
+                "centre_of_mass": [0, 0, 0],
+                "allocation": [[torque, 0, 0], [0, torque, 0], [0, 0, drag]],
+                "C1": [2.0, 2.0, 2.0],
+                "C2": [0.02, 0.02, 0.02],
+                "damping_estimate": [0, 0, 0],
+            },
+            "plant": {"limits": {"max_tilt_deg": 180}},
+            "reference": {"kind": "points", "times": times.tolist(), "attitudes": attitudes.tolist()},
+            "controller": {"max_reference_tilt_deg": 180, "after_restart": "configured", "max_reference_rate": 6.0},
+        }
+    )
+
+
+def test_a_free_body_flies_through_full_turns() -> None:
+    plant = Recorded(MujocoPlant(QUADROTOR, PERIOD))
+    settings = _full_turns()
+    figures = through_frames(settings, 15.0, plant=plant)
+    assert figures.max_error_deg is not None
+    assert figures.max_error_deg < 5
+    # It did turn: the quaternion returned to ±1 four times over, by way of 0.
+    scalar = np.array([state.attitude[0] for state in plant.states])
+    assert np.count_nonzero(np.diff(np.sign(scalar))) == 4
+
+
+@pytest.mark.parametrize("twin", [MujocoSettings(rotor=RotorSettings()), QUADROTOR], ids=["aero", "quadrotor"])
+def test_two_runs_are_the_same_to_the_last_bit(twin: MujocoSettings) -> None:
+    def course() -> list[Measurement]:
+        plant = MujocoPlant(twin, PERIOD)
+        voltages = np.random.default_rng(3).uniform(-10, 10, (300, plant.actuators))
+        seen = []
+        for each in voltages:
+            plant.actuate(each.tolist())
+            plant.advance()
+            seen.append(plant.measure())
+        return seen
+
+    assert course() == course()
+
+
+def test_lag_is_that_of_our_rotors() -> None:
+    rotor = RotorSettings(lag_up_s=0.1, lag_down_s=0.2)
+    rng = np.random.default_rng(4)
+    for voltage, command in rng.normal(size=(20, 2)):
+        fine, steps = voltage, 20_000
+        for _ in range(steps):
+            rising = (command - fine) * fine >= 0
+            fine += (command - fine) / (0.1 if rising else 0.2) * 0.3 / steps
+        assert lagged(rotor, voltage, command, 0.3) == pytest.approx(fine, abs=1e-4)
+
+
+def test_encoders_and_dead_zone_are_those_of_our_aero() -> None:
+    """Steps of the encoders and a dead zone, at rest: what is measured is ours to the last bit."""
+    settings = PlantSettings(rotor=RotorSettings(dead_zone_v=2.0))
+    ours = settings.build(PERIOD)
+    twin = MujocoPlant(MujocoSettings(rotor=settings.rotor, sensors=settings.sensors), PERIOD)
+    for plant in (ours, twin):
+        plant.actuate((1.9, -1.9))
+        for _ in range(200):
+            plant.advance()
+    assert twin.measure() == ours.measure()
+
+
+def test_controls_at_0_v_are_the_keyframes_and_close_goes_there() -> None:
+    """At hover the weight is carried, so nothing moves; the attitude is measured where it starts."""
+    plant = MujocoPlant(QUADROTOR.model_copy(update={"attitude": (0.0, 0.0, 0.0, 2.0)}), PERIOD)
+    plant.actuate((1.0, 2.0, 3.0))
+    plant.close()
+    plant.advance()
+    assert plant.measure() == Measurement((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+
+
+def test_a_simulation_that_diverges_measures_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo would begin anew at the start, as if nothing had happened."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    plant = MujocoPlant(MujocoSettings(model=SMOOTH.replace('damping="0.0220"', 'damping="-1e4"')), PERIOD)
+    plant.actuate((1.0, 1.0))
+    for _ in range(20):
+        plant.advance()
+    assert np.isnan(plant.measure().attitude).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"model": "no.xml"}, "there is no MJCF file no.xml; ours are aero, quadrotor"),
+        ({"model": "<mujoco><worl/></mujoco>"}, "MuJoCo refuses the MJCF given: .* 'worl', line 1"),
+        ({"model": "<mujoco/>", "body": "world"}, "the MJCF has no actuators"),
+        ({"body": "rotor"}, "the MJCF has no body 'rotor'; it has body"),
+        ({"keyframe": "start"}, "the MJCF has no keyframe 'start'; it has none with a name"),
+        ({"sensors": {"rate": "derivative"}, "joints": ["p", "yaw"]}, "no joint 'p'; it has yaw, pitch"),
+        ({"allocation": [[1.0]]}, "allocation needs 2 rows of one length"),
+        ({"allocation": [[1.0], [1.0, 2.0]]}, "allocation needs 2 rows of one length"),
+        ({"attitude": (1.0, 0.0, 0.0, 0.0)}, "attitude sets that of a body on a free or ball joint"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(changed: dict[str, object], text: str) -> None:
+    with pytest.raises(PluginError, match=text) as refused:
+        MujocoPlant(MujocoSettings.model_validate(changed), PERIOD)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0, 0.0), (inf, 0.0, 0.0, 0.0)])
+def test_an_attitude_has_a_direction(attitude: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="any finite length but zero"):
+        MujocoSettings.model_validate({"attitude": attitude})
+
+
+def test_without_mujoco_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(PluginError, match=r"not installed: pip install 'aeroloop\[mujoco\]'"):
+        MujocoPlant(MujocoSettings(), PERIOD)
+
+
+def test_a_file_and_a_smaller_step_may_be_given(tmp_path: Path) -> None:
+    """Whatever the period, steps are equal and no longer than the model's."""
+    path = tmp_path / "mine.xml"
+    path.write_text(AERO)
+    courses: list[Array] = []
+    for substeps in (None, 3, 12):
+        plant = MujocoPlant(MujocoSettings(model=str(path), substeps=substeps), 0.0025)
+        plant.actuate((5.0, 8.0))
+        for _ in range(400):
+            plant.advance()
+        courses.append(np.array(plant.measure().rate))
+    assert (courses[0] == courses[1]).all()  # 2.5 ms are three steps of less than 1 ms
+    assert courses[2] == pytest.approx(courses[1], abs=1e-4)
+    assert (courses[2] != courses[1]).any()
