@@ -76,12 +76,13 @@ class MujocoPlant(Plant):
     """
 
     Settings = MujocoSettings
+    repeatable = True
 
     def __init__(self, settings: MujocoSettings, period: float) -> None:
         try:
             self._mujoco: Any = import_module("mujoco")  # 0.3 s and 25 MB
         except ModuleNotFoundError:
-            raise PluginError("this needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
+            raise PluginError("plant.kind = 'mujoco' needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
         self._model = model = self._loaded(settings.model)
         flags = self._mujoco.mjtDisableBit
         model.opt.disableflags |= flags.mjDSBL_AUTORESET  # a state that is not finite is to be seen

@@ -136,7 +136,7 @@ def through_frames(
         duration_s: Length of the run [s].
         progress: Called once a second of the run with the time reached [s].
         watch: Called at every tick with the frames of both directions.
-        plant: Plant to control; the emulated one of the configuration if None.
+        plant: Plant to control; the configuration's if None.
         controller: Controller to run; the configuration's if None.
 
     Raises:
@@ -179,7 +179,7 @@ def through_frames(
 
 def _plant(settings: Settings) -> Plant:
     """The plant with its configured faults; faults of frames need a network."""
-    plant: Plant = settings.plant.build(settings.loop.period)
+    plant: Plant = settings.plant.make(settings.loop.period)
     if not settings.plant.faults:
         return plant
     for fault in settings.plant.parsed_faults:
