@@ -82,7 +82,9 @@ class MujocoPlant(Plant):
         try:
             self._mujoco: Any = import_module("mujoco")  # 0.3 s and 25 MB
         except ModuleNotFoundError:
-            raise PluginError("plant.kind = 'mujoco' needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
+            raise PluginError(
+                "plant.kind = 'mujoco' needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'"
+            ) from None
         self._model = model = self._loaded(settings.model)
         flags = self._mujoco.mjtDisableBit
         model.opt.disableflags |= flags.mjDSBL_AUTORESET  # a state that is not finite is to be seen
