@@ -6,6 +6,8 @@ its torque smoothly within 0.01 rad/s, MuJoCo's is a constraint that holds still
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
 from collections.abc import Sequence
 from math import degrees, inf
@@ -21,8 +23,10 @@ from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
+from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.plugins import PluginError
-from aeroloop.service.config import Settings
+from aeroloop.service.cli.show import EXAMPLES
+from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.experiment import through_frames
 from tests.support.numpy_twin import Array
 
@@ -55,6 +59,10 @@ TOP = """
   </actuator>
 </mujoco>
 """
+
+
+FLIGHT = load(EXAMPLES / "quadrotor.toml")
+QUADROTOR = MujocoSettings.model_validate(FLIGHT.plant.own)
 
 
 class Recorded(Plant):
@@ -188,55 +196,27 @@ def test_a_top_on_a_ball_joint_is_our_free_body() -> None:
     assert np.subtract(*rates) == pytest.approx(0.0, abs=1e-6)
 
 
-QUADROTOR = MujocoSettings(
-    model="quadrotor",
-    keyframe="hover",
-    allocation=[[0.0, -0.02, 0.02], [0.02, 0.0, -0.02], [0.0, 0.02, 0.02], [-0.02, 0.0, -0.02]],  # N/V
-)
-
-
-def _eased(times: Array, begin: float, end: float) -> Array:
-    """From 0 to 1, at rest at both ends."""
-    s: Array = np.clip((times - begin) / (end - begin), 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
-
-
-def _full_turns() -> Settings:
-    """The paper's law turns the quadrotor twice about roll, then twice about yaw."""
-    times: Array = np.linspace(0.0, 15.0, 301, dtype=np.float64)
-    attitudes = np.column_stack([720 * _eased(times, 1, 7), 0 * times, 720 * _eased(times, 8, 14)])
-    torque, drag = 2 * 0.17 * 0.02, 4 * 0.016 * 0.02
-    return Settings.model_validate(
-        {
-            # Half way through a turn η = √(1 − εᵀε) is 0, and as coarse as the root of a level: 1° with 14 bits.
-            "wire": {"actuators": 3, "attitude": {"bits": 14, "limit": 1.0}, "rate": {"bits": 12, "limit": 6.0}},
-            "law": {
-                "inertia": [0.00232, 0.00232, 0.004],
-                "mass": 0.5,
-                "centre_of_mass": [0, 0, 0],
-                "allocation": [[torque, 0, 0], [0, torque, 0], [0, 0, drag]],
-                "C1": [2.0, 2.0, 2.0],
-                "C2": [0.05, 0.05, 0.05],
-                "damping_estimate": [0, 0, 0],
-            },
-            "plant": {"limits": {"max_tilt_deg": 180}},
-            "reference": {"kind": "points", "times": times.tolist(), "attitudes": attitudes.tolist()},
-            "controller": {"max_reference_tilt_deg": 180, "after_restart": "configured", "max_reference_rate": 6.0},
-        }
-    )
-
-
 def test_a_free_body_flies_through_full_turns() -> None:
+    """Roll by one turn and yaw by two at once; half a turn of the error would be the wrong way round."""
     plant = Recorded(MujocoPlant(QUADROTOR, PERIOD))
-    figures = through_frames(_full_turns(), 15.0, plant=plant)
+    figures = through_frames(FLIGHT, 20.0, plant=plant)
     assert figures.max_error_deg is not None
-    assert figures.max_error_deg < 1.3  # as measured
+    assert figures.max_error_deg < 6  # at the start: the reference begins at full speed
 
+    assert isinstance(FLIGHT.reference, Sinusoid)
     times = PERIOD * np.arange(1, len(plant.states) + 1)
-    roll, yaw = (np.radians(720 * _eased(times, *leg)) / 2 for leg in ((1, 7), (8, 14)))
-    desired = np.column_stack([np.cos(roll) * np.cos(yaw), np.sin(roll), 0 * roll, np.cos(roll) * np.sin(yaw)])
+    size, speed = np.radians(FLIGHT.reference.amplitude), np.array(FLIGHT.reference.frequency)
+    roll, _, yaw = (size * np.sin(np.outer(times, speed))).T / 2
+    assert (roll.max(), yaw.max()) == pytest.approx((np.pi, 2 * np.pi), abs=1e-3)
+    turned = (
+        np.cos(roll) * np.cos(yaw),
+        np.sin(roll) * np.cos(yaw),
+        np.sin(roll) * np.sin(yaw),
+        np.cos(roll) * np.sin(yaw),
+    )
     true = np.array([state.attitude for state in plant.states])
-    assert degrees(2 * np.arccos(np.abs((desired * true).sum(axis=1)).min())) < 0.5
+    errors = 2 * np.arccos(np.abs((np.column_stack(turned) * true).sum(axis=1)))
+    assert degrees(errors[times > 2.0].max()) < 0.6
 
 
 @pytest.mark.parametrize("twin", [MujocoSettings(rotor=RotorSettings()), QUADROTOR], ids=["aero", "quadrotor"])
@@ -342,3 +322,21 @@ def test_a_file_and_a_smaller_step_may_be_given(tmp_path: Path) -> None:
     assert (courses[0] == courses[1]).all()  # 2.5 ms are three steps of less than 1 ms
     assert courses[2] == pytest.approx(courses[1], abs=1e-4)
     assert (courses[2] != courses[1]).any()
+
+
+@pytest.mark.processes
+def test_processes_in_lockstep_fly_it_as_the_experiment_does_and_both_ends_replay(tmp_path: Path) -> None:
+    """Through the network it is the same to the last bit. No slack: nothing here depends on a clock."""
+
+    def aeroloop(*words: str) -> str:
+        command = [sys.executable, "-P", "-m", "aeroloop", *words]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    run = ("--config", str(EXAMPLES / "quadrotor.toml"), "--duration", "2", "--json")
+    demo = json.loads(aeroloop("demo", "--lockstep", "--log", "flight.mcap", *run))
+    experiment = json.loads(aeroloop("lab", "experiment", *run))
+    same = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg")
+    assert [demo[name] for name in same] == [experiment[name] for name in same]
+    assert aeroloop("log", "replay", "flight.mcap").count("every tick is the same, byte for byte") == 2
