@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from math import ceil, copysign, exp, hypot, inf, isfinite, log
+from math import ceil, copysign, exp, hypot, inf, log
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BaseModel, Field
 
 from aeroloop.plant_emulator.model.rotor import RotorSettings
-from aeroloop.plant_emulator.model.sensors import NO_MEASUREMENT, Sensors, SensorSettings
+from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.plugins import PluginError
@@ -82,9 +82,7 @@ class MujocoPlant(Plant):
         try:
             self._mujoco: Any = import_module("mujoco")  # 0.3 s and 25 MB
         except ModuleNotFoundError:
-            raise PluginError(
-                "plant.kind = 'mujoco' needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'"
-            ) from None
+            raise PluginError("this needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
         self._model = model = self._loaded(settings.model)
         flags = self._mujoco.mjtDisableBit
         model.opt.disableflags |= flags.mjDSBL_AUTORESET  # a state that is not finite is to be seen
@@ -219,11 +217,7 @@ class MujocoPlant(Plant):
         self._attitude: Quaternion = (w, x, y, z)
         a, b, c, *_ = self._velocity.tolist()
         self._rate: Vector = (a, b, c)
-        if all(map(isfinite, (w, x, y, z, a, b, c))):
-            angles = self._qpos[self._joints].tolist()
-            self._measurement = self._sensors.read(self._attitude, self._rate, angles)
-        else:
-            self._measurement = NO_MEASUREMENT
+        self._measurement = self._sensors.read(self._attitude, self._rate, self._qpos[self._joints].tolist())
 
 
 def lagged(rotor: RotorSettings, voltage: float, command: float, time: float) -> float:

@@ -131,7 +131,6 @@ def test_accelerations_of_the_aero_are_ours_at_any_state() -> None:
     ("coulomb", "bits", "held_deg", "closed_deg"),
     [
         (False, "cont", 0.003, 0.0005),  # the rotor's lag is held over a step of 1 ms
-        (False, 8, 0.01, 0.15),  # a level of the quantizers, now and then one tick earlier
         (True, 8, 1.5, 0.5),
     ],
 )
@@ -246,15 +245,34 @@ def test_lag_is_that_of_our_rotors() -> None:
 
 
 def test_encoders_and_dead_zone_are_those_of_our_aero() -> None:
-    """Steps of the encoders and a dead zone, at rest: what is measured is ours to the last bit."""
-    settings = PlantSettings(rotor=RotorSettings(dead_zone_v=2.0))
+    """One motor turns both joints, the other is in its dead zone; counts are so coarse that all are ours."""
+    settings = PlantSettings(rotor=RotorSettings(dead_zone_v=2.0), friction=FrictionSettings(coulomb=()))
     ours = settings.build(PERIOD)
-    twin = MujocoPlant(MujocoSettings(rotor=settings.rotor, sensors=settings.sensors), PERIOD)
-    for plant in (ours, twin):
-        plant.actuate((1.9, -1.9))
-        for _ in range(200):
+    twin = MujocoPlant(MujocoSettings(model=SMOOTH, rotor=settings.rotor, sensors=settings.sensors), PERIOD)
+    for _ in range(500):
+        for plant in (ours, twin):
+            plant.actuate((-8.0, 1.9))
             plant.advance()
-    assert twin.measure() == ours.measure()
+        assert twin.measure() == ours.measure()
+    assert twin.measure().rate[1] < -0.1 < 0.1 < twin.measure().rate[2]
+
+
+def test_the_rate_is_that_of_the_instant_of_the_attitude() -> None:
+    """A constant torque: the rate rises evenly, and is not that before the last step."""
+    wheel = """
+    <mujoco>
+      <option integrator="implicitfast"/>
+      <worldbody>
+        <body name="body"><joint name="z" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body>
+      </worldbody>
+      <actuator><motor joint="z" gear="3"/></actuator>
+    </mujoco>
+    """
+    plant = MujocoPlant(MujocoSettings(model=wheel), PERIOD)
+    plant.actuate((4.0,))
+    for _ in range(10):
+        plant.advance()
+    assert plant.measure().rate == pytest.approx((0.0, 0.0, 4.0 * 3 / 2 * 10 * PERIOD), abs=1e-12)
 
 
 def test_controls_at_0_v_are_the_keyframes_and_close_goes_there() -> None:
@@ -286,6 +304,7 @@ def test_a_simulation_that_diverges_measures_nothing(tmp_path: Path, monkeypatch
         ({"keyframe": "start"}, "the MJCF has no keyframe 'start'; it has none with a name"),
         ({"sensors": {"rate": "derivative"}, "joints": ["p", "yaw"]}, "no joint 'p'; it has yaw, pitch"),
         ({"allocation": [[1.0]]}, "allocation needs 2 rows of one length"),
+        ({"allocation": [[], []]}, "allocation needs 2 rows of one length"),
         ({"allocation": [[1.0], [1.0, 2.0]]}, "allocation needs 2 rows of one length"),
         ({"attitude": (1.0, 0.0, 0.0, 0.0)}, "attitude sets that of a body on a free or ball joint"),
     ],
