@@ -132,15 +132,15 @@ class EventLog:
     def _event(self, address: Address, payload: bytes, at_ns: int) -> None:
         if self._is_duplicate(address.vehicle, payload, at_ns):
             return
-        event = Event.model_validate_json(payload)
+        event, role = Event.model_validate_json(payload), address.role or ""
         of_session = event.session == self._which[1]
-        repeats_a_change = event.kind == "changed" and event.role == "controller" and of_session
+        repeats_a_change = event.kind == "changed" and role == "controller" and of_session
         if address.vehicle != self._which[0] or repeats_a_change:
             return
-        if event.kind == "tripped" and (of_session or not self._alone):
+        if event.kind == "tripped" and role == "plant" and (of_session or not self._alone):
             self.trips.append(event.text)
         tick = event.tick if of_session else None
-        self._add(event.kind, event.role, event.text, tick, event.session)
+        self._add(event.kind, role, event.text, tick, event.session)
 
     def _loss(self, address: Address, payload: bytes, at_ns: int) -> None:
         if address.vehicle != self._which[0] or self._is_duplicate(address.vehicle, payload, at_ns):

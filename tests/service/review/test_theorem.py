@@ -27,6 +27,7 @@ from aeroloop.service.review.review import read, report
 from aeroloop.service.review.theorem_check import TheoremCheck
 from aeroloop.service.terminal.log_tables import review_account
 from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import coordinates
 from tests.support import numpy_twin as twin
@@ -296,7 +297,7 @@ def test_the_largest_norm_and_error_are_those_after_the_transient(tmp_path: Path
         q, omega, q_d, omega_d = (
             np.array([row]) for row in (after.attitude[i], after.rate[i], after.desired[i], rate_d)
         )
-        c = coordinates(q, omega, q_d, omega_d, after.sign[i : i + 1], np.array(settings.law.C1))
+        c = coordinates(q, omega, q_d, omega_d, after.state_next[i : i + 1, 3], np.array(with_theorem(settings).law.C1))
         norms.append(float(c.norm[0]))
     assert theorem.z_norm == pytest.approx(max(norms), rel=1e-9)
     largest = np.linalg.norm(after.attitude_error, axis=1).max()
