@@ -1,13 +1,12 @@
 """A control law of your own: PD with the body's weight, as CasADi expressions; and PID, in plain Python.
 
 aeroloop lab experiment --set law.kind=own_law:OwnLaw
-aeroloop demo --set law.kind=own_law:OwnPythonLaw --set law.integral=[0.5,0.5,0.5]
+aeroloop demo --set law.kind=own_law:OwnPythonLaw
 aeroloop op set-gains --stiffness 1.5 1.5 1.5
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -18,11 +17,11 @@ import aeroloop
 
 
 class OwnSettings(aeroloop.LawSettings):
-    """Keys of [law], beside the body's: inertia, mass, centre_of_mass, allocation. Give each its unit."""
+    """Keys of [law], with units and bounds, beside the body's: inertia, mass, centre_of_mass, allocation."""
 
     stiffness: aeroloop.Gains3 = Field(default=(1.0, 1.0, 1.0), description="torque by attitude error [N·m]")
     damping: aeroloop.Gains3 = Field(default=(0.15, 0.15, 0.15), description="torque by rate error [N·m·s/rad]")
-    integral: aeroloop.Gains3 = Field(default=(0.2, 0.2, 0.2), description="torque by its integral [N·m/s]")
+    integral: aeroloop.Gains3 = Field(default=(1.0, 1.0, 1.0), description="torque by its integral [N·m/s]")
 
 
 class OwnLaw(aeroloop.ExpressionLaw[OwnSettings]):
@@ -31,8 +30,8 @@ class OwnLaw(aeroloop.ExpressionLaw[OwnSettings]):
     Settings = OwnSettings
     gains = ("stiffness", "damping")  # an operator may change these while it runs, within the bounds of their types
 
-    def expressions(self, now: aeroloop.Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        """The voltages, and the state after this tick: this law has none."""
+    def expressions(self, now: aeroloop.Now[ca.SX]) -> tuple[ca.SX, dict[str, ca.SX]]:
+        """The voltages [V], and the named state after this tick: this law has none."""
         eta, eps = now.attitude_error[0], now.attitude_error[1:4]
         nearer = ca.if_else(eta < 0, -1, 1)  # q and −q are one attitude: turn the shorter way
         torque = -now.gains["stiffness"] * nearer * eps - now.gains["damping"] * now.rate_error
@@ -52,10 +51,9 @@ class OwnPythonLaw(aeroloop.PythonLaw[OwnSettings]):
         self.state = {"error_integral": np.zeros(3)}
 
     def step(self, now: aeroloop.Now[Any]) -> Any:
-        """The voltages. An integral of at most 1 s is the anti-windup."""
+        """The voltages [V]; the clip is the anti-windup."""
         eps = now.attitude_error[1:4] * (-1 if now.attitude_error[0] < 0 else 1)
         self.state["error_integral"] = np.clip(now.state["error_integral"] + self.period * eps, -1, 1)
-        gains = now.gains
-        torque = -gains["stiffness"] * eps - gains["damping"] * now.rate_error
-        torque -= gains["integral"] * self.state["error_integral"]
+        torque = -now.gains["stiffness"] * eps - now.gains["damping"] * now.rate_error
+        torque -= now.gains["integral"] * self.state["error_integral"]
         return aeroloop.voltages_for(self.settings, torque, self.actuators)

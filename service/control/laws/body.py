@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.interface import LawSettings
-
-X = TypeVar("X")
 
 
 def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
@@ -18,7 +16,7 @@ def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
     return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
 
 
-def voltages_for(p: LawSettings, torque: X, actuators: int) -> X:
+def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
     """The voltages whose torque B u is this, the least ones if there are several [V]. Shape (actuators,).
 
     A B of three columns serves two motors, too: they are its last two, and the first row is fictitious.
@@ -33,8 +31,7 @@ def voltages_for(p: LawSettings, torque: X, actuators: int) -> X:
     """
     B: np.ndarray[Any, Any] = check_allocation(p, actuators)
     if isinstance(torque, np.ndarray):
-        volts: Any = np.linalg.pinv(B) @ torque
-        return volts[-actuators:]  # type: ignore[no-any-return]  # an array, as the torque
+        return (np.linalg.pinv(B) @ torque)[-actuators:]
     if B.shape == (3, 3):
         return ca.solve(ca.SX(B), torque)[3 - actuators :]
     return ca.mtimes(ca.SX(np.linalg.pinv(B)), torque)
