@@ -70,7 +70,9 @@ def any_experiments(settings: Settings, rows: int, quantizers: bool = True) -> E
     """Random ones from x = 0, with damping that damps."""
     points = np.random.default_rng(3).uniform(-1, 1, (rows, 34))
     points[:, :3] = np.abs(points[:, :3])
-    return experiments(points, with_theorem(settings).law.damping_bound, 0.0, np.zeros(rows), np.full(rows, float(quantizers)))
+    return experiments(
+        points, with_theorem(settings).law.damping_bound, 0.0, np.zeros(rows), np.full(rows, float(quantizers))
+    )
 
 
 def largest(found: Attack, what: str, errors: str, *, start: bool = False) -> float:
