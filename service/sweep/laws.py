@@ -28,6 +28,7 @@ from aeroloop.service.lab.burden_grid import SENSORS
 from aeroloop.service.lab.experiment import PATH, paths
 from aeroloop.service.lab.law_margins import PUSHED_S, survives
 from aeroloop.service.lab.workers import PROCESSES, Workers
+from aeroloop.service.logs.outputs import writing
 from aeroloop.service.sweep.axes import Axis, Configuration, digest_of
 from aeroloop.service.sweep.sweep import Plan, run_sweep
 
@@ -91,6 +92,7 @@ class Laws(BaseModel):
     seeds: int
     bandwidth: list[float] = Field(description="ωₙ of the linearised attitude error of each axis, of all laws [rad/s]")
     damping_ratio: list[float] = Field(description="ζ of the same [1]")
+    period_ms: float = Field(description="time between ticks [ms]")
     within_deg: float = Field(description="bound of the attitude error in the second half, for the margins [deg]")
     margin_duration_s: float = Field(description="length of a run with delay or lost frames [s]")
     margin_at: str = Field(description="bits and sensors of these")
@@ -126,7 +128,7 @@ def compare(
     duration_s: float,
     within_deg: float = WITHIN_DEG,
 ) -> Comparison:
-    """Every combination of what is given; where nothing is, of LAWS, BITS, encoders, WINDS and PLANTS.
+    """Every combination of what is given; where nothing is, of the configured law and LAWS, BITS, encoders, WINDS and PLANTS.
 
     Args:
         settings: The configuration.
@@ -153,7 +155,7 @@ def compare(
         list(dict.fromkeys(each)) for each in (plants or PLANTS, sensors or ("encoders",), winds or WINDS, bits or BITS)
     ]
     for plant, sensor, wind, pair in product(*axes):
-        for law in dict.fromkeys(laws or LAWS):
+        for law in dict.fromkeys(laws or (settings.law.kind, *LAWS)):
             choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
             if all(choice != other for other, _ in found):
                 description = with_law_settings(load_over(settings, overrides)).description()
@@ -283,6 +285,7 @@ def run_comparison(
         seeds=plan.seeds,
         bandwidth=list(comparison.response.bandwidth),
         damping_ratio=list(comparison.response.damping),
+        period_ms=period_ms,
         within_deg=comparison.within_deg,
         margin_duration_s=PUSHED_S,
         margin_at=f"{first.bits} bits, sensors: {first.sensors}",
@@ -322,7 +325,8 @@ def with_margins(table: Path, margins: Sequence[LawMargin]) -> list[dict[str, An
         text = LawMargin.model_fields[name].description or ""
         field = pa.field(name, pa.float64(), metadata={"description": text})
         found = found.append_column(field, pa.array([getattr(of[key], name) for key in keys], pa.float64()))
-    parquet.write_table(found, table, compression="zstd")
+    with writing(table, force=True) as part:
+        parquet.write_table(found, part, compression="zstd")
     rows: list[dict[str, Any]] = found.to_pylist()
     return rows
 

@@ -52,7 +52,7 @@ def _sections(laws: Laws) -> Sections:
     plants = list(dict.fromkeys(margin.plant for margin in laws.margins))
     kinds = dict.fromkeys(margin.law for margin in laws.margins)
     of = {(margin.law, margin.plant): _margin(margin) for margin in laws.margins}
-    header = ["law", *(f"{plant}: {what}" for plant in plants for what in ("delay", "lost in a row"))]
+    header = ["law", *(f"{plant}: {what}" for plant in plants for what in ("delay", "lost"))]
     rows_of = [[law, *(text for plant in plants for text in of[law, plant])] for law in kinds]
     yield f"survives, calm, {laws.margin_at.split(',')[0]}: error within {laws.within_deg:g}°", [header, *rows_of]
 
@@ -80,7 +80,7 @@ def _notes(laws: Laws) -> Iterator[str]:
     )
     yield (
         f"{laws.duration_s:g} s each, {laws.seeds} seed{'s' * (laws.seeds > 1)}, sent on change. Settled is the "
-        f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands that act "
-        "later, or of which so many in a row never do, again and again, up to 1 s."
+        f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
+        "that act later, or of which so many in a row never do, again and again, up to 1 s."
     )
     yield f"path: {laws.path}{'' if laws.out is None else f'; all experiments: {laws.out}'}"

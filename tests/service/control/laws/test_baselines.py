@@ -5,6 +5,7 @@ Bodies, gains and motions are random, so that no term hides behind a zero or a s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -80,7 +81,7 @@ class Body:
         return np.asarray(moment / self.J)
 
 
-def along(function: Any, x: Array, h: float) -> Any:
+def along(function: Callable[[Array], Array], x: Array, h: float) -> Array:
     """A function's value at h x."""
     return function(h * x)
 
@@ -110,7 +111,7 @@ def test_at_the_reference_a_law_holds_the_weight_and_nothing_else(kind: str, mot
         assert not np.any(rest)
 
 
-POLES = {
+POLES: dict[str, Callable[[float, Array], Any]] = {
     "pd": lambda _, pair: pair,
     "lqr": lambda _, pair: pair,
     "pid": lambda wn, pair: [*pair, -wn / 10],
