@@ -21,6 +21,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
 
 ANSWER_WAIT_S: Final = 1.0
+_ANSWERS: Final[tuple[type[Grant | Refusal | Answer], ...]] = Grant, Refusal, Answer
 
 
 class SessionLostError(AeroloopError):
@@ -152,7 +153,7 @@ class ClaimClient:
             if reply.ok is None:
                 continue
             payload = reply.ok.payload.to_bytes()
-            for model in (Grant, Refusal, Answer):
+            for model in _ANSWERS:
                 with suppress(intake.IntakeError):
                     read = intake.read(model, payload, intake.REFERENCE)
                     return Refusal(reason=read.text) if isinstance(read, Answer) else read

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -196,8 +196,9 @@ def described(change: Change) -> str:
     """A change in words."""
     parts = []
     if change.gains is not None:
-        diagonals: dict[str, Any] = {name: value for name, value in change.gains if value is not None}
-        parts.append(", ".join(f"{name} = diag({', '.join(f'{x:g}' for x in xs)})" for name, xs in diagonals.items()))
+        parts.append(
+            ", ".join(f"{name} = [{', '.join(f'{x:g}' for x in xs)}]" for name, xs in change.gains.named.items())
+        )
     if change.reference is not None:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {in_words(change.reference)}{within}")

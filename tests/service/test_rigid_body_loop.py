@@ -232,12 +232,8 @@ def _explained_error(run: Run) -> Array:
     The moment d is what the law would have commanded otherwise, had it known q, ω and θ, with what the quantizer of u
     takes away and what changes while u is held.
     """
-    p, wire, slopes, period = (
-        with_theorem(run.settings).law,
-        run.settings.wire,
-        _Slopes.of(run),
-        run.settings.loop.period,
-    )
+    p, wire = with_theorem(run.settings).law, run.settings.wire
+    slopes, period = _Slopes.of(run), run.settings.loop.period
     d = (
         slopes.q * np.linalg.norm(run.q_seen - run.q, axis=1)
         + slopes.omega * _bound(wire.rate)

@@ -136,8 +136,8 @@ def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDEN
         zero,
         (0.0, 0.0),
         (0.0, 0.0),
-        1.0,
-        zero,
-        zero,
+        (0.0,) * 9,
+        (0.0, 0.0, 0.0, 1.0),
+        (0.0, 0.0, 0.0, 1.0),
     )
     return Ticks(*(np.array([column]) for column in columns))

@@ -54,7 +54,11 @@ def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     ("topic", "payload", "why"),
     [
         ("set_gains", b'{"C1": [0.3, 0.3, 300]}', "at most 20"),
-        ("set_gains", b'{"C9": [1, 1, 1]}', "Gains"),
+        ("set_gains", b'{"C9": [1, 1, 1]}', "no gain C9; it has C1, C2, Gamma"),
+        ("set_gains", b'{"C1": [0.3, 0.0, 0.3]}', "every element must be positive"),
+        ("set_gains", b'{"C2": [0.3, 0.3]}', "law.C2"),
+        ("set_gains", b'{"C2": 0.3}', "law.C2"),
+        ("set_gains", b'{"mass": 2}', "no gain mass"),
         ("set_gains", b"gains, please", "Gains"),
         ("track", b'{"reference": {"kind": "dance"}}', "Track"),
         ("track", b"", "Track"),

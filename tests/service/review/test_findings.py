@@ -51,9 +51,9 @@ def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
     assert [mark.text for mark in happened if mark.kind == "changed"] == ["configuration read again"]
     marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
     assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
-    assert "C2 = diag(0.2, 0.2, 0.2)" in marks[1][1]
+    assert "C2 = [0.2, 0.2, 0.2]" in marks[1][1]
     assert "0°, 5°, -10°" in marks[2][1]
-    assert "Gamma = diag(0.01, 0.01, 0.01)" in marks[3][1]
+    assert "Gamma = [0.01, 0.01, 0.01]" in marks[3][1]
     assert "sinusoid" in marks[3][1]
 
 

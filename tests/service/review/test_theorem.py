@@ -223,7 +223,8 @@ def block(first: int, count: int) -> Ticks:
     k, zeros, upright = np.arange(first, first + count), np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     one = np.ones(count)
     times = k, k, one, one, one
-    return Ticks(k, *times, upright, upright, zeros, zeros, zeros, zeros, zeros, zeros, one, zeros + 0.3, zeros)
+    state = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))  # θ̂, and the sign
+    return Ticks(k, *times, upright, upright, *[zeros] * 6, np.full((count, 9), 0.3), state, state)
 
 
 def trial(*changes: Change) -> TheoremCheck:
