@@ -39,7 +39,7 @@ def largest_error_deg(settings: Settings, delay: int, lost: int) -> float:
     """The largest attitude error in the second half of a run [deg]; infinite if the plant trips or the law fails."""
     loop = settings.loop
     controller = Controller(settings.wire, settings.law, settings.reference, loop.period)
-    plant = Late(settings.plant.build(loop.period), delay, lost)
+    plant = Late(settings.plant.make(loop.period), delay, lost)
     errors = [0.0]
 
     def watch(k: int, _measurement: bytes, _command: bytes) -> None:

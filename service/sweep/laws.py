@@ -37,8 +37,10 @@ BITS: Final = ("8/6", "cont/cont")
 WINDS: Final = {"calm": False, "wind": True}
 PLANTS: Final = ("aero", "rigid_body")
 WITHIN_DEG: Final = 10.0
-AS_CONFIGURED: Final = "own"
-"""Sensors and wind of a plant that has its own."""
+AS_CONFIGURED: Final = "its own"
+"""Sensors and wind of a plant that is none of ours."""
+IDEAL: Final = "ideal"
+"""Those of an ideal plant of ours: perfect sensors, no wind."""
 _MARGINS: Final = ("delay_ms", "lost_frames")
 
 
@@ -128,7 +130,9 @@ def compare(
     duration_s: float,
     within_deg: float = WITHIN_DEG,
 ) -> Comparison:
-    """Every combination of what is given; where nothing is, of the configured law and LAWS, BITS, encoders, WINDS and PLANTS.
+    """Every combination of what is given.
+
+    Where nothing is: the configured law and LAWS, BITS, encoders, WINDS, and PLANTS or a configured other plant.
 
     Args:
         settings: The configuration.
@@ -151,10 +155,9 @@ def compare(
     if wrong := [pair for pair in bits if pair.count("/") != 1]:
         raise LawsError(f"--bits takes bits out and in, such as 8/6 or cont/cont, not {wrong[0]!r}")
     found = list[tuple[Choice, Configuration]]()
-    axes = [
-        list(dict.fromkeys(each)) for each in (plants or PLANTS, sensors or ("encoders",), winds or WINDS, bits or BITS)
-    ]
-    for plant, sensor, wind, pair in product(*axes):
+    chosen = plants or (PLANTS if settings.plant.kind == PLANTS[0] else (settings.plant.kind,))
+    axes = chosen, sensors or ("encoders",), winds or WINDS, bits or BITS
+    for plant, sensor, wind, pair in product(*map(dict.fromkeys, axes)):
         for law in dict.fromkeys(laws or (settings.law.kind, *LAWS)):
             choice, overrides = _chosen(settings, Choice(law, pair, sensor, wind, plant))
             if all(choice != other for other, _ in found):
@@ -182,13 +185,16 @@ def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]
     plant, body = changes["plant"], settings.law
     if choice.plant not in PLANTS:
         choice = choice._replace(sensors=AS_CONFIGURED, wind=AS_CONFIGURED)
+        changes["wire"]["actuators"] = _motors(settings, choice.plant)
+    elif settings.plant.ideal:
+        choice = choice._replace(sensors=IDEAL, wind=IDEAL)
+        plant["sensors"], plant["wind"] = {}, {}
     else:
         plant["sensors"] = dict(SENSORS[choice.sensors].changes)
         plant["wind"] = {"blowing": WINDS[choice.wind]}
     if choice.plant == "rigid_body":
-        joints = plant["sensors"]
-        rate = "perfect" if joints["rate"] == "derivative" else joints["rate"]
-        plant["sensors"] = {**joints, "attitude": "perfect", "rate": rate}
+        rate = plant["sensors"].get("rate", "perfect")
+        plant["sensors"] |= {"attitude": "perfect", "rate": "perfect" if rate == "derivative" else rate}
         choice = choice._replace(sensors={"encoders": "perfect"}.get(choice.sensors, choice.sensors))
         if settings.plant.kind != "rigid_body":
             body = body.model_copy(update={"allocation": three_motors(body.allocation)})
@@ -197,6 +203,13 @@ def _chosen(settings: Settings, choice: Choice) -> tuple[Choice, tuple[str, ...]
             changes["wire"]["actuators"] = 3
     law = _law(settings, choice.law, body)
     return choice, tuple(as_overrides({**changes, "law": law}))
+
+
+def _motors(settings: Settings, kind: str) -> int:
+    """Motors of a plant of one's own. Raises PluginError or PlantError if it cannot be made."""
+    plant = load_over(settings, [f"plant.kind={kind}"]).plant.make(settings.loop.period)
+    plant.close()
+    return plant.actuators
 
 
 def _bits(text: str) -> int | str:
@@ -309,7 +322,7 @@ def _pushed(comparison: Comparison) -> Iterator[tuple[Choice, tuple[str, ...]]]:
     for choice, configuration in zip(comparison.choices, comparison.plan.found, strict=True):
         if (choice.law, choice.plant) not in seen:
             seen.add((choice.law, choice.plant))
-            calm = ("plant.wind.blowing=false",) if choice.plant in PLANTS else ()
+            calm = ("plant.wind.blowing=false",) if choice.wind in WINDS else ()
             yield choice, (*configuration.overrides, *calm)
 
 

@@ -12,7 +12,7 @@ from aeroloop.service.lab.tables import markdown_table
 from aeroloop.service.sweep.laws import LawMargin, LawRow, Laws
 from aeroloop.service.terminal.console import Console
 
-_HEADER = ["law", "z_track, 10⁻⁴ s", "u_total, V²·s", "largest", "settled", "changes/s", "kbit/s"]
+_HEADER = ["law", "z_track 10⁻⁴ s", "u_total V²·s", "largest", "settled", "changes/s", "kbit/s"]
 Sections = Iterator[tuple[str, list[list[str]]]]
 
 
@@ -22,7 +22,7 @@ def laws_table(laws: Laws) -> None:
     for title, (header, *rows) in _sections(laws):
         table = Table(title=Text(title), title_justify="left", title_style="italic", box=None, pad_edge=False)
         for i, name in enumerate(header):
-            table.add_column(name, justify="right" if i else "left", min_width=11 if i == 0 else None)
+            table.add_column(name, justify="right" if i else "left", min_width=0 if i else 11, no_wrap=not i)
         failed = [row for row in rows if len(row) == 2]
         for row in rows:
             if row not in failed:

@@ -91,14 +91,7 @@ def test_silence_is_computed_as_the_frame_that_was_not_sent_would_be() -> None:
         changed = k in (0, 7, 30)
         yaw = 0.1 if k < 7 else 0.3 if k < 30 else -0.2
         assert sparse.tick(measurement(k, yaw) if changed else SILENCE, k) == periodic.tick(measurement(k, yaw), k)
-<<<<<<< HEAD
-        assert (sparse.voltages, sparse.law_state["damping_estimate"]) == (
-            periodic.voltages,
-            periodic.law_state["damping_estimate"],
-        )
-=======
         assert (sparse.voltages, sparse.law_state) == (periodic.voltages, periodic.law_state)
->>>>>>> main
         assert (sparse.tick_index, sparse.counter) == (k, k % COUNTERS)
 
 

@@ -111,7 +111,7 @@ def test_at_the_reference_a_law_holds_the_weight_and_nothing_else(kind: str, mot
         assert not np.any(rest)
 
 
-POLES: dict[str, Callable[[float, Array], Any]] = {
+POLES: dict[str, Callable[[float, Any], Any]] = {
     "pd": lambda _, pair: pair,
     "lqr": lambda _, pair: pair,
     "pid": lambda wn, pair: [*pair, -wn / 10],
