@@ -5,6 +5,8 @@ Bodies, gains and motions are random, so that no term hides behind a zero or a s
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -44,12 +46,12 @@ class Body:
 
     def __init__(self, kind: str, rng: np.random.Generator, **fields: Any) -> None:
         B = (rng.normal(size=(3, 3)) + 3 * np.eye(3)) / 10  # well away from singular
-        body = LawSettings(
+        body = OwnLawSettings(
             kind=kind,
             inertia=tuple(rng.uniform(0.5, 2, 3)),
             mass=rng.uniform(0.5, 2),
             centre_of_mass=tuple(rng.normal(size=3)),
-            allocation=tuple(map(tuple, B.tolist())),
+            allocation=B.tolist(),
         )
         self.response = Response(tuple(rng.uniform(1, 3, 3)), tuple(rng.uniform(0.75, 1.5, 3)))
         known = {"damping_estimate": tuple(rng.uniform(0, 0.1, 3))}
@@ -59,7 +61,7 @@ class Body:
         self.function = law_function(law)
         self.gains = [value for gain in configured_gains(law).values() for value in gain]
         self.state = np.array([value for values in initial_state(law).values() for value in values])
-        self.J, self.B, self.theta = np.array(self.p.inertia), B, np.array(self.p.damping_estimate)
+        self.J, self.B, self.theta = np.array(self.p.inertia), B, np.array(known["damping_estimate"])
 
     def law(self, q: Array, omega: Array, q_d: Array, omega_d: Array, omega_d_dot: Array, state: Array) -> Any:
         """Torque B u and the next state."""
@@ -77,6 +79,11 @@ class Body:
         gravity = np.cross(p.centre_of_mass, weight)
         moment = torque + gravity - np.cross(omega, self.J * omega) - self.theta * omega
         return np.asarray(moment / self.J)
+
+
+def along(function: Callable[[Array], Array], x: Array, h: float) -> Array:
+    """A function's value at h x."""
+    return function(h * x)
 
 
 def slope_of(value: Any, h: float = 1e-6) -> Any:
@@ -104,7 +111,7 @@ def test_at_the_reference_a_law_holds_the_weight_and_nothing_else(kind: str, mot
         assert not np.any(rest)
 
 
-POLES = {
+POLES: dict[str, Callable[[float, Any], Any]] = {
     "pd": lambda _, pair: pair,
     "lqr": lambda _, pair: pair,
     "pid": lambda wn, pair: [*pair, -wn / 10],
@@ -135,7 +142,7 @@ def test_near_the_reference_each_axis_has_the_poles_of_the_tuning_rule(kind: str
             return np.array([x[1], body.omega_dot(q, omega, torque)[axis], *further])
 
         one_by_one = np.eye(2 + bool(extra))
-        A = np.column_stack([slope_of(lambda h, x=x: derivative(h * x)) for x in one_by_one])
+        A = np.column_stack([slope_of(partial(along, derivative, x)) for x in one_by_one])
         wn, zeta = response.bandwidth[axis], response.damping[axis]
         pair = np.roots([1, 2 * zeta * wn, wn**2])
         expected = POLES.get(kind, POLES["pd"])(wn, pair)
@@ -235,7 +242,8 @@ def test_where_a_motor_saturates_the_integral_gives_way_and_else_it_does_not() -
         for _ in range(1000):
             answer = function(last=IDENTITY, state=state, gains=gains, eps=[0, 0.18, 0.18], **turned)
             state = answer["state_next"]
-        return np.array(state).ravel()[1:] * np.array(law.settings.ki)
+        integral: Array = np.array(state).ravel()[1:] * np.array(law.settings.ki)
+        return integral
 
     bounded, endless = held(0.2), held(1e9)
     assert (endless[1:] > 1.5).all()  # N·m, where the motors have 0.05 and 0.08
@@ -261,7 +269,8 @@ def test_without_adaptation_the_voltages_are_the_papers_with_its_first_estimate(
 
 
 BODY = (
-    "plant.kind=rigid_body", "plant.limits.max_tilt_deg=180", "plant.rigid_body.damping=[0.0, 0.0070, 0.0095]", "wire.actuators=3",
+    "plant.kind=rigid_body", "plant.limits.max_tilt_deg=180", "wire.actuators=3",
+    "plant.rigid_body.damping=[0.0, 0.0070, 0.0095]",
     "plant.rigid_body.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "law.centre_of_mass=[0, 0, 0]",
     "law.allocation=[[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]", "reference.amplitude=[300, 40, 300]",
     "reference.frequency=[0.1, 0.13, 0.08]",
