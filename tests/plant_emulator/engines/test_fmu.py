@@ -118,6 +118,14 @@ def test_start_values_are_the_fmus_parameters(fmus: dict[str, Path], mapping: st
     assert np.abs(theirs - ours).max() < 1e-12
 
 
+def test_until_the_first_command_its_voltages_are_zero_whatever_it_starts_with(fmus: dict[str, Path]) -> None:
+    started, still = (FmuPlant(settings_of(fmus["fmi2"], start=start), PERIOD) for start in ({"u2": 5.0}, {}))
+    for plant in (started, still):
+        plant.advance()
+        plant.close()
+    assert started.truth() == still.truth()
+
+
 def test_angles_in_degrees_are_angles(fmus: dict[str, Path]) -> None:
     radians, degrees = (
         FmuPlant(settings_of(fmus["fmi3"], "joints", angle_unit=angle, rate_unit=rate), PERIOD)
@@ -352,14 +360,19 @@ def test_lab_experiment_gives_the_figures_of_our_ideal_aero(
         assert theirs[name] == pytest.approx(ours[name], rel=1e-9)
 
 
-def test_an_fmu_that_fails_in_the_loop_ends_it_with_its_own_words(
-    configuration: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
+def test_an_fmu_that_fails_in_the_loop_ends_it_with_its_own_words_and_is_closed(
+    configuration: Callable[[str], Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    closed: list[FmuPlant] = []
+    close = FmuPlant.close
+    monkeypatch.setattr(FmuPlant, "close", lambda plant: (closed.append(plant), close(plant)))
     failing = ["--set", "plant.own.start.fails_at=0.5", "--set", "plant.own.start.fails_with=3"]
     assert execute(["lab", "experiment", "--duration", "2", "--config", str(configuration("fmi2")), *failing]) == 1
-    said = capsys.readouterr().err
-    assert "the motor burnt at 0.5 s" in said
-    assert said.count("\n") == 1
+    assert capsys.readouterr().err == (
+        "aeroloop: FmuPlant failed in advance(): aero.fmu: it failed at 0.5 s: fmi2DoStep failed with status 3 (error): "
+        "the motor burnt at 0.5 s\n"
+    )
+    assert len(closed) == 1
 
 
 @pytest.mark.processes
