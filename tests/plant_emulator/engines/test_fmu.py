@@ -365,12 +365,17 @@ def test_an_fmu_that_fails_in_the_loop_ends_it_with_its_own_words_and_is_closed(
 ) -> None:
     closed: list[FmuPlant] = []
     close = FmuPlant.close
-    monkeypatch.setattr(FmuPlant, "close", lambda plant: (closed.append(plant), close(plant)))
+
+    def noted(plant: FmuPlant) -> None:
+        closed.append(plant)
+        close(plant)
+
+    monkeypatch.setattr(FmuPlant, "close", noted)
     failing = ["--set", "plant.own.start.fails_at=0.5", "--set", "plant.own.start.fails_with=3"]
     assert execute(["lab", "experiment", "--duration", "2", "--config", str(configuration("fmi2")), *failing]) == 1
     assert capsys.readouterr().err == (
-        "aeroloop: FmuPlant failed in advance(): aero.fmu: it failed at 0.5 s: fmi2DoStep failed with status 3 (error): "
-        "the motor burnt at 0.5 s\n"
+        "aeroloop: FmuPlant failed in advance(): aero.fmu: it failed at 0.5 s: fmi2DoStep failed with status 3 (error):"
+        " the motor burnt at 0.5 s\n"
     )
     assert len(closed) == 1
 
