@@ -5,7 +5,7 @@ This is the only module that selects the parts of a plant.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -21,6 +21,7 @@ from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySetting
 from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.own_plant import EMULATED, PlantError, own_plant
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.plant_emulator.quanser_settings import QuanserSettings
 from aeroloop.protocol.wire.loop import WATCHDOG_S
@@ -34,8 +35,15 @@ class PlantSettings(BaseModel, extra="forbid"):
         description="the plant: emulated, a node on the CAN bus of [can], Quanser's USB board, or a fake of that board "
         "with an emulated Aero",
     )
-    kind: Literal["aero", "rigid_body"] = Field(
-        default="aero", description="the body; rotor, friction, wind and sensors act on either"
+    kind: str = Field(
+        default="aero",
+        min_length=1,
+        description="which plant: the emulated bodies aero and rigid_body, on which rotor, friction, wind and sensors "
+        "act; mujoco or fmu; an entry point of aeroloop.plants; or package.module:Class of your own. Faults, limits, "
+        "watchdog and voltage_limit act on any",
+    )
+    own: dict[str, Any] = Field(
+        default={}, description="settings of a plant that is neither aero nor rigid_body: those of its class"
     )
     ideal: bool = Field(
         default=False,
@@ -53,7 +61,7 @@ class PlantSettings(BaseModel, extra="forbid"):
     )
     truth_rate_hz: float = Field(default=10.0, ge=0, le=10_000, description="publish the true state this often [Hz]")
     voltage_limit: float = Field(default=24.0, gt=0, description="largest voltage of the supply [V]")
-    substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period")
+    substeps: int = Field(default=2, ge=1, le=100, description="Runge–Kutta steps a period of an emulated body")
     faults: list[str] = Field(
         default=[],
         max_length=MAX_FAULTS,
@@ -91,6 +99,15 @@ class PlantSettings(BaseModel, extra="forbid"):
         return [Fault.parse(text) for text in self.faults]
 
     @model_validator(mode="after")
+    def _parts_belong_to_the_kind(self) -> PlantSettings:
+        names = ("own",) if self.emulated else _OF_EMULATED
+        for name in names:
+            if getattr(self, name) != type(self).model_fields[name].default:
+                where = "a plant of another kind" if self.emulated else f"the kinds {' and '.join(EMULATED)}"
+                raise ValueError(f"plant.{name} is for {where}, and plant.kind is {self.kind!r}: leave it out")
+        return self
+
+    @model_validator(mode="after")
     def _sensors_fit_the_body(self) -> PlantSettings:
         needs_joints = self.sensors.attitude == "encoders" or self.sensors.rate == "derivative"
         if self.kind == "rigid_body" and needs_joints and not self.ideal:
@@ -110,16 +127,35 @@ class PlantSettings(BaseModel, extra="forbid"):
         return self.model_copy(update={**parts, "sensors": IDEAL_SENSORS, "ideal": False})
 
     @property
-    def actuators(self) -> int:
-        """Number of motors of the emulated plant."""
-        return RigidBody.actuators if self.kind == "rigid_body" else Aero.actuators
+    def emulated(self) -> bool:
+        """Whether the plant is one of our bodies, and so known by its equations."""
+        return self.kind in EMULATED
+
+    @property
+    def actuators(self) -> int | None:
+        """Number of motors of an emulated body; None for any other plant, whose class knows."""
+        return {"aero": Aero.actuators, "rigid_body": RigidBody.actuators}.get(self.kind)
 
     def mechanism(self) -> Mechanism:
-        """The body, of `effective` settings."""
+        """The emulated body, of `effective` settings. Raises PlantError for any other plant."""
+        if not self.emulated:
+            raise PlantError(
+                f"this needs a plant whose equations are known, plant.kind = {' or '.join(map(repr, EMULATED))}, "
+                f"and it is {self.kind!r}"
+            )
         return RigidBody(self.rigid_body) if self.kind == "rigid_body" else Aero(self.aero)
 
+    def make(self, period: float) -> Plant:
+        """Make the plant of this kind; `advance` lets one `period` pass [s].
+
+        Raises:
+            PluginError: There is no class of the name in `kind`.
+            PlantError: It cannot be made of `own`.
+        """
+        return self.build(period) if self.emulated else own_plant(self.kind, self.own, period, self.voltage_limit)
+
     def build(self, period: float) -> EmulatedPlant:
-        """Build the emulated plant; `advance` integrates one `period` [s]."""
+        """Build the emulated plant; `advance` integrates one `period` [s]. Raises PlantError for any other kind."""
         parts = self.effective
         mechanism = parts.mechanism()
         return EmulatedPlant(
@@ -142,6 +178,9 @@ class PlantSettings(BaseModel, extra="forbid"):
         """Build the guard. A motor is saturated at the supply's limit or at the outermost quantizer level [V]."""
         return Guard(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
 
+
+_OF_EMULATED = ("ideal", "substeps", "aero", "rigid_body", "rotor", "friction", "wind", "sensors")
+"""Settings that act on an emulated body only."""
 
 IDEAL_AERO = AeroSettings(centre_of_mass=(0.0, 0.0, -0.0038), damping=(0.0, 0.0071, 0.0220))
 IDEAL_ROTOR = RotorSettings(lag_up_s=0.0, lag_down_s=0.0)

@@ -100,11 +100,15 @@ def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, A
     known = {_variable(key): key for key, _ in Shapes(model).every_key()} if given else {}
     tree: dict[str, Any] = {}
     for name, text in sorted(given.items()):
-        variable, _, option = name.upper().partition(_OPTIONS)
-        if option:
-            merge(tree, {"can": {"options": {option.lower(): _value(text)}}})
+        variable = name.upper()
+        section = next((free for free in _FREE if variable.startswith(_variable(f"{free}."))), None)
+        if section is not None:
+            option = variable.removeprefix(_variable(f"{section}.")).lower().replace("__", ".")
+            _put(tree, f"{section}.{option}", _value(text))
         elif variable in known:
             _put(tree, known[variable], _value(text))
+        elif variable.startswith(_variable("law.")):  # of a user's law, whose names have the case they are written in
+            _put(tree, f"law.{name[len(_variable('law.')) :]}", _value(text))
         else:
             found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
             hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"
@@ -116,8 +120,8 @@ def _variable(key: str) -> str:
     return ENV_PREFIX + key.upper().replace(".", "__")
 
 
-_OPTIONS: Final = _variable("can.options.")
-"""What follows it names an option of the CAN interface; any may be given."""
+_FREE: Final = ("can.options", "plant.own")
+"""Sections in which any key may be given: its name in lower case."""
 
 
 def _put(tree: dict[str, Any], key: str, value: Any) -> None:

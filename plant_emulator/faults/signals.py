@@ -157,7 +157,7 @@ class FaultyPlant(Plant):
         self, plant: Plant, faults: Sequence[Fault], period: float, *, voltage_limit: float, seed: int = 0
     ) -> None:
         self.plant = plant
-        self.actuators = plant.actuators
+        self.actuators, self.paces = plant.actuators, plant.paces
         self._period, self._limit, self._seed = period, voltage_limit, seed
         self._started = False
         self._ticks = 0
@@ -229,6 +229,7 @@ class FaultyPlant(Plant):
             self.actuate(self._commanded)  # a motor also fails and recovers while a voltage is held
         self._actuated = False
         self.plant.advance()
+        self.passed = self.plant.passed
         self._ticks += self._started
         self._seen = None
         if self._sensors:

@@ -13,6 +13,7 @@ from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.endpoint.front import Front
+from aeroloop.plant_emulator.own_plant import PlantError
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
@@ -61,7 +62,11 @@ class Driver:
         )
 
     def run(self, front: Front) -> None:
-        """Run until `stop` is set; then close the plant at 0 V and leave the network."""
+        """Run until `stop` is set or the plant fails; then close the plant at 0 V and leave the network.
+
+        Raises:
+            PlantError: A plant of one's own failed; the loop has tripped and says so.
+        """
         self._front = front
         front.serve()
         try:
@@ -69,9 +74,14 @@ class Driver:
                 self._run_lockstep()
             else:
                 self._run_real_time()
+        except PlantError as error:
+            self.endpoint.stop(TripCause.PLANT, str(error))
+            raise
         finally:
-            self._plant.close()
-            front.leave()
+            try:
+                self._plant.close()
+            finally:
+                front.leave()
 
     def reconfigure(self, settings: PlantSettings) -> None:
         """Apply the settings that can change between two ticks: limits and watchdog."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.endpoint.front import Front
 from aeroloop.plant_emulator.endpoint.tenancy import Notice
 from aeroloop.plant_emulator.faults.language import Fault
@@ -19,7 +18,6 @@ from aeroloop.plant_emulator.faults.signals import FaultyPlant
 from aeroloop.plant_emulator.faults.streams import FaultyStream
 from aeroloop.plant_emulator.hosts.driver import Driver
 from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import FaultStatus, Truth
@@ -31,40 +29,31 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 
-def truth_of(plant: EmulatedPlant, endpoint: Endpoint) -> Truth:
-    """The present true state, with the tick of the measurement taken of it."""
-    state, session = plant.truth(), endpoint.session
-    return Truth(
-        tick=endpoint.ticked,
-        attitude=state.attitude,
-        rate=state.rate,
-        voltages=state.voltages,
-        session=session,
-        session_tick=None if session is None else endpoint.session_tick,
-    )
-
-
 class FaultError(AeroloopError):
     """A fault that cannot be injected; one line that says why."""
 
 
 class Emulator(Driver):
-    """The emulator, for any network.
+    """The emulator, for any network: of our bodies, or of the plant that `plant.kind` names.
 
     Raises:
-        ValueError: A fault of a motor that the plant does not have.
+        PluginError, PlantError: There is no such plant, or it cannot be made.
+        ValueError: A fault of a motor that the plant does not have, or another number of motors than the wire's.
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
-        self._emulated = settings.build(loop.period)
         limit, seed = settings.voltage_limit, settings.fault_seed
-        self._faulty = FaultyPlant(self._emulated, (), loop.period, voltage_limit=limit, seed=seed)
-        super().__init__(self._faulty, loop, wire, settings, stop)
+        self._faulty = FaultyPlant(settings.make(loop.period), (), loop.period, voltage_limit=limit, seed=seed)
         self._measurements = FaultyStream("measurement", (), seed)
         self._commands = FaultyStream("command", (), seed)
         self._schedule = Schedule(loop.period)
-        self._add(settings.parsed_faults, "configured")
         self._session: str | None = None
+        try:
+            super().__init__(self._faulty, loop, wire, settings, stop)
+            self._add(settings.parsed_faults, "configured")
+        except ValueError:
+            self._faulty.close()  # it may be a machine
+            raise
 
     def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
         """Add faults with start and end counted from now; if `clear`, remove all others first.
@@ -97,6 +86,18 @@ class Emulator(Driver):
         """Status of every fault."""
         ticks = self._faulty.ticks
         return self._schedule.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
+
+    def truth(self) -> Truth | None:
+        """The present true state, with the tick of the measurement taken of it; None where the plant knows none."""
+        state, session = self._faulty.plant.truth(), self.endpoint.session
+        return state and Truth(
+            tick=self.endpoint.ticked,
+            attitude=state.attitude,
+            rate=state.rate,
+            voltages=state.voltages,
+            session=session,
+            session_tick=None if session is None else self.endpoint.session_tick,
+        )
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Tick the plant end, and note the faults that began or ended."""
@@ -170,8 +171,8 @@ class EmulatorOnZenoh(Emulator):
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         echo = super()._tick(arrival, k)
-        if self._truth_every and k % self._truth_every == 0:
-            self._role.publish("truth", truth_of(self._emulated, self.endpoint))
+        if self._truth_every and k % self._truth_every == 0 and (truth := self.truth()) is not None:
+            self._role.publish("truth", truth)
         if self._steps is not None:
             self._steps -= 1
         return echo

@@ -18,9 +18,11 @@ from pydantic import BaseModel, Field
 from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.own_plant import class_of
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.trace import NEVER, Batch, Operation, Sent
+from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
@@ -50,8 +52,16 @@ class PlantReplayed(BaseModel, frozen=True):
 
 
 def why_not(plant: PlantSettings) -> str | None:
-    """Why a plant cannot be replayed; None if it can."""
-    return None if plant.via == "emulator" else f"plant.via is {plant.via!r}: only an emulated plant is computed again"
+    """Why a plant cannot be replayed; None if it can. Of a plant that is no body of ours this imports the class."""
+    if plant.via != "emulator":
+        return f"plant.via is {plant.via!r}: only an emulated plant is computed again"
+    if plant.emulated:
+        return None
+    try:
+        found = class_of(plant.kind)
+    except PluginError as error:
+        return str(error)
+    return None if found.repeatable else f"{found.__name__} (plant.kind) does not state that it is `repeatable`"
 
 
 class PlantReplay:

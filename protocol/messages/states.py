@@ -47,6 +47,7 @@ class TripCause(StrEnum):
     BUS = "bus lost"
     NODE = "node lost"
     DUPLICATE = "another plant of this name"
+    PLANT = "plant failed"
 
     @property
     def number(self) -> int:

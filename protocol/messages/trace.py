@@ -25,7 +25,7 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
 from aeroloop.protocol.messages.operator import Change, Message
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -207,7 +207,7 @@ def read_header(payload: bytes) -> Header | None:
     version, end, flags, *figures, name = _HEADER.unpack_from(payload)
     actuators, measurement, command = figures[:3]
     session = _name(name)
-    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or actuators not in (2, 3):
+    if version != PROTOCOL_VERSION or end >= len(ENDS) or flags & ~_FINAL or not 1 <= actuators <= MAX_ACTUATORS:
         return None
     if session is None or not measurement or not command:
         return None

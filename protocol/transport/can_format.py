@@ -74,7 +74,7 @@ class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
 
 def check_widths(settings: CanSettings, wire: WireSpec) -> None:
     """Raise CanError if a frame does not fit the bus, with what would fit."""
-    longest = 64 if settings.fd else CLASSIC_BYTES
+    longest = FD_LENGTHS[-1] if settings.fd else CLASSIC_BYTES
     for name, frame, signals in (
         ("measurement", wire.measurement, "wire.attitude.bits and wire.rate.bits"),
         ("command", wire.command, "wire.voltage.bits"),
@@ -83,10 +83,13 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
             continue
         sizes = {n: FrameFormat([n] * len(frame.widths), wire.counter_bits).size for n in range(MIN_BITS, MAX_BITS + 1)}
         widest = max(bits for bits, size in sizes.items() if size <= longest)
-        ways = ["set can.fd = true", f"{signals} to {widest} at the most"]
+        ways = [f"{signals} to {widest} at the most"]
+        if not settings.fd and frame.size <= FD_LENGTHS[-1]:
+            ways.insert(0, "set can.fd = true")
         if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
             ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
-        problem = f"a {name} frame has {frame.size} bytes, and a classic CAN frame holds {CLASSIC_BYTES}"
+        bus = "CAN FD" if settings.fd else "classic CAN"
+        problem = f"a {name} frame has {frame.size} bytes, and a {bus} frame holds {longest}"
         raise CanError(f"{problem}: {', or '.join(ways)}")
 
 

@@ -126,8 +126,7 @@ def _measured(wire: WireSpec) -> list[_Quantity]:
 
 
 def _commanded(wire: WireSpec) -> list[_Quantity]:
-    numbers = (2, 3) if wire.actuators == 2 else (1, 2, 3)  # the Aero's two are the paper's u₂ and u₃
-    return [_Quantity(f"u{i}", "V", f"Command u{i}.", wire.voltage) for i in numbers]
+    return [_Quantity(f"u{i}", "V", f"Command u{i}.", wire.voltage) for i in wire.motors]
 
 
 def _message(

@@ -17,6 +17,8 @@ from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS, Continuous, Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.transmit import Transmit
 
+MAX_ACTUATORS: Final = 8
+
 
 def bits_or_continuous(value: object) -> object:
     """The word "cont" stands for no quantization in configuration (TOML has no null)."""
@@ -99,7 +101,12 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         default=SignalSpec(bits=8, limit=1.0), description="ω, angular velocity, body frame [rad/s]"
     )
     voltage: SignalSpec = Field(default=SignalSpec(bits=6, limit=24.0), description="u, the command [V]")
-    actuators: Literal[2, 3] = Field(default=2, description="2: the Aero's u₂ and u₃; 3: a free rigid body's u₁…u₃")
+    actuators: int = Field(
+        default=2,
+        ge=1,
+        le=MAX_ACTUATORS,
+        description="number of motors: 2 for the Aero's u₂ and u₃, n for u₁…uₙ of any other plant",
+    )
     transmit: Transmit = Field(default=Transmit(), description="when frames are sent")
     counter_bits: int = Field(
         default=DEFAULT_COUNTER_BITS,
@@ -115,8 +122,13 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
 
     @cached_property
     def command(self) -> FrameFormat:
-        """Format of a command frame: u₂ u₃, or u₁ u₂ u₃."""
+        """Format of a command frame: u₁…uₙ, or u₂ u₃ if there are two."""
         return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
+
+    @property
+    def motors(self) -> range:
+        """Numbers of the motors, as in u₁: of two they are the paper's 2 and 3, else they begin at 1."""
+        return range(2, 4) if self.actuators == 2 else range(1, self.actuators + 1)
 
     def freshness_ns(self, period_ns: int) -> int:
         """Lateness at which a frame may be taken for a newer one: 2^counter_bits periods [ns]."""

@@ -23,7 +23,7 @@ from aeroloop.service.cli.common import (
     checked,
     fail,
     guarded,
-    settings_of,
+    loop_of,
     show,
     with_bits_of,
 )
@@ -46,7 +46,7 @@ def experiment(
     overrides: Overrides = None,
 ) -> None:
     """Run the closed loop in this process, in lockstep, without a network."""
-    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     from aeroloop.service.lab.experiment import experiment_figures
     from aeroloop.service.terminal.display import figures_table, progress_bar
 
@@ -68,7 +68,7 @@ def tables(
     overrides: Overrides = None,
 ) -> None:
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     _check_engine(engine)
     from aeroloop.service.lab.tables import markdown as as_markdown
     from aeroloop.service.lab.tables import markdown_table, predict
@@ -90,7 +90,7 @@ def tables(
 @group.command()
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     from aeroloop.service.lab.calibrate import calibrate
     from aeroloop.service.terminal.display import calibration_table, count_bar
 
@@ -152,7 +152,7 @@ def certify(
     overrides: Overrides = None,
 ) -> None:
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
-    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     if margins:
         if late:
             fail("--margins finds the largest --late: leave one of them out", 2)
@@ -223,7 +223,7 @@ def attack(
     overrides: Overrides = None,
 ) -> None:
     """Search, as an adversary, for a run of the paper's body that breaks the certificate; exit 1 if one is found."""
-    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     _check_engine(engine)
     from aeroloop.service.terminal.attack_table import attack_table
 
@@ -273,7 +273,7 @@ def burden(
     overrides: Overrides = None,
 ) -> None:
     """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     from aeroloop.service.lab.burden import measure_burden
     from aeroloop.service.lab.burden_grid import grid
     from aeroloop.service.lab.burden_table import burden_table
@@ -324,7 +324,7 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds, and write a table of their figures."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     _check_engine(engine)
     from aeroloop.service.sweep.axes import parse_axes
     from aeroloop.service.sweep.sweep import plan, rows_file, run_sweep

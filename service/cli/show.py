@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from aeroloop.service.cli.common import Config, Overrides, fail, settings_of
+from aeroloop.service.cli.common import Config, Overrides, checked, fail, settings_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -21,7 +22,13 @@ def show_config(
     overrides: Overrides = None,
 ) -> None:
     """Print the effective configuration as TOML, each key with what it means, its unit and its bounds."""
-    typer.echo(settings_of(config, overrides).toml(comments=not bare), nl=False)
+    from aeroloop.protocol.plugins import PluginError
+    from aeroloop.service.config import with_law_settings
+
+    settings = settings_of(config, overrides)
+    with checked(), suppress(PluginError):  # a class that is not on this host: its keys as they are written
+        settings = with_law_settings(settings)
+    typer.echo(settings.toml(comments=not bare), nl=False)
 
 
 @group.command()
@@ -55,7 +62,7 @@ def layout(
 
     from aeroloop.service.viewers.layout import layout as describe
 
-    typer.echo(describe(settings.vehicle, settings.wire.actuators))
+    typer.echo(describe(settings.vehicle, settings.wire.motors))
 
 
 @group.command()

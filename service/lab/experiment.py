@@ -139,7 +139,7 @@ def through_frames(
         duration_s: Length of the run [s].
         progress: Called once a second of the run with the time reached [s].
         watch: Called at every tick with the frames of both directions.
-        plant: Plant to control; the emulated one of the configuration if None.
+        plant: Plant to control; the configuration's if None.
         controller: Controller to run; the configuration's if None.
 
     Raises:
@@ -166,6 +166,8 @@ def through_frames(
         command = controller.tick(measurement, k)
         if command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
+            if controller.fault is not None:
+                trips = [controller.fault]
             raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
             score.error(k, controller.attitude_error, sent=measurement != SILENCE)
@@ -182,7 +184,7 @@ def through_frames(
 
 def _plant(settings: Settings) -> Plant:
     """The plant with its configured faults; faults of frames need a network."""
-    plant: Plant = settings.plant.build(settings.loop.period)
+    plant: Plant = settings.plant.make(settings.loop.period)
     if not settings.plant.faults:
         return plant
     for fault in settings.plant.parsed_faults:

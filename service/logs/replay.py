@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
+from aeroloop.plant_emulator.own_plant import PlantError
 from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import ENDS, Batch, End, Sent, read_batch
@@ -177,7 +178,11 @@ class Plants:
             if (why := why_not(settings.plant)) is not None:
                 self._reason = why
                 return
-            self._replays[source] = PlantReplay(settings.loop, settings.wire, settings.plant)
+            try:
+                self._replays[source] = PlantReplay(settings.loop, settings.wire, settings.plant)
+            except PlantError as error:
+                self._reason = str(error)
+                return
         self._replays[source].feed(batch)
 
     def results(self) -> tuple[list[PlantReplayed], str | None]:

@@ -62,7 +62,7 @@ class Group(NamedTuple):
 
 def groups(wire: WireSpec, period: float, law: Law[Any]) -> list[Group]:
     """Every column of the table, in order, by how frames were quantized, the time between ticks [s], and the law."""
-    motors = [str(i) for i in range(4 - wire.actuators, 4)]
+    motors = list(map(str, wire.motors))
     outermost = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
     return [
         _group("tick", "", "tick k of the law", lambda rows: rows.ticks.k, kind="int64"),

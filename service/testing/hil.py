@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import Condition
 from typing import Any, Final, Self
@@ -23,13 +23,15 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.protocol.messages.operator import Advance, Answer, Gains, Hold, Inject, Message, Reference, Request, Track
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, as_overrides, load
 from aeroloop.service.host.operator import send, stop
 from aeroloop.service.points_file import read_points
 from aeroloop.service.testing.hil_log import HilError as HilError
 from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
+
+PLANTS: Final = ("emulator", "can", "can-node", "quanser", "quanser-fake")
+"""Plant ends by name; any other name is of a plant, which the emulator runs."""
 
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
 PATIENCE_S: Final = 30.0
@@ -44,7 +46,8 @@ class Hil:
     Args:
         folder: Folder of the logs.
         lockstep: Whether `run` counts steps instead of seconds.
-        plant: The plant end: a value of `plant.via`, or can-node for an emulated node on a private bus.
+        plant: The plant end: a value of `plant.via`; can-node for an emulated node on a private bus; any other value of
+            `plant.kind`, such as package.module:Class, for the emulator with that plant.
         config: TOML file to start from, unless `start` names another.
     """
 
@@ -52,7 +55,8 @@ class Hil:
         self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
     ) -> None:
         self._folder = folder
-        self._via = plant.replace("can-node", "can")
+        self._kind = None if plant in PLANTS else plant
+        self._via = "emulator" if self._kind else plant.replace("can-node", "can")
         self._private_bus = plant == "can-node"
         self._config = config
         self._lockstep = lockstep
@@ -99,6 +103,7 @@ class Hil:
             "loop.lockstep": self._lockstep,
             "plant.steps_on_request": self._lockstep and self._via == "emulator",
             "plant.via": self._via,
+            **({"plant.kind": self._kind} if self._kind else {}),
         }
         overrides = as_overrides(ours) + as_overrides(settings or {})  # a later one wins
         loaded = load(Path(config) if config else self._config, overrides)
@@ -185,9 +190,9 @@ class Hil:
         followed = read_points(reference) if isinstance(reference, Path) else reference
         return self._operate("track", self._made(Track, reference=followed, within_s=within_s))
 
-    def set_gains(self, *, C1: Vector | None = None, C2: Vector | None = None, Gamma: Vector | None = None) -> str:
-        """Change the law's gains, as `aeroloop op set-gains`; None keeps one. Returns and raises as `arm`."""
-        return self._operate("set_gains", self._made(Gains, C1=C1, C2=C2, Gamma=Gamma))
+    def set_gains(self, **gains: float | Sequence[float]) -> str:
+        """Change gains of the law by name, as `aeroloop op set-gains`. Returns and raises as `arm`."""
+        return self._operate("set_gains", self._made(Gains, **gains))
 
     def kill(self, role: RoleName) -> None:
         """Kill a role with SIGKILL."""

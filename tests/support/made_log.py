@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from unittest.mock import patch
 
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
+from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
@@ -248,8 +248,8 @@ def made(
             measurement = emulator.tick(arrival.frame if arrival else None, k)
             assert measurement is not None, endpoint.notices
             trace.row(endpoint, measurement, arrival, plant_clock.monotonic_ns())
-            if truth_every and k % truth_every == 0:
-                messages.add("truth", truth_of(emulator._emulated, endpoint).encode(), plant_clock, "plant")
+            if truth_every and k % truth_every == 0 and (truth := emulator.truth()) is not None:
+                messages.add("truth", truth.encode(), plant_clock, "plant")
             if k % 100 == 0 and (injected or settings.plant.faults):
                 publish(k)
             arrival = None

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from unittest.mock import patch
 
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.hosts.emulator import Emulator, truth_of
+from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Gains, Hold
@@ -125,8 +125,9 @@ class World(Link):
             if endpoint.outcome is Outcome.ACTED and arrival is not None:
                 known.acted[endpoint.answered] = arrival.at_ns
             if session_tick % 10 == 0:
-                truth = truth_of(self.emulator._emulated, endpoint).encode()
-                known.messages.add("truth", truth, self._plant_clock, "plant")
+                truth = self.emulator.truth()
+                assert truth is not None
+                known.messages.add("truth", truth.encode(), self._plant_clock, "plant")
         done_ns = now_ns + self.takes(100_000)
         self._due_ns = max(tick + 1, -(-done_ns // self._period_ns)) * self._period_ns
 

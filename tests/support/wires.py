@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, SignalSpec, WireSpec
 
 COUNTER_BITS = range(4, 17)
 
@@ -42,6 +42,6 @@ specs = st.builds(
     attitude=signals(),
     rate=signals(),
     voltage=signals(),
-    actuators=st.sampled_from([2, 3]),
+    actuators=st.integers(1, MAX_ACTUATORS),
     counter_bits=any_counter_bits,
 )

@@ -17,7 +17,8 @@
 The equations without quantization, (C.16)–(C.23), are the same expressions with unquantized arguments; where the paper
 repeats an equation for its quantized form, the line carries both numbers. That (C.25) follows from them is proved in
 tests/service/control/laws/test_adaptive.py. Received values are within the bounds (C.28) and (C.29) of the true ones;
-errors are (C.31), (C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the bound (C.30).
+errors are (C.31), (C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the
+bound (C.30).
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ def equations(p: AdaptiveSettings, actuators: int = 3, given: Mapping[str, ca.SX
     z2 = omega_e - alpha  # (C.19), (C.40)
     alpha_bar = -s / 2 * C1 @ (eta_e * I + S(eps_e)) @ omega_e  # (C.46), for α̇ (Remark 6)
 
-    g = gravity_torque(p, q)  # (C.45)
+    g = -gravity_torque(p, q)  # (C.45)
     Psi = -S(omega) @ (J @ omega) - g  # (C.43)
     Phi = ca.diag(-omega)  # (C.44)
     u = voltages_for(

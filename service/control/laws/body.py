@@ -9,13 +9,11 @@ from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.interface import LawSettings
 
-BodySettings = LawSettings
-
 
 def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
-    """g of (C.45): torque of the weight about the origin at attitude q, body frame [N·m]. Shape (3,)."""
+    """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,)."""
     weight = ca.vertcat(0, 0, -p.mass * p.gravity)
-    return -S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
+    return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
 
 
 def voltages_for(p: LawSettings, torque: ca.SX, actuators: int) -> ca.SX:

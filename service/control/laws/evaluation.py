@@ -72,7 +72,7 @@ def law_of_many(law: ExpressionLaw[Any], rows: int) -> ca.Function:
 
     Returns:
         A function with the inputs of `law_function`: `last` and `state` are those before the first tick, all others
-        have a row per tick. Its outputs: q, u, state_next, eps_e, omega_e, and state_used, which each u was computed with.
+        have a row per tick. Its outputs: q, u, state_next, eps_e, omega_e, and state_used, from which u was computed.
     """
     parts = _parts(law)
     given = {

@@ -122,7 +122,7 @@ class Law(ABC, Generic[S]):
         self.actuators = actuators
 
     @classmethod
-    def certify(cls, configured: Any) -> Mapping[str, Any] | None:
+    def certify(cls, configured: Any) -> Mapping[str, Any] | None:  # noqa: ARG003  # for those that override it
         """What is proven of a configuration with this law: `holds` and `verdict`, with whatever else; None if nothing.
 
         Args:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import CanError, CanSettings, Heartbeat, check_widths, fingerprint
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
 from tests.support.can_in_process import PAPER
 from tests.support.wires import wire_of
 
@@ -44,16 +44,18 @@ def test_causes_are_numbered_as_in_the_specification() -> None:
         "bus lost",
         "node lost",
         "another plant of this name",
+        "plant failed",
     ]
-    assert [TripCause(cause).number for cause in causes] == list(range(1, 12))
+    assert [TripCause(cause).number for cause in causes] == list(range(1, 13))
     said = [Heartbeat(PlantState.TRIPPED, number, MARK).cause for number in range(16)]
-    assert said == [None, *causes, None, None, None, None]
+    assert said == [None, *causes, None, None, None]
 
 
 WIDTHS = st.one_of(st.none(), st.integers(MIN_BITS, MAX_BITS))
 ADVICE = re.compile(
-    r"a (?P<frame>\w+) frame has (?P<size>\d+) bytes, and a classic CAN frame holds 8: set can\.fd = true, "
-    r"or wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
+    r"a (?P<frame>\w+) frame has (?P<size>\d+) bytes, and a (?P<bus>classic CAN|CAN FD) frame holds \d+: "
+    r"(?P<fd>set can\.fd = true, or )?"
+    r"wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
     r"(?P<shorter>, or wire\.counter_bits = 4 with can\.short_counter = true)?$"
 )
 
@@ -73,18 +75,25 @@ def _size(frame: str, bits: dict[str, int | None], actuators: int, counter_bits:
 
 @settings(max_examples=60)
 @given(
-    attitude=WIDTHS, rate=WIDTHS, voltage=WIDTHS, actuators=st.sampled_from([2, 3]), counted=st.sampled_from([4, 8, 16])
+    attitude=WIDTHS,
+    rate=WIDTHS,
+    voltage=WIDTHS,
+    actuators=st.integers(1, MAX_ACTUATORS),
+    counted=st.sampled_from([4, 8, 16]),
 )
 def test_a_spec_that_does_not_fit_is_refused_with_the_widths_that_would(
     attitude: int | None, rate: int | None, voltage: int | None, actuators: int, counted: int
 ) -> None:
     bits = {"attitude": attitude, "rate": rate, "voltage": voltage}
-    assert _refusal(wire_of(**bits, actuators=actuators, counter_bits=counted), fd=True) is None
+    on_fd = _refusal(wire_of(**bits, actuators=actuators, counter_bits=counted), fd=True)
+    assert (on_fd is not None) == (_size("command", bits, actuators, counted) > 64)  # eight doubles
+    assert on_fd is None or "can.fd" not in on_fd
     while (said := _refusal(wire_of(**bits, actuators=actuators, counter_bits=counted), fd=False)) is not None:
         advice = ADVICE.match(said)
         assert advice is not None, said
         frame, size, widest = advice["frame"], int(advice["size"]), int(advice["widest"])
         assert _size(frame, bits, actuators, counted) == size > 8
+        assert (advice["fd"] is not None) == (size <= 64)
         assert (advice["shorter"] is not None) == (_size(frame, bits, actuators, 4) <= 8)
         signals = [name for name in (advice["first"], advice["second"]) if name is not None]
         bits |= dict.fromkeys(signals, widest)

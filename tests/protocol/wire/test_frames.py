@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.frames import FrameFormat
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
 from tests.support.wires import COUNTER_BITS, any_counter_bits, wire_of, wires
 
 Widths = tuple[int | None, ...]
@@ -28,7 +28,7 @@ def formats() -> Iterator[FrameFormat]:
     for first in WIDTHS:
         for second in WIDTHS:
             yield wire_of(first, second, 6).measurement
-        for actuators in (2, 3):
+        for actuators in range(1, MAX_ACTUATORS + 1):
             yield wire_of(8, 8, first, actuators).command
     for counter_bits in COUNTER_BITS:
         for width in (2, 8, None):
