@@ -39,7 +39,7 @@ class OwnLawSettings(LawSettings):
 
 def _tag(section: Any) -> str:
     kind = section.get("kind", "adaptive") if isinstance(section, dict) else getattr(section, "kind", "")
-    return kind if kind in BUILT_IN else _OWN
+    return kind if isinstance(kind, str) and kind in BUILT_IN else _OWN
 
 
 _MODELS: Final = {
