@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from hashlib import sha256
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
 from pathlib import Path
 from traceback import extract_tb
 from typing import Any, Final, TypeVar
@@ -73,6 +74,16 @@ def _loaded(said: str, point: EntryPoint) -> Any:
     except AttributeError:
         classes = ", ".join(name for name, value in vars(module).items() if isinstance(value, type))
         raise PluginError(f"{said}: {point.module} has no {point.attr}; its classes are {classes or 'none'}") from None
+
+
+def source_of(plugin: type[Any]) -> str:
+    """Which source a class is of: its file and the file's SHA-256, and its distribution's version if it has one."""
+    module = sys.modules[plugin.__module__]
+    file = getattr(module, "__file__", None)
+    named = [f"{Path(file).name} sha256:{sha256(Path(file).read_bytes()).hexdigest()[:16]}"] if file else []
+    for name in packages_distributions().get(plugin.__module__.partition(".")[0], []):
+        named.append(f"{name} {version(name)}")
+    return ", ".join(named) or "unknown"
 
 
 def own_words(error: BaseException) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, create_model, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
@@ -25,7 +25,8 @@ from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
 from aeroloop.service.config_sources import merge, sources, tree_of
 from aeroloop.service.config_text import toml
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.registry import BUILT_IN, LawSection, own_settings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
 from aeroloop.service.vehicle_address import VehicleAddress
@@ -63,7 +64,9 @@ class Settings(VehicleAddress):
     loop: LoopSettings = Field(default=LoopSettings(), description="tick grid and process set-up of both ends")
     wire: WireSpec = Field(default=WireSpec(), description="quantizers and frames, on which both ends must agree")
     reference: OneReference = Field(default=Sinusoid(), description="attitude to follow over time")
-    law: LawSettings = Field(default=LawSettings(), description="model of the plant and gains of the law")
+    law: SerializeAsAny[LawSection] = Field(
+        default=AdaptiveSettings(), description="which law, its model of the plant and its gains"
+    )
     controller: ControllerSettings = Field(default=ControllerSettings(), description="the controller daemon")
     plant: PlantSettings = Field(default=PlantSettings(), description="the plant end: plant, sensors, faults, limits")
     can: CanSettings = Field(default=CanSettings(), description="the CAN bus, for plant.via = 'can'")
@@ -116,7 +119,23 @@ class Settings(VehicleAddress):
 
     def toml(self, *, comments: bool = False) -> str:
         """The effective configuration as a TOML file that loads to the same, if wanted with a comment on every key."""
-        return toml(self.description(), Shapes(type(self)) if comments else None)
+        if not comments:
+            return toml(self.description())
+        model: type[BaseModel] = type(self)
+        if self.law.kind not in BUILT_IN:  # whose keys only its own model explains
+            law = Field(default=..., description=model.model_fields["law"].description)
+            model = create_model("Settings", __base__=model, law=(type(self.law), law))
+        return toml(self.description(), Shapes(model))
+
+
+def with_law_settings(settings: Settings) -> Settings:
+    """The configuration with a user's law as its own model has it, defaults included; for what runs the law.
+
+    Raises:
+        PluginError: There is no such law.
+        LawError: Its settings are wrong.
+    """
+    return settings.model_copy(update={"law": own_settings(settings.law)})
 
 
 def load(file: Path | None = None, overrides: Sequence[str] = ()) -> Settings:

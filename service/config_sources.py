@@ -17,6 +17,10 @@ ENV_PREFIX: Final = "AEROLOOP_"
 """Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
 
 
+BODY: Final = ("inertia", "mass", "gravity", "centre_of_mass", "allocation")
+"""The model of the plant in `[law]`, which all laws have."""
+
+
 class ConfigError(AeroloopError):
     """The configuration is wrong; one line with the key and its allowed values."""
 
@@ -53,13 +57,13 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
-    """Put the values of one tree into another. A reference of another kind replaces the one that is there."""
+    """Put the values of one tree into another. A reference or a law of another kind replaces the one that is there."""
     value: Any
     present: Any
     for name, value in changes.items():
         present = tree.get(name)
-        # A reference of another kind has other keys; the kinds of a quantizer share theirs.
-        other_kind = name == "reference" and isinstance(value, dict) and "kind" in value
+        # A reference or a law of another kind has other keys; the kinds of a quantizer share theirs.
+        other_kind = name in ("reference", "law") and isinstance(value, dict) and "kind" in value
         if (
             isinstance(value, dict)
             and isinstance(present, dict)
@@ -67,7 +71,8 @@ def merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
         ):
             merge(present, value)
         else:
-            tree[name] = value
+            same = {key: present[key] for key in BODY if key in present} if other_kind and name == "law" else {}
+            tree[name] = {**same, **value} if same else value
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -102,6 +107,8 @@ def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, A
             _put(tree, f"{section}.{option}", _value(text))
         elif variable in known:
             _put(tree, known[variable], _value(text))
+        elif variable.startswith(_variable("law.")):  # of a user's law, whose names have the case they are written in
+            _put(tree, f"law.{name[len(_variable('law.')) :]}", _value(text))
         else:
             found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
             hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"

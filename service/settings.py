@@ -49,6 +49,12 @@ class ControllerSettings(BaseModel, extra="forbid"):
         "gains of the vehicle's last session and, unless an operator stopped it, its reference; configured: those of "
         "the configuration, and after a trip those of the session before",
     )
+    law_timeout_s: float = Field(
+        default=0.1,
+        gt=0,
+        le=10,
+        description="stop commanding, as faulted, after a tick of the law that takes longer; not in lockstep [s]",
+    )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is on the network")
     require_certificate: bool = Field(
         default=False,

@@ -57,7 +57,7 @@ class SessionRecord(Message):
 
     controller: str
     session: str | None = Field(description="null: none runs, and the next one begins so")
-    gains: Gains = Field(description="all three")
+    gains: Gains = Field(description="all of the law")
     gains_from: Source
     reference: Reference = Field(description="a hold without attitude: the attitude that the session finds")
     reference_from: Source
@@ -200,6 +200,7 @@ class Tenure(BaseModel, extra="ignore"):
     process: str
     session: str | None = None
     cause: str | None = None
+    datagrams: str = ""
 
 
 class Telemetry(Message):
@@ -211,9 +212,11 @@ class Telemetry(Message):
     attitude_error: tuple[float, float, float] = Field(description="ε̃ of the quantized attitude [1]")
     rate_error: tuple[float, float, float] = Field(description="ω_e of the quantized rates, body frame [rad/s]")
     desired: tuple[float, float, float, float] = Field(description="q_d [1]")
-    damping_estimate: tuple[float, float, float] = Field(description="θ̂ [N·m·s/rad]")
+    state: dict[str, tuple[float, ...]] = Field(
+        description="the law's named state after the tick; of the paper's: damping_estimate, θ̂ [N·m·s/rad], and sign, "
+        "of the equilibrium approached, z₁₊ or z₁₋"
+    )
     voltages: tuple[float, ...] = Field(description="u before quantization [V]")
-    sign: int = Field(description="the equilibrium approached, z₁₊ or z₁₋")
 
 
 class Truth(Message):

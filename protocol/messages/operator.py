@@ -6,15 +6,18 @@ rate and acceleration never jump.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite, pi
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
+    StringConstraints,
     model_serializer,
     model_validator,
 )
@@ -51,16 +54,6 @@ def _finite(triple: Vector) -> Vector:
         raise ValueError("every element must be a number")
     return triple
 
-
-def _gain(gains: Vector) -> Vector:
-    if min(gains) <= 0 or max(gains) > MAX_GAIN:
-        raise ValueError(f"every element must be positive and at most {MAX_GAIN:g}")
-    return gains
-
-
-MAX_GAIN: Final = 20.0
-Gain = Annotated[Vector, AfterValidator(_finite), AfterValidator(_gain)]
-"""Diagonal of a positive definite gain matrix; bounded, so that no typing error makes it a hundred times too large."""
 
 Angles = Annotated[Vector, AfterValidator(_finite)]
 """Roll, pitch, yaw [deg]."""
@@ -141,12 +134,57 @@ class Setpoint(Message):
     attitude: Angles = Field(description="roll, pitch, yaw [deg]")
 
 
-class Gains(Message):
-    """The law's gains, each the diagonal of its matrix. What is null stays as it is."""
+MAX_GAINS: Final = 32
+"""The most gains of a law, and numbers of a gain."""
 
-    C1: Gain | None = Field(default=None, description="of the attitude error [1/s]")
-    C2: Gain | None = Field(default=None, description="of the rate error [N·m·s/rad]")
-    Gamma: Gain | None = Field(default=None, description="of the adaptation [N·m·s²/rad² per s]")
+
+def _numbers(gain: Any) -> Any:
+    return (gain,) if isinstance(gain, int | float) else gain
+
+
+def _all_finite(gain: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(isfinite(value) for value in gain):
+        raise ValueError("every element must be a number")
+    return gain
+
+
+Gain = Annotated[
+    tuple[float, ...],
+    Field(min_length=1, max_length=MAX_GAINS),
+    BeforeValidator(_numbers, json_schema_input_type=float | tuple[float, ...]),
+    AfterValidator(_all_finite),
+]
+"""The numbers of a gain; a single one may stand without brackets."""
+
+
+class Gains(Message, extra="allow"):
+    """Gains of the law by name, such as C1, C2 and Gamma of the paper's. One left out, or null, stays as it is.
+
+    The law of the session bounds them, and has no others.
+    """
+
+    __pydantic_extra__: dict[Annotated[str, StringConstraints(max_length=64)], Gain | None]
+
+    if TYPE_CHECKING:
+
+        def __init__(self, **gains: float | Sequence[float] | None) -> None: ...
+
+        def __getattr__(self, name: str) -> tuple[float, ...] | None: ...
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Gains:
+        if len(self.named) > MAX_GAINS:
+            raise ValueError(f"a law has {MAX_GAINS} gains at the most")
+        return self
+
+    @property
+    def named(self) -> dict[str, tuple[float, ...]]:
+        """The gains given, by name."""
+        return {name: gain for name, gain in (self.__pydantic_extra__ or {}).items() if gain is not None}
+
+    def over(self, before: Gains) -> Gains:
+        """These gains, and those of `before` that are not given here."""
+        return Gains.model_validate(before.named | self.named)
 
 
 class Request(Message):

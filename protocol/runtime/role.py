@@ -119,6 +119,7 @@ class Role:
         self._throttle = Throttle()
         self._long = Throttle(LONG_S)
         self._started = time.monotonic()
+        self.own_versions: dict[str, str] = {}  # of a user's classes that it runs, for its description
         self.publish_description(config)
         key = topics.key("description", vehicle, role=role)
         self.answer(key, lambda query: query.reply(key, self._description))
@@ -192,7 +193,7 @@ class Role:
             role=self.role,
             vehicle=self.vehicle,
             host=socket.gethostname(),
-            versions=versions(),
+            versions=versions() | self.own_versions,
             facts=host_facts(),
             config=config,
             freshness_s=freshness_s,

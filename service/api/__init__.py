@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from aeroloop.plant_emulator.plant import Measurement as Measurement
     from aeroloop.plant_emulator.plant import Plant as Plant
+    from aeroloop.plant_emulator.plant import State as State
     from aeroloop.protocol.errors import AeroloopError as AeroloopError
     from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer as HysteresisQuantizer
     from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer as LogarithmicQuantizer
@@ -34,6 +35,15 @@ if TYPE_CHECKING:
     from aeroloop.research import run_experiment as run_experiment
     from aeroloop.service.config import Settings as Settings
     from aeroloop.service.control.controller import Controller as Controller
+    from aeroloop.service.control.laws.body import gravity_torque as gravity_torque
+    from aeroloop.service.control.laws.body import voltages_for as voltages_for
+    from aeroloop.service.control.laws.interface import ExpressionLaw as ExpressionLaw
+    from aeroloop.service.control.laws.interface import Gain as Gain
+    from aeroloop.service.control.laws.interface import Gains3 as Gains3
+    from aeroloop.service.control.laws.interface import LawSettings as LawSettings
+    from aeroloop.service.control.laws.interface import Now as Now
+    from aeroloop.service.control.laws.interface import PositiveGain as PositiveGain
+    from aeroloop.service.control.laws.interface import PythonLaw as PythonLaw
     from aeroloop.service.figures import Figures as Figures
     from aeroloop.service.logs.ticks import Ticks as Ticks
     from aeroloop.service.testing.hil import Hil as Hil
@@ -43,22 +53,32 @@ _HOMES: Final = {
     "AeroloopError": "aeroloop.protocol.errors",
     "Certificate": "aeroloop.service.theorem.certificate",
     "Controller": "aeroloop.service.control.controller",
+    "ExpressionLaw": "aeroloop.service.control.laws.interface",
     "Figures": "aeroloop.service.figures",
+    "Gain": "aeroloop.service.control.laws.interface",
+    "Gains3": "aeroloop.service.control.laws.interface",
     "Hil": "aeroloop.service.testing.hil",
     "HysteresisQuantizer": "aeroloop.protocol.wire.hysteresis",
+    "LawSettings": "aeroloop.service.control.laws.interface",
     "LogarithmicQuantizer": "aeroloop.protocol.wire.logarithmic",
     "Measurement": "aeroloop.plant_emulator.plant",
+    "Now": "aeroloop.service.control.laws.interface",
     "Plant": "aeroloop.plant_emulator.plant",
+    "PositiveGain": "aeroloop.service.control.laws.interface",
+    "PythonLaw": "aeroloop.service.control.laws.interface",
     "RecordedRun": "aeroloop.research",
     "Settings": "aeroloop.service.config",
     "SignalSpec": "aeroloop.protocol.wire.spec",
+    "State": "aeroloop.plant_emulator.plant",
     "Ticks": "aeroloop.service.logs.ticks",
     "UniformQuantizer": "aeroloop.protocol.wire.quantizer",
     "WireSpec": "aeroloop.protocol.wire.spec",
     "certify": "aeroloop.research",
+    "gravity_torque": "aeroloop.service.control.laws.body",
     "load_settings": "aeroloop.research",
     "read_run": "aeroloop.research",
     "run_experiment": "aeroloop.research",
+    "voltages_for": "aeroloop.service.control.laws.body",
 }
 """Module of each public name. Names load on first use: `import aeroloop` stays light, and so does every command."""
 

@@ -16,7 +16,9 @@ from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.bench.item import Figure, in_turns
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import law_function
+from aeroloop.service.control.laws.evaluation import law_function
+from aeroloop.service.control.laws.interface import ExpressionLaw
+from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.control.reference import reference_function
 from aeroloop.service.lab.experiment import run_experiment
 
@@ -39,7 +41,9 @@ def tick(quick: bool) -> Figure:
 
 def bare_tick(settings: Settings) -> Tick:
     """Unpack, both functions, pack; the codes are not used."""
-    law, reference = Compiled(law_function(settings.law, settings.loop.period)), Compiled(reference_function())
+    law = law_of(settings.law, settings.loop.period, settings.wire.actuators)
+    assert isinstance(law, ExpressionLaw)
+    evaluate_law, reference = Compiled(law_function(law)), Compiled(reference_function())
     attitude, rate, voltage, counter = (
         settings.wire.attitude.bits,
         settings.wire.rate.bits,
@@ -52,7 +56,7 @@ def bare_tick(settings: Settings) -> Tick:
     def tick(frame: bytes, _: int) -> object:
         values = measured.unpack(frame)
         reference()
-        law()
+        evaluate_law()
         return command.pack(values[0], 1, 2)
 
     return tick

@@ -134,6 +134,14 @@ def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str
     return reloadable(config, overrides, *more)[0]
 
 
+def loop_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
+    """As `settings_of`, for what runs the law: its class is found and has checked its settings."""
+    from aeroloop.service.config import with_law_settings
+
+    with checked():
+        return with_law_settings(settings_of(config, overrides, *more))
+
+
 def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleAddress:
     """Vehicle and network of the effective configuration; a configuration error ends the command."""
     from aeroloop.service.vehicle_address import load_vehicle_address

@@ -23,7 +23,7 @@ from aeroloop.service.cli.common import (
     checked,
     fail,
     guarded,
-    settings_of,
+    loop_of,
     show,
     with_bits_of,
 )
@@ -46,7 +46,7 @@ def experiment(
     overrides: Overrides = None,
 ) -> None:
     """Run the closed loop in this process, in lockstep, without a network."""
-    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     from aeroloop.service.lab.experiment import experiment_figures
     from aeroloop.service.terminal.display import figures_table, progress_bar
 
@@ -68,7 +68,7 @@ def tables(
     overrides: Overrides = None,
 ) -> None:
     """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     _check_engine(engine)
     from aeroloop.service.lab.tables import markdown as as_markdown
     from aeroloop.service.lab.tables import markdown_table, predict
@@ -90,7 +90,7 @@ def tables(
 @group.command()
 def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
     """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     from aeroloop.service.lab.calibrate import calibrate
     from aeroloop.service.terminal.display import calibration_table, count_bar
 
@@ -152,7 +152,7 @@ def certify(
     overrides: Overrides = None,
 ) -> None:
     """Print what is proven of the configuration, what that assumes, and what fails; exit 1 unless all of it holds."""
-    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     if margins:
         if late:
             fail("--margins finds the largest --late: leave one of them out", 2)
@@ -223,7 +223,7 @@ def attack(
     overrides: Overrides = None,
 ) -> None:
     """Search, as an adversary, for a run of the paper's body that breaks the certificate; exit 1 if one is found."""
-    settings = with_bits_of(settings_of(config, overrides), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
     _check_engine(engine)
     from aeroloop.service.terminal.attack_table import attack_table
 
@@ -273,7 +273,7 @@ def burden(
     overrides: Overrides = None,
 ) -> None:
     """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     from aeroloop.service.lab.burden import measure_burden
     from aeroloop.service.lab.burden_grid import grid
     from aeroloop.service.lab.burden_table import burden_table
@@ -292,6 +292,102 @@ def burden(
 
         with _new_file(figure, config, force) as part:
             draw_burden(result, part)
+
+
+@group.command()
+def laws(
+    law: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="A kind of law: ours, an entry point, or package.module:Class; may be repeated; ours if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    bits: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OUT/IN",
+            help="Bits of ε and ω, and of u; may be repeated; 8/6 and cont/cont if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); may be repeated; encoders "
+            "if left out. A free body has no encoders: perfect.",
+            show_default=False,
+        ),
+    ] = None,
+    wind: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="calm or wind; may be repeated; both if left out.", show_default=False),
+    ] = None,
+    plant: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="aero, rigid_body (a free body like it, with three motors), or a plant of your own, as plant.kind "
+            "takes it; may be repeated; the first two if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    within: Annotated[
+        float,
+        typer.Option(
+            metavar="DEG", min=0.1, max=180, help="Error up to which delay and lost frames count as survived."
+        ),
+    ] = 10.0,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Runs of each combination, with seeds of wind and sensors from 0 up.")
+    ] = 1,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.parquet",
+            help="Table of all experiments. Rows are kept in FILE.jsonl: the same command goes on there.",
+            show_default=False,
+        ),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="Draw the laws beside each other: a .png, .svg or .pdf file.", show_default=False),
+    ] = None,
+    force: Force = False,
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Compare control laws, tuned alike: error, effort, chatter, bits, and the delay and loss that each survives."""
+    settings = loop_of(config, overrides)
+    _check_engine(engine)
+    from aeroloop.service.sweep.laws import compare, run_comparison
+    from aeroloop.service.sweep.sweep import rows_file
+    from aeroloop.service.sweep.table import check_table
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.laws_table import laws_table
+    from aeroloop.service.terminal.laws_table import markdown as as_markdown
+
+    axes = {"laws": law, "bits": bits, "sensors": sensors, "winds": wind, "plants": plant}
+    given = {name: values or () for name, values in axes.items()}
+    with checked():
+        _check_figure(figure, config, force)
+        if out is not None:
+            check_table(out, [config], force=force or rows_file(out).exists())  # as of `sweep`
+        comparison = compare(settings, **given, seeds=seeds, duration_s=duration, within_deg=within)
+    with guarded(), count_bar("experiments and searches", hidden=json) as update:
+        result = run_comparison(comparison, out, engine, update)
+    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else laws_table)
+    if figure is not None:
+        from aeroloop.service.sweep.laws_figure import draw_laws
+
+        with _new_file(figure, config, force) as part:
+            draw_laws(result, part)
 
 
 @group.command()
@@ -324,7 +420,7 @@ def sweep(
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment for every combination of values and seeds, and write a table of their figures."""
-    settings = settings_of(config, overrides)
+    settings = loop_of(config, overrides)
     _check_engine(engine)
     from aeroloop.service.sweep.axes import parse_axes
     from aeroloop.service.sweep.sweep import plan, rows_file, run_sweep

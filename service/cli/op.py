@@ -11,7 +11,9 @@ import typer
 from aeroloop.service.cli.common import Config, Json, Overrides, address_of, checked, fail, guarded
 
 if TYPE_CHECKING:
-    from aeroloop.protocol.messages.operator import Message, Reference
+    from collections.abc import Sequence
+
+    from aeroloop.protocol.messages.operator import Gains, Message, Reference
     from aeroloop.service.host.operator import Stopped
     from aeroloop.service.vehicle_address import VehicleAddress
 
@@ -185,27 +187,36 @@ def inject(
     _send(address, "inject", message)
 
 
-@group.command("set-gains")
-def set_gains(
-    c1: Annotated[Three | None, typer.Option("--C1", help="For the attitude error (1/s).", show_default=False)] = None,
-    c2: Annotated[
-        Three | None, typer.Option("--C2", help="For the rate error (N·m·s/rad).", show_default=False)
-    ] = None,
-    gamma: Annotated[
-        Three | None, typer.Option("--Gamma", help="For the adaptation (N·m·s²/rad² per s).", show_default=False)
-    ] = None,
-    config: Config = None,
-    overrides: Overrides = None,
-) -> None:
-    """Change the law's gains between two ticks; gains left out stay as they are."""
+@group.command("set-gains", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def set_gains(context: typer.Context, config: Config = None, overrides: Overrides = None) -> None:
+    """Change gains of the law between two ticks, each as --NAME and its numbers: --C2 0.2 0.2 0.2; others stay."""
+    address = address_of(config, overrides)
+    _send(address, "set_gains", gains_from(context.args))
+
+
+def gains_from(words: Sequence[str]) -> Gains:
+    """Gains given as --NAME and numbers; anything else ends the command."""
     from aeroloop.protocol.messages.operator import Gains
 
-    address = address_of(config, overrides)
-    if c1 is c2 is gamma is None:
-        fail("give --C1, --C2 or --Gamma, three numbers each", 2)
+    how = "give each gain as --NAME and its numbers, such as --C2 0.2 0.2 0.2"
+    given: dict[str, list[str]] = {}
+    numbers: list[str] | None = None
+    for word in words:
+        if word.startswith("--"):
+            name, equals, value = word[2:].partition("=")
+            numbers = given[name] = [value] if equals else []
+        elif numbers is None:
+            fail(f"{how}, not {word!r}", 2)
+        else:
+            numbers.append(word)
+    if not all(given.values()) or not given:
+        fail(how, 2)
+    try:
+        floats = {name: [float(number) for number in numbers] for name, numbers in given.items()}
+    except ValueError:
+        fail(how, 2)
     with checked(Gains):
-        gains = Gains(C1=c1, C2=c2, Gamma=gamma)
-    _send(address, "set_gains", gains)
+        return Gains.model_validate(floats)
 
 
 @group.command(context_settings={"ignore_unknown_options": True})  # a negative angle is no option

@@ -22,6 +22,7 @@ from aeroloop.service.cli.common import (
     Overrides,
     daemon,
     guarded,
+    loop_of,
     reloadable,
     run_alone,
     run_role,
@@ -67,7 +68,7 @@ def demo(
 ) -> None:
     """Run the paper's experiment over Zenoh in three processes, and review its log."""
     options = [*(["loop.lockstep=true"] if lockstep else []), *([f"plant.via={via}"] if via else [])]
-    settings = with_bits_of(settings_of(config, overrides, *options), bits_out, bits_in)
+    settings = with_bits_of(loop_of(config, overrides, *options), bits_out, bits_in)
     from aeroloop.service.lab.demo import run_demo
     from aeroloop.service.terminal.display import live_demo
     from aeroloop.service.terminal.log_tables import demo_account
@@ -102,14 +103,22 @@ def controller(
     """Run the controller daemon until SIGTERM."""
     words = [f"controller.duration_s={duration}"] if duration is not None else []
     words += ["controller.auto_arm=true"] if auto_arm else []
-    settings, load = reloadable(options.config, options.overrides, *words)
+    _, load_open = reloadable(options.config, options.overrides, *words)
+    settings = loop_of(options.config, options.overrides, *words)
+
+    def load() -> Settings:
+        from aeroloop.service.config import with_law_settings
+
+        return with_law_settings(load_open())
 
     def run(role: Role) -> None:
         from aeroloop.service.config import from_description
+        from aeroloop.service.control.laws.registry import version_of
         from aeroloop.service.daemon.daemon import Daemon
         from aeroloop.service.daemon.reload import reload_on_hangup
 
         daemon = Daemon(role, settings)
+        role.own_versions = version_of(settings.law)
 
         def certificate_of(now: Settings) -> dict[str, Any] | None:
             return daemon.certificate_of(now.law, now.reference, now.controller)

@@ -4,8 +4,8 @@ It uses no socket, no clock and no log, so the daemon, the lockstep experiment, 
 run this one code path. The law's time is k times the period. A frame that would repeat the last levels need not be
 sent; the controller then receives SILENCE and computes with the levels it holds.
 
-Between the two frames stands one call of `controller_function`, on memory that stays. Its outputs are one row of
-doubles; after a valid tick the row is copied, and the copy is what the next tick and the properties here read.
+Between the two frames stands one evaluation of a `Tick`, on memory that stays. Its outputs are one row of doubles;
+after a valid tick the row is copied, and the copy is what the next tick and the properties here read.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Sequence
 from math import isnan, nan
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector, received_quaternion
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.symbolic import Buffer, Compiled, buffer, integers, parts
+from aeroloop.protocol.wire.symbolic import Buffer, integers, parts
 from aeroloop.protocol.wire.transmit import SILENCE, Sender
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.evaluation import configured_gains
+from aeroloop.service.control.laws.interface import LawSettings
+from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.control.motion import Motion
-from aeroloop.service.control.tick import CARRIED, REGARDLESS, controller_function
+from aeroloop.service.control.tick import Tick
 
 Codes = tuple[float, ...]
 
@@ -34,8 +35,7 @@ class ControllerSnapshot(BaseModel):
 
     Attributes:
         attitude: q^Q of the last measurement [1].
-        sign: ±1, the equilibrium that is approached; 0 before the first measurement (Assumption 3).
-        damping_estimate: θ̂ [N·m·s/rad].
+        law: The law's named state.
         held: Codes of the last measurement, for silence; None before the first. Shape (6,).
         voltage_codes: Codes of the last valid voltages, for quantizers with a memory; None before the first.
             Shape (actuators,).
@@ -47,8 +47,7 @@ class ControllerSnapshot(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
     attitude: Quaternion = IDENTITY
-    sign: Literal[-1, 0, 1] = 0
-    damping_estimate: Vector
+    law: dict[str, tuple[float, ...]]
     held: Codes | None = None
     voltage_codes: Codes | None = None
     sent_codes: Codes | None = None
@@ -56,11 +55,11 @@ class ControllerSnapshot(BaseModel):
 
 
 class Controller:
-    """The adaptive law between a measurement frame and a command frame.
+    """The law between a measurement frame and a command frame.
 
     Args:
         wire: Format of the frames.
-        law: Parameters and gains.
+        law: Which law, its parameters and gains.
         reference: Reference from tick 0 on.
         period: Time between ticks [s].
 
@@ -69,11 +68,12 @@ class Controller:
         counter: Its counter.
         motion: The reference as followed; may be changed between two ticks.
         refused: Malformed measurement frames so far.
-        failed: Whether the law has returned NaN.
+        fault: Why the law gave no voltages, once it has not; None before.
         invalid: Measurements with the code "no valid value" so far.
 
     Raises:
-        ValueError: The law's B cannot be inverted.
+        LawError: The law cannot be used, such as one for another number of actuators.
+        PluginError: There is no such law.
     """
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float) -> None:
@@ -83,20 +83,20 @@ class Controller:
         self.counter = 0
         self.refused = 0
         self.invalid = 0
-        self.failed = False
-        function = controller_function(wire, law, period)
-        sizes = {name: function.numel_out(name) for name in function.name_out()}
-        self._found, self._kept = buffer(function.nnz_out()), buffer(function.nnz_out())
-        found, self._last = parts(self._found, sizes), parts(self._kept, sizes)
-        self._tick = Compiled(function, found | {name: self._last[carried] for name, carried in CARRIED.items()})
-        self._evaluate, self._inputs, self._codes = self._tick.evaluate, self._tick.inputs, self._tick.inputs["codes"]
-        self._measured, self._computed = found["measured"], found["computed"]
+        self.fault: str | None = None
+        self.law = law_of(law, period, wire.actuators)
+        self._tick = tick = Tick(wire, self.law, period)
+        self._found, self._kept, self._last = tick.row, tick.kept_row, tick.kept
+        self._evaluate, self._codes = tick.evaluate, tick.inputs["codes"]
+        self._measured, self._computed = tick.found["measured"], tick.found["computed"]
         self._command: memoryview[int] | Buffer
-        self._command = found["command"] if wire.voltage.bits is None else integers(found["words"])
+        self._command = tick.found["command"] if wire.voltage.bits is None else integers(tick.found["words"])
         self._no_command = [wire.voltage.quantizer().invalid] * wire.actuators
-        self._regardless = sum(sizes[name] for name in REGARDLESS)
-        self.motion = Motion(reference, shared=self._inputs)
-        self.set_gains(Gains(C1=law.C1, C2=law.C2, Gamma=law.Gamma))
+        self._regardless = tick.regardless
+        self.motion = Motion(reference, shared=tick.inputs)
+        self._gains = parts(tick.inputs["gains"], tick.gains)
+        self._law_state = parts(tick.kept["state_next"], tick.states)
+        self.set_gains(Gains.model_validate(configured_gains(self.law)))
         self._counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), self._counters)
         self._periodic = wire.transmit.command == "periodic"
@@ -105,7 +105,8 @@ class Controller:
         self._held: Sequence[float] | None  # codes of the last measurement
         self._attitude_level: Callable[[float], float] = wire.attitude.quantizer().level
         self._read, self._write = wire.measurement.unpack, wire.command.pack
-        self.restore(ControllerSnapshot(damping_estimate=law.damping_estimate))
+        initial: Buffer = memoryview(bytearray(array("d", tick.initial))).cast("d")
+        self.restore(ControllerSnapshot(law={name: tuple(part) for name, part in parts(initial, tick.states).items()}))
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
         """Answer a measurement.
@@ -148,7 +149,7 @@ class Controller:
         if not self._measured[0]:
             self.invalid += 1
             return
-        self.failed = True
+        self.fault = self._tick.fault or f"law {self.law.settings.kind} gave no number"
         self._kept[: self._regardless] = self._found[: self._regardless]
         self.tick_index, self.counter = k, counter
 
@@ -180,9 +181,12 @@ class Controller:
 
     def set_gains(self, gains: Gains) -> None:
         """Use other gains from the next tick on; None leaves a gain unchanged."""
-        for name in ("C1", "C2", "Gamma"):
-            if (diagonal := getattr(gains, name)) is not None:
-                self._inputs[name][:] = memoryview(array("d", diagonal))
+        for name, gain in gains.named.items():
+            self._gains[name][:] = memoryview(array("d", gain))
+
+    def leave_out_law(self) -> None:
+        """Compute only attitude, desired attitude and errors from now on, where the law is in Python."""
+        self._tick.without_law = True
 
     def apply(self, change: Change) -> None:
         """Apply a recorded change; the next tick must be its first, or later."""
@@ -197,8 +201,7 @@ class Controller:
         held, codes = self._held, tuple(self._last["command"])
         return ControllerSnapshot(
             attitude=self.attitude,
-            sign=self.sign,  # type: ignore[arg-type]  # one of the three
-            damping_estimate=self.damping_estimate,
+            law=self.law_state,
             held=None if held is None else tuple(held),
             voltage_codes=None if isnan(codes[0]) else codes,
             sent_codes=None if sent_codes is None else tuple(sent_codes),
@@ -208,9 +211,12 @@ class Controller:
     def restore(self, state: ControllerSnapshot) -> None:
         """Continue bit for bit from this state, given the same reference and gains."""
         codes = state.voltage_codes or [nan] * self.wire.actuators
-        known = {"q": state.attitude, "s_next": [state.sign], "theta_next": state.damping_estimate, "command": codes}
-        for name, values in known.items():
+        rows = {"q": state.attitude, "command": codes}
+        for name, values in rows.items():
             self._last[name][:] = memoryview(array("d", values))
+        for name, part in self._law_state.items():
+            if len(values := state.law.get(name, ())) == len(part):  # that of another law does not count
+                part[:] = memoryview(array("d", values))
         widths = self.wire.measurement.widths
         self._held = state.held and [
             code if width is None else int(code) for code, width in zip(state.held, widths, strict=True)
@@ -220,12 +226,12 @@ class Controller:
     @property
     def gains(self) -> Gains:
         """The gains now."""
-        return Gains.model_validate({name: tuple(self._inputs[name]) for name in ("C1", "C2", "Gamma")})
+        return Gains.model_validate({name: tuple(gain) for name, gain in self._gains.items()})
 
     @property
-    def sign(self) -> int:
-        """±1, the equilibrium that is approached; 0 before the first measurement."""
-        return int(self._last["s_next"][0])
+    def law_state(self) -> dict[str, tuple[float, ...]]:
+        """The law's named state after the last measurement."""
+        return {name: tuple(part) for name, part in self._law_state.items()}
 
     @property
     def attitude(self) -> Quaternion:
@@ -251,11 +257,6 @@ class Controller:
     def desired(self) -> Quaternion:
         """q_d at the last measurement [1]."""
         return tuple(self._last["q_d"])  # type: ignore[return-value]  # four elements
-
-    @property
-    def damping_estimate(self) -> tuple[float, float, float]:
-        """θ̂ after the last measurement [N·m·s/rad]."""
-        return tuple(self._last["theta_next"])  # type: ignore[return-value]  # three elements
 
     @property
     def voltages(self) -> list[float]:

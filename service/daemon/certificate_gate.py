@@ -17,13 +17,16 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final, NamedTuple
 
+from pydantic import BaseModel
+
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import EventKind
 from aeroloop.protocol.messages.operator import Gains, Reference
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.service.config import Settings
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.registry import law_class, with_gains
 from aeroloop.service.theorem.certificate import Certificate, certify
+from aeroloop.service.theorem.configured import NoTheoremError, with_theorem
 from aeroloop.service.theorem.extremes import BoundlessError
 
 KEPT: Final = 8
@@ -39,16 +42,23 @@ class UncertifiedError(AeroloopError):
     """A change after which the theorem would not hold, where it must; one line with the reason and the remedies."""
 
 
+class OwnCertificate(BaseModel, extra="allow"):
+    """What a user's law says is proven; see `Law.certify`."""
+
+    holds: bool
+    verdict: str
+
+
 class Verdict(NamedTuple):
     """Whether gains and a reference satisfy the theorem.
 
     Attributes:
-        certificate: None of a stream, which cannot be certified.
+        certificate: None of a stream, which cannot be certified, and of a law without a theorem.
         text: The verdict in a sentence, without full stop.
         helps: Remedies where it does not hold, to be appended to the text.
     """
 
-    certificate: Certificate | None
+    certificate: Certificate | OwnCertificate | None
     text: str
     helps: str = ""
 
@@ -58,13 +68,11 @@ class Verdict(NamedTuple):
         return self.certificate is not None and self.certificate.holds
 
     @classmethod
-    def of(cls, certificate: Certificate) -> Verdict:
+    def of(cls, certificate: Certificate | OwnCertificate) -> Verdict:
         """The verdict of a certificate."""
         text = certificate.verdict.rstrip(".")
         text = text[0].lower() + text[1:]  # within a sentence
-        if certificate.holds:
-            return cls(certificate, text)
-        if not certificate.remedies:
+        if certificate.holds or isinstance(certificate, OwnCertificate) or not certificate.remedies:
             return cls(certificate, text)
         ways = [remedy.text for remedy in certificate.remedies if remedy.overrides]
         return cls(certificate, text, f"; what would do: {', or '.join(ways) or 'no bits and no gains'}")
@@ -77,12 +85,12 @@ class CertificateGate:
         required: Whether the theorem must hold.
     """
 
-    def __init__(self, role: Role, settings: Settings, reference: Reference) -> None:
+    def __init__(self, role: Role, settings: Settings, gains: Gains, reference: Reference) -> None:
         self._role = role
         self._settings = settings
         self.required = settings.controller.require_certificate
         self._cache: deque[tuple[Gains, Reference, Verdict]] = deque(maxlen=KEPT)
-        self._now = gains_of(settings.law), reference
+        self._now = gains, reference
         self._verdict: Verdict | None = self.verdict_of(*self._now)
         self._published = ""
         self._computing = False
@@ -93,11 +101,13 @@ class CertificateGate:
         """The verdict on gains and a reference, from the cache if there."""
         if (cached := self._cached(gains, reference)) is not None:
             return cached
-        law = self._settings.law.model_copy(update={name: value for name, value in gains if value is not None})
+        law = with_gains(self._settings.law, gains)
         try:
             with _giving_way():
                 changed = self._settings.model_copy(update={"law": law, "reference": reference})
-                verdict = Verdict.of(certify(changed, seek_remedies=self.required))
+                verdict = Verdict.of(_certify(changed, seek_remedies=self.required))
+        except NoTheoremError as error:
+            verdict = Verdict(None, str(error))
         except BoundlessError as error:
             verdict = Verdict(None, f"nothing is certified: {error}")
         self._cache.append((gains, reference, verdict))
@@ -184,6 +194,9 @@ def _giving_way() -> Iterator[None]:
         sys.setswitchinterval(interval)
 
 
-def gains_of(law: LawSettings) -> Gains:
-    """The gains of a configured law."""
-    return Gains(C1=law.C1, C2=law.C2, Gamma=law.Gamma)
+def _certify(settings: Settings, *, seek_remedies: bool) -> Certificate | OwnCertificate:
+    """Raises NoTheoremError where the law has none, BoundlessError where the reference has no bounds."""
+    own = law_class(settings.law).certify(settings)
+    if own is None:
+        return certify(with_theorem(settings), seek_remedies=seek_remedies)
+    return OwnCertificate.model_validate(own)

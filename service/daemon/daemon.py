@@ -27,9 +27,11 @@ from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import LawSettings
-from aeroloop.service.daemon.certificate_gate import CertificateGate, gains_of
+from aeroloop.service.control.laws.interface import LawSettings, PythonLaw
+from aeroloop.service.control.laws.registry import gains_of
+from aeroloop.service.daemon.certificate_gate import CertificateGate
 from aeroloop.service.daemon.claim import ClaimClient, SessionLostError
+from aeroloop.service.daemon.law_watch import LawWatch
 from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.daemon.telemetry import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick, TickSource
@@ -55,7 +57,8 @@ class Daemon:
     """The controller end as a process. The role's name must be unique: the plant identifies its holder by it.
 
     Raises:
-        ValueError: The law's B cannot be inverted.
+        LawError: The law cannot be used.
+        PluginError: There is no such law.
     """
 
     def __init__(
@@ -74,7 +77,7 @@ class Daemon:
         self._own_grid = settings.pace == "clock" and not loop.lockstep
         self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm, own_grid=self._own_grid)
         begins = reference if settings.after_restart == "configured" else Hold()
-        self._gate = CertificateGate(role, configured, begins)
+        self._gate = CertificateGate(role, configured, gains_of(law), begins)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
             role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators > 2
@@ -87,6 +90,8 @@ class Daemon:
         self._plants = 0  # how often a plant's token has appeared or disappeared
         self._granted = False  # whether the plant's status has ever named this session
         self._lost = ""
+        self._too_slow: float | None = None  # time of a tick beyond law_timeout_s, before it is a fault
+        self._watch = LawWatch(role, f"law {law.kind}")
         self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = self._stale = 0
         self._notes: list[str] = []
         self._timing: LoopTiming | None = None
@@ -116,6 +121,8 @@ class Daemon:
         role.watch_token("plant", self._see_plant)
         role.announce()
         role.event("started", f"{role.name} looks for {role.vehicle}")
+        if isinstance(self._controller.law, PythonLaw):
+            self._watch.start()
         try:
             finished = False
             while not finished and not role.stop.is_set():
@@ -142,6 +149,7 @@ class Daemon:
     def _run(self, link: ZenohLink) -> bool:
         """Run one session. True once the duration is over, False if the session was lost."""
         controller, changes, timing, lockstep = self._controller, self._changes, self._timing, self._loop.lockstep
+        watch = self._watch
         source = TickSource(link, self._loop, self._wire, own_grid=self._own_grid, stale_s=self._stale_s)
         k, last = -1, time.monotonic()
         while self._may_continue() and (self._last_tick is None or k < self._last_tick):
@@ -163,7 +171,11 @@ class Daemon:
             changes.before_tick(now.tick, now.frame)
             if not self._may_continue():
                 break
+            watch.begun = time.monotonic()
             command = controller.tick(now.frame, now.tick)
+            took_s, watch.begun = time.monotonic() - watch.begun, None
+            if took_s > self._law_timeout_s and not lockstep:
+                self._too_slow, command = took_s, None
             if command or (command is not None and lockstep):
                 link.send(command)
             k = now.tick
@@ -217,6 +229,7 @@ class Daemon:
             self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", session, tick)
         if command is not None:
             self._sent += command != SILENCE
+        if command is not None or self._too_slow is not None:
             self._advance_state(tick)
         if self._controller.tick_index == tick and tick % self._telemetry_every == 0:
             self._role.publish("telemetry", telemetry_of(self._controller, session))
@@ -225,9 +238,13 @@ class Daemon:
     def _advance_state(self, tick: int) -> None:
         """Move the state machine after an answer."""
         before, session, role = self._machine.state, self._claims.session, self._role
-        if self._controller.failed:
+        fault = self._controller.fault
+        if self._too_slow is not None:
+            fault = f"law {self._controller.law.settings.kind} took {self._too_slow:.3g} s for a tick"
+            self._too_slow = None
+        if fault is not None:
             self._machine.fire(Trigger.FAULT)
-            self._lost = "the law gave no number"
+            self._lost = fault
             role.event("fault", f"{self._lost}: stopped commanding until `aeroloop op arm`", session, tick)
         elif self._controller.tick_index != tick:
             if before is not State.READY:
@@ -366,6 +383,7 @@ class Daemon:
 
     def _take(self, settings: ControllerSettings) -> None:
         self._stale_s = settings.stale_s
+        self._law_timeout_s = settings.law_timeout_s
         self._claims.auto_arm = settings.auto_arm
         self._telemetry_every = max(1, round(self._loop.rate_hz / settings.telemetry_rate_hz))
 

@@ -36,9 +36,10 @@ from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.attitude import distance
 from aeroloop.service.control.approach import Approach, nearest_turn
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.interface import LawSettings
+from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
 from aeroloop.service.control.reference import FollowError, Limits, Plan
-from aeroloop.service.daemon.certificate_gate import CertificateGate, UncertifiedError, gains_of
+from aeroloop.service.daemon.certificate_gate import CertificateGate, UncertifiedError
 from aeroloop.service.daemon.session_start import found, remaining
 from aeroloop.service.settings import ControllerSettings
 
@@ -97,6 +98,7 @@ class OperatorChanges:
         self._trace = trace
         self._gate = gate
         self._rolls = rolls
+        self._law = law
         self._gains = gains_of(law)
         self._reference: Reference = reference
         self._adopted = self._gains, reference
@@ -150,8 +152,9 @@ class OperatorChanges:
     def adopt(self, law: LawSettings, reference: Reference) -> None:
         """Take over the gains and the reference that changed in a reloaded configuration; others stay as they are."""
         (gains, configured), self._adopted = self._adopted, (gains_of(law), reference)
-        if gains_of(law) != gains:
-            self._gains, self._gains_from = gains_of(law), "configured"
+        self._law = law
+        if self._adopted[0] != gains:
+            self._gains, self._gains_from = self._adopted[0], "configured"
             if self._controller is not None:
                 self.set_gains(self._gains, "configured")
         if reference != configured:
@@ -197,12 +200,14 @@ class OperatorChanges:
         reference = remaining(last, self._running().period)
         try:
             self.plan(reference)
+            with_gains(self._law, last.gains)
+            gains = last.gains.over(self._gains)
             if self._gate is not None:
-                self._gate.admit(last.gains, reference)
-        except (FollowError, UncertifiedError) as error:
+                self._gate.admit(gains, reference)
+        except (FollowError, UncertifiedError, LawError) as error:
             self._role.event("fault", f"the last session is not resumed: {error}", self._session)
             return
-        self._gains, self._gains_from = last.gains, "resumed"
+        self._gains, self._gains_from = gains, "resumed"
         if last.ended is TripCause.OPERATOR or reference == Hold():
             return
         if isinstance(reference, Stream):
@@ -296,13 +301,18 @@ class OperatorChanges:
         """Check a change against the certificate, where one is required; what is None stays as it is.
 
         Raises:
-            FollowError: No session runs.
+            FollowError: No session runs, or the law has no such gain or bounds it.
             UncertifiedError: The theorem would not hold.
         """
         self._running()
-        changed = {name: value for name, value in gains or () if value is not None}
+        if gains is not None:
+            try:
+                with_gains(self._law, gains)
+            except LawError as error:
+                raise FollowError(str(error)) from None
+            gains = gains.over(self._gains)
         if self._gate is not None:
-            self._gate.admit(self._gains.model_copy(update=changed), reference or self._followed)
+            self._gate.admit(gains or self._gains, reference or self._followed)
 
     def certify(self) -> None:
         """Publish the certificate of the present gains and reference."""
@@ -321,7 +331,7 @@ class OperatorChanges:
         self._gains, self._gains_from = controller.gains, source
         self._record(gains=gains)
         self._note()
-        text = ", ".join(f"{name} = {list(value)}" for name, value in gains if value is not None)
+        text = ", ".join(f"{name} = {list(value)}" for name, value in gains.named.items())
         self._role.event("changed", f"gains set: {text or 'nothing'}", self._session, self._k)
         return Answer(done=True, text=f"{self._role.vehicle}: {text or 'no gain was given, so none has changed'}")
 

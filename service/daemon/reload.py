@@ -11,14 +11,14 @@ from typing import Any, Final
 from aeroloop.protocol.runtime.role import Action, Role
 from aeroloop.protocol.wire.spec import flat
 from aeroloop.service.config import Settings
+from aeroloop.service.control.laws.interface import LawSettings
+from aeroloop.service.control.laws.registry import law_class
 
 LIVE: Final = {
     "controller": (
-        "law.C1",
-        "law.C2",
-        "law.Gamma",
         "reference",
         "controller.stale_s",
+        "controller.law_timeout_s",
         "controller.telemetry_rate_hz",
         "controller.max_reference_rate",
         "controller.max_reference_braking",
@@ -31,7 +31,7 @@ LIVE: Final = {
     "recorder": ("recorder.chunk_s", "recorder.max_file_mb", "recorder.max_file_s", "recorder.keep_gb"),
     "router": (),
 }
-"""By role, the keys and sections that take effect at once."""
+"""By role, the keys and sections that take effect at once; a controller's gains, too."""
 
 _SECTIONS: Final = {
     "controller": {"vehicle", "loop", "wire", "law", "reference", "controller", "network"},
@@ -69,7 +69,7 @@ def reload_on_hangup(
         nonlocal current, effective
         now = load()
         lines = differences(current, now, role.role)
-        description = _with_live_keys(effective, now.description(), role.role)
+        description = _with_live_keys(effective, now.description(), live_keys(role.role, current.law))
         certificate = certificate_of(description)
         current, effective = now, description
 
@@ -84,10 +84,15 @@ def reload_on_hangup(
     role.on_hangup(reload)
 
 
-def _with_live_keys(effective: dict[str, Any], after: dict[str, Any], role: str) -> dict[str, Any]:
+def live_keys(role: str, law: LawSettings) -> tuple[str, ...]:
+    """The keys and sections that take effect at once in a role with this law."""
+    return LIVE[role] + (tuple(f"law.{name}" for name in law_class(law).gains) if role == "controller" else ())
+
+
+def _with_live_keys(effective: dict[str, Any], after: dict[str, Any], live: tuple[str, ...]) -> dict[str, Any]:
     """The effective configuration with the live keys of a new one."""
     merged = {**effective}
-    for name in LIVE[role]:
+    for name in live:
         section, _, key = name.partition(".")
         merged[section] = {**merged[section], key: after[section][key]} if key else after[section]
     return merged
@@ -96,7 +101,7 @@ def _with_live_keys(effective: dict[str, Any], after: dict[str, Any], role: str)
 def differences(before: Settings, after: Settings, role: str) -> list[str]:
     """The changes for a role, a line per key: old value, new value, and whether it needs a restart."""
     old, new = (flat(settings.model_dump(mode="json", include=_SECTIONS[role])) for settings in (before, after))
-    live = tuple(f"{name}." for name in LIVE[role])
+    live = tuple(f"{name}." for name in live_keys(role, before.law))
     return [
         f"{key}: {_short(old.get(key))} → {_short(new.get(key))}"
         + ("" if f"{key}.".startswith(live) else ", after a restart")

@@ -15,7 +15,6 @@ def telemetry_of(controller: Controller, session: str) -> Telemetry:
         attitude_error=controller.attitude_error,
         rate_error=controller.rate_error,
         desired=controller.desired,
-        damping_estimate=controller.damping_estimate,
+        state=controller.law_state,
         voltages=tuple(controller.voltages),
-        sign=controller.sign,
     )

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.service.config import Settings
-from aeroloop.service.control.law import ESTIMATE_REACH
+from aeroloop.service.control.laws.adaptive import ESTIMATE_REACH
 from aeroloop.service.control.reference import Floats
 from aeroloop.service.lab.attack_rounds import Round, Rounds, WorstInstants
 from aeroloop.service.lab.attacked_lemma import SIZE as INSTANT_SIZE
@@ -32,6 +32,7 @@ from aeroloop.service.lab.attacked_lemma import Instants
 from aeroloop.service.lab.attacked_loops import WAVES, Experiments, Loops, Outcome, Wave
 from aeroloop.service.lab.search_points import ball, proposals
 from aeroloop.service.lab.workers import Workers
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate, largest_voltage
 from aeroloop.service.theorem.invariant import largest_start, reach
 
@@ -232,7 +233,7 @@ def _run(config: str, ticks: int, disturbance: float, groups: Sequence[_Group], 
     group_of = _group_of(len(points), groups)
     start = np.array([groups[g].start for g in group_of])
     quantized = np.array([groups[g].errors == "quantizers" for g in group_of], float)
-    loops.begin(experiments(points, loops.settings.law.damping_bound, disturbance, start, quantized))
+    loops.begin(experiments(points, with_theorem(loops.settings).law.damping_bound, disturbance, start, quantized))
     return Outcome(*(np.minimum(np.nan_to_num(part, nan=DIVERGED), DIVERGED) for part in loops.advance(ticks)))
 
 

@@ -11,6 +11,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.reference import Floats, desired
 from aeroloop.service.lab.attacked_loops import span, turned
 from aeroloop.service.lab.search_points import ball
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.lemma import Samples, lemma_inequalities, rotation, times
 
@@ -61,6 +62,6 @@ class Instants:
             found.equation: np.where(
                 found.right > 0, found.left / np.maximum(found.right, 1e-300), np.where(found.broken, np.inf, 0.0)
             )
-            for found in lemma_inequalities(samples, self._settings.law, p, self._e.lemma)
+            for found in lemma_inequalities(samples, with_theorem(self._settings).law, p, self._e.lemma)
             if found.equation not in PREMISES
         }

@@ -24,8 +24,10 @@ from aeroloop.protocol.messages.operator import Points, Reference, Sinusoid
 from aeroloop.protocol.wire.quantizer import TIE, Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.service.config import Settings
-from aeroloop.service.control.law import build_law, law_function
+from aeroloop.service.control.laws.adaptive import Adaptive, equations
+from aeroloop.service.control.laws.evaluation import law_function
 from aeroloop.service.control.reference import Floats, desired
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.lemma import coordinates, lyapunov, rotation, times
 
 WAVES: Final = ("square", "sinusoid", "constant", "bang-bang")
@@ -130,7 +132,7 @@ class Loops:
 
     def begin(self, chosen: Experiments) -> None:
         """Set every loop to its start. As many experiments as rows."""
-        law = self.settings.law
+        law = with_theorem(self.settings).law
         self._first, self._k = np.round(self._starts * chosen.phase).astype(int), 0
         q_d, omega_d = self._desired[self._first, :4], self._desired[self._first, 4:7]
         C1, theta_error = np.array(law.C1), chosen.theta - chosen.theta_hat
@@ -168,7 +170,8 @@ class Loops:
 
 def balance(settings: Settings, q_d: Floats, omega_d: Floats, theta_error: Floats) -> Floats:
     """K w_s: ε̃ and z₂ at which the law balances the slow disturbance. Shape (n, 6)."""
-    C1, C2 = np.array(settings.law.C1), np.array(settings.law.C2)
+    law = with_theorem(settings).law
+    C1, C2 = np.array(law.C1), np.array(law.C2)
     slow = -times(np.swapaxes(rotation(q_d), 1, 2), omega_d) * theta_error
     eps = slow / (1 + C1 * C2)
     return np.hstack([eps, C1 * eps])
@@ -196,7 +199,7 @@ def tick_function(settings: Settings) -> ca.Function:
     Inputs: state, desired (q_d, ω_d, ω̇_d), time [s], theta, torque and error as `Wave.columns`, offset [steps],
     quantized. Output: after.
     """
-    law, wire, period = settings.law, settings.wire, settings.loop.period
+    law, wire, period = with_theorem(settings).law, settings.wire, settings.loop.period
     given = {
         "state": ca.SX.sym("state", sum(_SIZES.values())),
         "desired": ca.SX.sym("desired", 10),
@@ -220,7 +223,7 @@ def tick_function(settings: Settings) -> ca.Function:
         beyond = with_quantizers * (_largest(y + o) - quantizer.limit)
         return ca.if_else(with_quantizers > 0, on_grid, y - quantizer.bound * wave), beyond
 
-    p = build_law(law)
+    p = equations(law)
     errors = ca.Function("errors", [p.q, p.omega, p.q_d, p.omega_d, p.s, p.C1], [ca.vertcat(p.z1, p.z2), p.z2])
     z, z2 = errors(q, omega, q_d, omega_d, 1, ca.SX(law.C1))
 
@@ -228,9 +231,11 @@ def tick_function(settings: Settings) -> ca.Function:
     wave = error[:3] * _course(error, time, ca.sign(z2))
     eps, eps_beyond = received(sent, wire.attitude.quantizer(), offset[:3], wave)
     rate, rate_beyond = received(omega, wire.rate.quantizer(), offset[3:6], wave)
-    last, u, theta_hat, *_ = law_function(law, period)(
-        last, theta_hat, eps, rate, q_d, omega_d, omega_d_dot, 1, law.C1, law.C2, law.Gamma
+    gains = ca.SX([*law.C1, *law.C2, *law.Gamma])
+    last, u, state, *_ = law_function(Adaptive(law, period, 3))(
+        last, ca.vertcat(theta_hat, 1), gains, eps, rate, q_d, omega_d, omega_d_dot
     )
+    theta_hat = state[:3]
     first = 3 - wire.actuators  # with two motors the first torque is fictitious: neither quantized nor limited
     pushed = -ca.sign(ca.SX(np.array(law.allocation)).T @ wave)  # as the wave's other errors push
     motors, u_beyond = received(u[first:], wire.voltage.quantizer(), offset[6 + first :], pushed[first:])
@@ -243,7 +248,7 @@ def tick_function(settings: Settings) -> ca.Function:
             mass=law.mass,
             gravity=law.gravity,
             centre_of_mass=law.centre_of_mass,
-            allocation=law.allocation,
+            allocation=np.array(law.allocation).tolist(),
             damping=(0.0, 0.0, 0.0),  # θ differs from row to row: it is part of the load
         )
     )

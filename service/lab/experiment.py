@@ -1,7 +1,7 @@
 """Experiment: runs controller and plant end in one process, in lockstep, by one of two paths with the same bits.
 
 *compiled*: the whole loop is one function, `loop_function`. *frames*: a `for` loop over the two ends, through real
-frames, for what that function cannot express: faults, a user's own plant or controller, `watch`, a run that trips.
+frames, for what that function cannot express: faults, a law in Python, a user's own plant, `watch`, a run that trips.
 Without network or clock it repeats bit for bit, and a demo in lockstep over Zenoh gives the same figures.
 """
 
@@ -21,6 +21,8 @@ from aeroloop.protocol.messages.models import Claim, Refusal
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.laws.interface import ExpressionLaw
+from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.figures import Figures, Score
 from aeroloop.service.lab.loop_function import Run, loop_of
 from aeroloop.service.lab.traffic import sent_ticks
@@ -63,7 +65,8 @@ def experiment(
             reported += max(1, report_every)
 
     course = None
-    if ticks and settings.plant.actuators == wire.actuators and not settings.plant.faults:
+    of_expressions = issubclass(law_class(settings.law), ExpressionLaw)
+    if ticks and of_expressions and settings.plant.actuators == wire.actuators and not settings.plant.faults:
         course = loop_of(settings).run(settings, ticks, report)
     if course is None:
         return Experiment(through_frames(settings, duration_s, progress, watch), "frames")
@@ -166,6 +169,8 @@ def through_frames(
         command = controller.tick(measurement, k)
         if command is None:
             trips = [notice.text for notice in endpoint.notices if notice.kind == "tripped"]
+            if controller.fault is not None:
+                trips = [controller.fault]
             raise LoopEndedError(f"the loop ended after {k * loop.period:g} s: {'; '.join(trips) or 'no answer'}")
         if controller.tick_index == k:  # it used the measurement
             score.error(k, controller.attitude_error, sent=measurement != SILENCE)

@@ -25,7 +25,9 @@ from aeroloop.protocol.wire.expressions import NUMBERS, as_written, encode, leve
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
-from aeroloop.service.control.law import law_function
+from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
+from aeroloop.service.control.laws.interface import ExpressionLaw
+from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.control.reference import Floats, desired
 from aeroloop.service.lab.c_code import in_c
 
@@ -64,14 +66,18 @@ class Loop:
     """
 
     def __init__(self, settings: Settings) -> None:
-        law, wire, period, plant = settings.law, settings.wire, settings.loop.period, settings.plant.effective
+        wire, period, plant = settings.wire, settings.loop.period, settings.plant.effective
+        law = law_of(settings.law, period, wire.actuators)
+        assert isinstance(law, ExpressionLaw)  # `experiment` runs others through frames
+        self._gains = [value for gain in configured_gains(law).values() for value in gain]
+        self._law_state = [value for values in initial_state(law).values() for value in values]
         self._mechanism = mechanism = plant.mechanism()
         self._initially = initially(mechanism)
         step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
         held = {"measured": 6, "commanded": wire.actuators, "numbers": 3 * len(NUMBERS), "zeros": 2}
-        sizes = {"x": step.numel_in("x"), "last": 4, "theta": 3, "s": 1, "seen": 7, "filters": 4, **held}
+        sizes = {"x": step.numel_in("x"), "last": 4, "law": len(self._law_state), "seen": 7, "filters": 4, **held}
         self._still = [0.0] * (sizes["x"] - len(mechanism.initial))
-        functions = law_function(law, period), step, sensor_function(plant.sensors, period)
+        functions = law_function(law), step, sensor_function(plant.sensors, period)
         with as_written():
             self.tick = self._tick(settings, sizes, functions)
         self.in_c = self._tried_c = False
@@ -82,7 +88,6 @@ class Loop:
         self, settings: Settings, sizes: dict[str, int], functions: tuple[ca.Function, ca.Function, ca.Function]
     ) -> ca.Function:
         law, step, sensors = functions
-        gains = [ca.SX(gain) for gain in (settings.law.C1, settings.law.C2, settings.law.Gamma)]
         wire, limit = settings.wire, settings.plant.voltage_limit
         state = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
         wanted, wind, error = ca.SX.sym("desired", 10), ca.SX.sym("wind", step.numel_in("wind")), ca.SX.sym("error", 3)
@@ -99,9 +104,9 @@ class Loop:
         levels = ca.vertcat(*(level(kinds[i], measured[i]) for i in range(6)))
 
         parts = ca.vertsplit(wanted, [0, 4, 7, 10])
-        answers = law.call([state["last"], state["theta"], levels[:3], levels[3:], *parts, state["s"], *gains])
+        answers = law.call([state["last"], state["law"], ca.SX(self._gains), levels[:3], levels[3:], *parts])
         answer = dict(zip(law.name_out(), answers, strict=True))
-        u = answer["u"][3 - wire.actuators :]
+        u = answer["u"]
         commanded = [encode(voltage, u[i], state["commanded"][i]) for i in range(wire.actuators)]
         voltages = ca.vertcat(*(level(voltage, code) for code in commanded))
 
@@ -110,7 +115,7 @@ class Loop:
             true[2] = ca.SX.zeros(2)  # a free body has no joints, and so no encoders
         next_seen, filters = sensors.call([*true, state["filters"], state["zeros"], error])
         codes = {"measured": ca.vertcat(*measured), "commanded": ca.vertcat(*commanded)}
-        learned = {"last": answer["q"], "theta": answer["theta_next"], "s": answer["s_next"]}
+        learned = {"last": answer["q"], "law": answer["state_next"]}
         after = {**state, **codes, **learned, "x": x, "seen": next_seen, "filters": filters}
         out = {**codes, "voltages": voltages, "errors": answer["eps_e"], "u": u, "seen": seen}
         self._outputs = {name: part.numel() for name, part in out.items()}
@@ -162,7 +167,7 @@ class Loop:
         held = [np.nan] * (6 + wire.actuators)
         quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
         x = *self._mechanism.initial, *self._still
-        first = [*x, *IDENTITY, *settings.law.damping_estimate, 0.0, *seen.attitude, *seen.rate, *sensors.held, *held]
+        first = [*x, *IDENTITY, *self._law_state, *seen.attitude, *seen.rate, *sensors.held, *held]
         state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros])
         torque, error = np.zeros((ticks, self._mechanism.axes)), np.zeros((ticks, 3))
         if not wind.calm:

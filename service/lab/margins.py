@@ -18,13 +18,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.lab.experiment import LoopEndedError, run_experiment
 from aeroloop.service.lab.workers import Workers
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import beyond, premises
 from aeroloop.service.theorem.extremes import extremes
 from aeroloop.service.theorem.invariant import reach
@@ -138,7 +138,7 @@ def measure_margins(
         duration_s=duration_s,
         diverged=DIVERGED,
         watchdog_ms=settings.plant.watchdog_s * 1e3,
-        damping_bound=settings.law.damping_bound,
+        damping_bound=with_theorem(settings).law.damping_bound,
         margins=[_margin(*row, *found[2 * i : 2 * i + 2]) for i, row in enumerate(rows)],
     )
 
@@ -211,15 +211,20 @@ def diverges_at(config: dict[str, Any], lost: bool, duration_s: float) -> int | 
         late = {"lost": ticks} if lost else {"delay": ticks}
         return largest_error(settings, duration_s, **late) > DIVERGED
 
-    low, high = 0, max(1, settings.loop.ticks(0.1))
-    while not diverges(high):
+    return least(diverges, settings.loop.ticks(0.1), settings.loop.ticks(OLDEST_S))
+
+
+def least(fails: Callable[[int], bool], guess: int, most: int) -> int | None:
+    """The least number that fails, if all larger ones do, by bisection from a guess; None if none up to `most` does."""
+    low, high = 0, max(1, guess)
+    while not fails(high):
         low, high = high, 2 * high
-        if high * settings.loop.period > OLDEST_S:
+        if high > most:
             return None
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if diverges(middle) else (middle, high)
-    return 0 if high == 1 and diverges(0) else high
+        low, high = (low, middle) if fails(middle) else (middle, high)
+    return 0 if high == 1 and fails(0) else high
 
 
 def largest_error(settings: Settings, duration_s: float, *, delay: int = 0, lost: int = 0) -> float:
@@ -232,7 +237,7 @@ def largest_error(settings: Settings, duration_s: float, *, delay: int = 0, lost
         lost: Commands lost between two that act.
     """
     settings = three_torques(settings)
-    loop, law = settings.loop, settings.law
+    loop, law = settings.loop, with_theorem(settings).law
     body = settings.plant.build(loop.period)
     controller = Controller(settings.wire, law, settings.reference, loop.period)
     rows = list[tuple[float, ...]]()
@@ -240,7 +245,9 @@ def largest_error(settings: Settings, duration_s: float, *, delay: int = 0, lost
     def watch(k: int, _measurement: bytes, _command: bytes) -> None:
         if 2 * k >= loop.ticks(duration_s):
             true, c = body.truth(), controller
-            rows.append((*true.attitude, *true.rate, *c.attitude, *c.rate, *c.rate_error, *c.desired, c.sign))
+            rows.append(
+                (*true.attitude, *true.rate, *c.attitude, *c.rate, *c.rate_error, *c.desired, *c.law_state["sign"])
+            )
 
     try:
         run_experiment(settings, duration_s, watch=watch, plant=Late(body, delay, lost), controller=controller)
@@ -256,7 +263,7 @@ def three_torques(settings: Settings) -> Settings:
 
     An Aero becomes a body as the law assumes it, with θ = θ̂(0) and u₁ quantized as the others are.
     """
-    plant, law, wire = settings.plant, settings.law, settings.wire
+    plant, law, wire = settings.plant, with_theorem(settings).law, settings.wire
     if plant.kind == "aero":
         motors = np.array(law.allocation)[1:, 1:]
         allocation = np.diag([np.linalg.norm(motors, 2), 0.0, 0.0])
@@ -271,11 +278,10 @@ def three_torques(settings: Settings) -> Settings:
 
 
 class Late(Plant):
-    """An emulated plant whose commands act `delay` ticks later, and of which `lost` in a row never do."""
+    """A plant whose commands act `delay` ticks later, and of which `lost` in a row never do."""
 
-    actuators = 3
-
-    def __init__(self, plant: EmulatedPlant, delay: int, lost: int) -> None:
+    def __init__(self, plant: Plant, delay: int, lost: int) -> None:
+        self.actuators = plant.actuators
         self._plant, self._every = plant, lost + 1
         self._due = deque([(0.0,) * plant.actuators] * delay)
         self._ticks = 0

@@ -1,8 +1,9 @@
 """Controller over thousands of ticks at once, bit for bit what it computes tick by tick.
 
-All measurements are in the log, so only the attitude's sign and θ̂ carry over from tick to tick. The law and the
+All measurements are in the log, so only the attitude's sign and the law's state carry over from tick to tick. Law and
 reference are the loop's own CasADi instructions, run over columns with a row per tick (`law_of_many`,
-protocol/wire/symbolic.py), so the bits are the loop's (tests/service/logs/test_batch.py); a tick costs 1 µs, not 15.
+protocol/wire/symbolic.py), so the bits are the loop's (tests/service/logs/test_batch.py). A law in Python runs tick by
+tick.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from aeroloop.protocol.messages.operator import Change, Gains, Reference
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import Buffer, Compiled, in_columns
 from aeroloop.protocol.wire.transmit import Sender
-from aeroloop.service.control.controller import ControllerSnapshot
-from aeroloop.service.control.law import LawSettings, law_of_many
+from aeroloop.service.control.controller import Controller, ControllerSnapshot
+from aeroloop.service.control.laws.evaluation import configured_gains, law_of_many
+from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings
 from aeroloop.service.control.motion import Motion
 from aeroloop.service.control.reference import reference_function
 from aeroloop.service.logs.codes import encoded_by, levels
@@ -42,9 +44,9 @@ class Computed(NamedTuple):
         attitude_error: ε̃ [1]. Shape (n, 3).
         rate_error: ω_e [rad/s]. Shape (n, 3).
         voltages: u before quantization [V]; NaN where the law gives no number. Shape (n, actuators).
-        sign: ±1, the equilibrium approached. Shape (n, 1).
-        gain: C₁'s diagonal [1/s]. Shape (n, 3).
-        damping_estimate: θ̂ that the law used [N·m·s/rad]. Shape (n, 3).
+        gains: The law's gains, one beside the other. Shape (n, gains).
+        state: Its named state that it used, likewise. Shape (n, states).
+        state_next: The same after the tick.
     """
 
     attitude: Array
@@ -53,9 +55,9 @@ class Computed(NamedTuple):
     attitude_error: Array
     rate_error: Array
     voltages: Array
-    sign: Array
-    gain: Array
-    damping_estimate: Array
+    gains: Array
+    state: Array
+    state_next: Array
 
 
 class Commands(NamedTuple):
@@ -69,25 +71,30 @@ class BatchController:
     """Computes many measurements per call.
 
     The reference holds from tick 0 on, the period is between ticks [s], `rows` is ticks per CasADi call, a multiple of
-    `aeroloop.protocol.wire.symbolic.UNROLLED`. Raises ValueError if the law's B cannot be inverted.
+    `aeroloop.protocol.wire.symbolic.UNROLLED`. Raises LawError and PluginError as Controller does.
     """
 
     def __init__(self, wire: WireSpec, law: LawSettings, reference: Reference, period: float, rows: int = ROWS) -> None:
         self._wire, self._period, self._rows = wire, period, rows
-        self._law = Compiled(law_of_many(law, period, rows))
-        desired = {name: self._law.inputs[name] for name in _DESIRED}
-        self._reference = Compiled(in_columns(reference_function(), rows), desired)
-        # CasADi's buffers as arrays, a column per tick.
-        self._given = {name: _table(memory, rows) for name, memory in self._law.inputs.items()}
-        self._found = {name: _table(memory, rows) for name, memory in self._law.outputs.items()}
-        self._piece = {name: _table(memory, rows) for name, memory in self._reference.inputs.items()}
+        self._controller = Controller(wire, law, reference, period)
+        own = self._controller.law
+        self._by_tick = not isinstance(own, ExpressionLaw)
+        self._gains = configured_gains(own)
+        self._state = self._controller.state
+        self._states = {name: len(values) for name, values in self._state.law.items()}
+        if isinstance(own, ExpressionLaw):
+            self._law = Compiled(law_of_many(own, rows))
+            desired = {name: self._law.inputs[name] for name in _DESIRED}
+            self._reference = Compiled(in_columns(reference_function(), rows), desired)
+            # CasADi's buffers as arrays, a column per tick.
+            self._given = {name: _table(memory, rows) for name, memory in self._law.inputs.items()}
+            self._found = {name: _table(memory, rows) for name, memory in self._law.outputs.items()}
+            self._piece = {name: _table(memory, rows) for name, memory in self._reference.inputs.items()}
         self._motion = Motion(reference)
-        self._gains = {name: np.array(getattr(law, name)) for name in Gains.model_fields}
         self._voltage = [wire.voltage.quantizer() for _ in range(wire.actuators)]
         counters = wire.measurement.counters
         heartbeat = wire.transmit.heartbeat_ticks(round(period * 1e9), counters)
         self._sender = Sender(wire.transmit.command, heartbeat, counters)
-        self.restore(ControllerSnapshot(damping_estimate=law.damping_estimate))
 
     @property
     def state(self) -> ControllerSnapshot:
@@ -98,7 +105,9 @@ class BatchController:
 
     def restore(self, state: ControllerSnapshot) -> None:
         """Continue from a recorded state; reference and gains stay as they are."""
-        self._state = state
+        self._controller.restore(state)
+        fitting = self._controller.law_state
+        self._state = state.model_copy(update={"law": fitting})
         for i, quantizer in enumerate(self._voltage):
             quantizer.reset()
             if state.voltage_codes is not None:
@@ -106,16 +115,23 @@ class BatchController:
         self._sender.resume(state.sent_codes, state.sent_tick)
 
     def follow(self, other: BatchController) -> None:
-        """Copy state, gains and reference of another controller with the same configuration."""
+        """Copy state, gains and reference of another controller with the same configuration.
+
+        What follows is beside the loop, where no voltages count: a user's code does not run for it. It may never end.
+        """
+        self._controller.leave_out_law()
         self.restore(other.state)
         self._gains = dict(other._gains)
-        self._motion.plan = other._motion.plan
+        self._motion.plan = self._controller.motion.plan = other._motion.plan
+        self._controller.set_gains(Gains.model_validate(self._gains))
 
     def compute_all(self, k: Integers, codes: Array, changes: deque[Change]) -> Computed:
         """Results of `Controller.compute` for measurements at ascending ticks k. Shapes (n,) and (n, 6).
 
         Changes of gains and reference are in order of tick; those that take effect are removed.
         """
+        if self._by_tick:
+            return self._compute_by_tick(k, codes, changes)
         if not len(k):
             return self._nothing(0)
         with np.errstate(all="ignore"):  # a float64 wire may carry 1e200
@@ -149,13 +165,15 @@ class BatchController:
 
     def _nothing(self, n: int) -> Computed:
         # The values of one element are contiguous in memory, since readers take them by element.
-        return Computed(*(np.full((columns, n), nan).T for columns in (4, 4, 3, 3, 3, self._wire.actuators, 1, 3, 3)))
+        gains, states = sum(map(len, self._gains.values())), sum(self._states.values())
+        widths = (4, 4, 3, 3, 3, self._wire.actuators, gains, states, states)
+        return Computed(*(np.full((columns, n), nan).T for columns in widths))
 
     def _compute(self, k: Integers, vectors: Array, rates: Array, changes: deque[Change]) -> Sequence[Array]:
         """`Computed` with a column per tick, for at most `rows` ticks, all of them valid."""
         n, given, found, state = len(k), self._given, self._found, self._state
         given["eps"][:, :n], given["omega"][:, :n] = vectors, rates
-        given["last"][:, 0], given["theta"][:, 0] = state.attitude, state.damping_estimate
+        given["last"][:, 0], given["state"][:, 0] = state.attitude, self._in_a_row(state)
         t: Array = np.asarray(k * self._period, dtype=np.float64)
         since = 0
         while since < n:  # until the next change, the same gains and the same plan
@@ -165,34 +183,54 @@ class BatchController:
             self._lay_out(t[since:until], slice(since, until))
             since = until
         self._reference()
-        given["s"][:] = state.sign or 1
         self._law()
-        if not state.sign and not found["eta_e"][0, 0] >= 0:  # Assumption 3, as at the loop's first measurement
-            given["s"][:] = -1
-            self._law()
+        last = np.split(found["state_next"][:, n - 1], np.cumsum(list(self._states.values()))[:-1])
         self._state = state.model_copy(
             update={
                 "attitude": tuple(found["q"][:, n - 1].tolist()),
-                "sign": int(given["s"][0, 0]),
-                "damping_estimate": tuple(found["theta_next"][:, n - 1].tolist()),
+                "law": {name: tuple(values.tolist()) for name, values in zip(self._states, last, strict=False)},
             }
         )
-        u = found["u"][3 - self._wire.actuators :, :n]
+        u = found["u"][:, :n]
         u[:, np.isnan(u.sum(axis=0))] = nan  # ∞ − ∞ is no number either
-        q, eps_e, omega_e, theta = (found[name] for name in ("q", "eps_e", "omega_e", "theta_before"))
-        columns = q, given["q_d"], rates, eps_e, omega_e, u, given["s"], given["C1"], theta
+        q, eps_e, omega_e, state_used, after = (
+            found[name] for name in ("q", "eps_e", "omega_e", "state_used", "state_next")
+        )
+        columns = q, given["q_d"], rates, eps_e, omega_e, u, given["gains"], state_used, after
         return [column[:, :n] for column in columns]
+
+    def _compute_by_tick(self, k: Integers, codes: Array, changes: deque[Change]) -> Computed:
+        computed, controller = self._nothing(len(k)), self._controller
+        widths = self._wire.measurement.widths
+        for i, (tick, row) in enumerate(zip(k.tolist(), codes.tolist(), strict=True)):
+            while changes and changes[0].tick <= tick:
+                self._apply(changes[0])
+                controller.apply(changes.popleft())
+            before = self._in_a_row(controller.state)
+            exact = [code if width is None else int(code) for code, width in zip(row, widths, strict=True)]
+            u = controller.compute(tick % self._wire.measurement.counters, exact, tick)
+            if controller.tick_index != tick:
+                continue  # no valid value was measured
+            q, after = controller, self._in_a_row(controller.state)
+            gains = [value for gain in self._gains.values() for value in gain]
+            values = q.attitude, q.desired, q.rate, q.attitude_error, q.rate_error, u or nan, gains, before, after
+            for column, value in zip(computed, values, strict=True):
+                column[i] = value
+        now = controller.state
+        self._state = self._state.model_copy(update={"attitude": now.attitude, "law": now.law, "held": now.held})
+        return computed
+
+    def _in_a_row(self, state: ControllerSnapshot) -> list[float]:
+        return [value for name in self._states for value in state.law[name]]
 
     def _apply(self, change: Change) -> None:
         if change.gains is not None:
-            changed = change.gains.model_dump(exclude_none=True)
-            self._gains |= {name: np.array(diagonal) for name, diagonal in changed.items()}
+            self._gains |= change.gains.named
         self._motion.change(change, self._period)
 
     def _lay_out(self, t: Array, rows: slice) -> None:
         """Fill in the current gains, and the pieces of the current reference plan at times t [s]."""
-        for name, diagonal in self._gains.items():
-            self._given[name][:, rows] = diagonal[:, np.newaxis]
+        self._given["gains"][:, rows] = np.array([value for gain in self._gains.values() for value in gain])[:, None]
         plan = self._motion.plan
         # A plan of one piece needs no search.
         piece = np.maximum(0, np.searchsorted(plan.starts, t, side="right") - 1) if len(plan.starts) > 1 else [0]

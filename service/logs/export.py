@@ -18,6 +18,7 @@ from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.runtime.host_facts import versions
 from aeroloop.service.config import ConfigError, Settings
+from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.files import LogFiles, Progress
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.runs import Block, Run, Taker
@@ -98,7 +99,9 @@ def _table(
     first = run.choose(None if session == ALL else session, vehicle)
     chosen = run.sessions_of(first[0]) if session == ALL else [first]
     settings = run.settings(first)
-    table = groups(settings.wire, settings.loop.period)
+    table = groups(
+        settings.wire, settings.loop.period, law_of(settings.law, settings.loop.period, settings.wire.actuators)
+    )
     names = ["/".join(which) for which in chosen]
     facts = {
         "config": settings.description(),

@@ -7,12 +7,15 @@ that the log lacks is NaN here, and the file format's own null in a file.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.service.control.laws.evaluation import initial_state
+from aeroloop.service.control.laws.interface import Law
 from aeroloop.service.logs.ticks import Ticks
 
 Array = npt.NDArray[Any]
@@ -57,8 +60,8 @@ class Group(NamedTuple):
     of: Callable[[Rows], Array]
 
 
-def groups(wire: WireSpec, period: float) -> list[Group]:
-    """Every column of the table, in order, by how the frames were quantized and the time between ticks [s]."""
+def groups(wire: WireSpec, period: float, law: Law[Any]) -> list[Group]:
+    """Every column of the table, in order, by how frames were quantized, the time between ticks [s], and the law."""
     motors = list(map(str, wire.motors))
     outermost = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
     return [
@@ -91,10 +94,8 @@ def groups(wire: WireSpec, period: float) -> list[Group]:
                lambda rows: _outermost(rows.ticks.rate, outermost["rate"]), AXES, "bool"),
         _group("saturated_voltage_{}", "", "whether u{} has the quantizer's outermost level",
                lambda rows: _outermost(rows.ticks.voltages, outermost["voltage"]), motors, "bool"),
-        _group("damping_estimate_{}_Nms_rad", "N·m·s/rad", "θ̂ as the law used it, {}",
-               lambda rows: rows.ticks.damping_estimate, AXES),
+        *_state(law),
         _group("unquantized_voltage_{}_V", "V", "u{} before quantization", lambda rows: rows.ticks.unquantized, motors),
-        _group("sign", "1", "the equilibrium approached, z₁₊ or z₁₋", lambda rows: rows.ticks.sign, kind="int8"),
         *_attitude("truth_", "as the emulator had it", lambda rows: rows.truth.attitude),
         _group("truth_rate_{}_rad_s", "rad/s", "ω as the emulator had it, about {}",
                lambda rows: rows.truth.rate, AXES),
@@ -119,6 +120,27 @@ def _group(
     """A column, or one per axis, which replaces the braces in its name and description."""
     columns = [Column(name.format(axis), unit, what.format(axis), kind) for axis in axes]
     return Group(columns, lambda rows: of(rows).reshape(-1, len(axes)))
+
+
+def _state(law: Law[Any]) -> list[Group]:
+    """The law's named state as it used it, a column for each number: by axis if it is three, else counted."""
+    found, since = list[Group](), 0
+    for name, values in initial_state(law).items():
+        n, unit = len(values), law.units.get(name, "1")
+        axes = {1: [""], 3: [f"_{axis}" for axis in AXES]}.get(n, [f"_{i + 1}" for i in range(n)])
+        suffix = "" if unit == "1" else "_" + unit.translate(_PLAIN)
+        of: Callable[[Rows], Array] = partial(_part, since=since, until=since + n)
+        found.append(_group(f"{name}{{}}{suffix}", unit, f"{name} as the law used it, {{}}", of, axes))
+        since += n
+    return found
+
+
+_PLAIN: Final = str.maketrans({"·": "", "/": "_", "²": "2", "°": "deg", " ": ""})
+"""Characters of a unit in a column's name."""
+
+
+def _part(rows: Rows, since: int, until: int) -> Array:
+    return rows.ticks.state[:, since:until]
 
 
 def _attitude(prefix: str, which: str, of: Callable[[Rows], Array]) -> list[Group]:

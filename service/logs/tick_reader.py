@@ -125,11 +125,11 @@ class TickReader:
                 columns[i][places] = column
                 if beside is not None:
                     columns[i][over] = beside[i]
-        attitude, desired, rate, attitude_error, rate_error, unquantized, sign, gain, damping = columns
-        unquantized[over] = damping[over] = np.nan
+        attitude, desired, rate, attitude_error, rate_error, unquantized, gains, state, after = columns
+        unquantized[over] = state[over] = np.nan
         ticks = Ticks(
             block.k, *self._times(block), attitude, desired, rate, rate - rate_error, attitude_error, rate_error,
-            self._voltages(block, commanded), unquantized, sign[:, 0], gain, damping,
+            self._voltages(block, commanded), unquantized, gains, state, after,
         )  # fmt: skip
         sent = _is(plant, block.at_plant, "sent_as", Sent.FRAME)
         sent |= (block.at_plant < 0) & _is(rows, block.at_controller, "received_as", Received.FRAME)

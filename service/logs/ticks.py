@@ -25,9 +25,10 @@ class Ticks(NamedTuple):
         attitude: q as measured. The other quantities of the law likewise, in its units.
         voltages: What was commanded; NaN where nothing was, or no valid value [V].
         unquantized: u before quantization [V].
-        sign: ±1, the equilibrium approached.
-        gain: C₁'s diagonal [1/s].
-        damping_estimate: θ̂ as the law used it [N·m·s/rad].
+        gains: The law's gains, one beside the other.
+        state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad].
+        state_next: The same after the tick; of the paper's law the sign of the equilibrium approached. Where the
+            controller computed nothing, of the law's own state at the last tick that it did.
     """
 
     k: Integers
@@ -44,9 +45,9 @@ class Ticks(NamedTuple):
     rate_error: Array
     voltages: Array
     unquantized: Array
-    sign: Array
-    gain: Array
-    damping_estimate: Array
+    gains: Array
+    state: Array
+    state_next: Array
 
     @classmethod
     def joined(cls, blocks: Sequence[Self]) -> Self:

@@ -21,9 +21,10 @@ import numpy.typing as npt
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array
-from aeroloop.service.review.certified_bounds import CertifiedBounds
+from aeroloop.service.review.certified_bounds import CertifiedBounds, PaperSignals
 from aeroloop.service.theorem.evaluation import Evaluated
 from aeroloop.service.theorem.invariant import Premises, largest_start, reach
 from aeroloop.service.theorem.lemma import Coordinates, Samples, lyapunov, norm, rotation, times
@@ -155,7 +156,8 @@ class Guarantees:
 
     def __init__(self, certified: CertifiedBounds, loop: LoopSettings, plant: PlantSettings) -> None:
         e = certified.bounds
-        self._law, self._evaluated, self._period = certified.law, e, loop.period
+        self._certified, self._law = certified, certified.law or AdaptiveSettings()
+        self._evaluated, self._period = e, loop.period
         self.unjudged = certified.verdict.rstrip(".") if e is None else _unjudged(e)
         self._supply = plant.voltage_limit
         self._theta = None if e is None else e.bounds.theta
@@ -279,7 +281,8 @@ class Guarantees:
     def _lyapunov(self, b: Coordinates, at: Ticks) -> Array:
         """V, or a bound of it where θ is not known. Shape (n,)."""
         if self._theta is not None:
-            return lyapunov(b, self._theta - at.damping_estimate, self._law)
+            estimate = PaperSignals.of(at, self._certified).damping_estimate
+            return lyapunov(b, self._theta - estimate, self._law)
         assert self._evaluated is not None
         p = self._evaluated.plant
         unknown: Array = lyapunov(b, np.zeros((1, 3)), self._law) + p.theta_error**2 / min(p.Gamma) / 2
@@ -289,12 +292,13 @@ class Guarantees:
         """‖x‖ of `invariant`, or a bound of it where θ is not known or the roll is held. Shape (n,)."""
         if self._set is None:
             return np.full(len(at.k), inf)
-        eps, z2 = at.sign[:, None] * b.eps_e, b.z2
+        paper = PaperSignals.of(at, self._certified)
+        eps, z2 = paper.sign[:, None] * b.eps_e, b.z2
         if self._theta is None or self._set.held_roll:
             whole: Array = norm(np.hstack([eps, z2])) + self._set.offset
             return whole
         C1, C2 = np.array(self._law.C1), np.array(self._law.C2)
-        balance = -self._desired_rate(at) * (self._theta - at.damping_estimate) / (1 + C1 * C2)
+        balance = -self._desired_rate(at) * (self._theta - paper.damping_estimate) / (1 + C1 * C2)
         return norm(np.hstack([eps - balance, z2 - C1 * balance]))
 
     @staticmethod

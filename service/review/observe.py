@@ -21,7 +21,7 @@ from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
 from aeroloop.service.review.angles import beside, of_nearer_sign, without_jumps
 from aeroloop.service.review.downsample import MAX_POINTS, DownsampledLines
-from aeroloop.service.review.panels import columns_of, panels_of, with_level
+from aeroloop.service.review.panels import columns_of, drawn_state, panels_of, with_level
 from aeroloop.service.review.report import Gap, Panel, Spread
 from aeroloop.service.review.theorem_check import TheoremCheck
 
@@ -105,6 +105,7 @@ class Observer:
         self._period = settings.loop.period
         self.check = check
         self._columns = columns_of(settings, theta=check.damping_known)
+        self._drawn_state = drawn_state(settings)
         self._part = part
         self._lines = DownsampledLines(1 + len(self._columns), part.points)  # k, then what is drawn
         self._last_angles: Array = np.zeros(3)
@@ -167,7 +168,7 @@ class Observer:
                     drawn.true_error,
                     ticks.latency_ns * 1e-3,
                     periods * 1e-3,
-                    ticks.damping_estimate,
+                    ticks.state[:, self._drawn_state],
                     drawn.norms,
                 ]
             )[(t >= self._part.since_s) & (t <= self._part.until_s)]

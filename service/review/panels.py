@@ -7,7 +7,7 @@ that figure. Roll, pitch and yaw come before them; timing, estimates, and the th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from typing import Final, Literal, NamedTuple
@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aeroloop.service.config import Settings
+from aeroloop.service.control.laws.evaluation import initial_state
+from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.traces import Array
 from aeroloop.service.review.report import Line, Panel
 
@@ -85,7 +87,7 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
         ("error_angle", "Attitude error, as an angle", ["angle"], "°", ("measured", "true")),
         ("latency", "Loop latency", ["latency"], "µs", ["latency"]),
         ("period", "Period between measurements", ["period"], "µs", ["period"]),
-        ("damping_estimate", "Damping estimate", ("θ̂₁", "θ̂₂", "θ̂₃"), "N·m·s/rad", ["estimated"]),
+        *_law_panels(settings),
         ("z_norm", "Error of Theorem 1", ["‖z‖"], "1", ("measured", "true")),
         ("lyapunov", "Lyapunov function", ["V"], "N·m", ("measured, without θ̃", true_V)),
     ]
@@ -95,6 +97,23 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
         for label in labels
         for line in lines
     ]
+
+
+def _law_panels(settings: Settings) -> Iterator[tuple[str, str, Sequence[str], str, Sequence[str]]]:
+    """A panel for each part of the law's named state, but for the sign of the equilibrium, in the state's order."""
+    law = law_of(settings.law, settings.loop.period, settings.wire.actuators)
+    for name, values in initial_state(law).items():
+        if name != "sign":
+            symbol = {"damping_estimate": "θ̂"}.get(name, name)
+            labels = [f"{symbol}{'₁₂₃₄₅₆₇₈₉'[i] if i < 9 else i + 1}" for i in range(len(values))]
+            yield name, name.replace("_", " ").capitalize(), labels, law.units.get(name, "1"), ["estimated"]
+
+
+def drawn_state(settings: Settings) -> list[int]:
+    """Columns of the law's named state that are drawn, in the order of their panels."""
+    law = law_of(settings.law, settings.loop.period, settings.wire.actuators)
+    names = [name for name, values in initial_state(law).items() for _ in values]
+    return [i for i, name in enumerate(names) if name != "sign"]
 
 
 def panels_of(columns: list[PanelColumn], values: Array) -> list[Panel]:

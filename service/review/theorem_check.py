@@ -22,11 +22,11 @@ import numpy.typing as npt
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.service.config import Settings
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Array, Integers
 from aeroloop.service.review.angles import of_nearer_sign
-from aeroloop.service.review.certified_bounds import CertifiedBounds
+from aeroloop.service.review.certified_bounds import CertifiedBounds, PaperSignals
 from aeroloop.service.review.guarantees import Conditions, Guarantees
 from aeroloop.service.review.report import LemmaCheck, TheoremFindings
 from aeroloop.service.theorem.lemma import (
@@ -161,7 +161,7 @@ class TheoremCheck:
 
     def ticks(self, ticks: Ticks) -> Drawn:
         """Check a block of ticks, and return what is drawn of it."""
-        z, V = measured_norm(ticks, self._certified.law)
+        z, V = measured_norm(ticks, self._certified)
         if (after := (ticks.k >= self._settled) & (ticks.k < self._until)).any():
             square = (ticks.attitude_error[after] ** 2).sum(axis=1)
             self._seen = _larger(self._seen, z[after], 2 * np.arcsin(np.sqrt(np.minimum(1.0, square))))
@@ -209,14 +209,17 @@ class TheoremCheck:
         certified, law = self._certified, self._certified.law
         inertial = times(rotation(at.attitude), at.desired_rate)
         q = truths.attitude * np.where((truths.attitude * at.attitude).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-        samples = Samples(q, truths.rate, at.attitude, at.rate, at.desired, inertial, at.sign)
-        b = coordinates(q, samples.omega, samples.q_d, inertial, at.sign, at.gain)
-        theta_error = np.zeros((1, 3)) if self._damping is None else self._damping - at.damping_estimate
+        paper = PaperSignals.of(at, certified)
+        samples = Samples(q, truths.rate, at.attitude, at.rate, at.desired, inertial, paper.sign)
+        b = coordinates(q, samples.omega, samples.q_d, inertial, paper.sign, paper.gain)
+        theta_error = np.zeros((1, 3)) if self._damping is None else self._damping - paper.damping_estimate
         within = (at.k >= self._since) & (at.k < self._until)
         half_angle = np.arcsin(np.minimum(1.0, np.linalg.norm(b.eps_e, axis=1)))
         if (after := within & (at.k >= self._settled)).any():
             self._true = _larger(self._true, b.norm[after], 2 * half_angle[after])
         self._samples += int(within.sum())
+        if law is None:
+            return b.norm, b.norm, np.degrees(2 * half_angle)  # NaN, without C₁
         if (bounds := certified.bounds) is not None and within.any():
             small = half_angle <= bounds.known.half_angle_e * (1 + 1e-9)
             time: Array = np.asarray(at.k * self._period, dtype=np.float64)
@@ -286,9 +289,9 @@ class TheoremCheck:
             transient_s=transient(certified.law),
             since_s=round(self._since * self._period, 9),
             until_s=None if self._until == inf else round(self._until * self._period, 9),
-            z_norm=seen and seen[0],
+            z_norm=seen[0] if seen and certified.law else None,
             error_deg=seen and degrees(seen[1]),
-            true_z_norm=true and true[0],
+            true_z_norm=true[0] if true and certified.law else None,
             true_error_deg=true and degrees(true[1]),
             damping_known=self.damping_known,
             samples=self._samples,
@@ -305,11 +308,13 @@ class TheoremCheck:
         changed = f"gains or reference changed at {found.until_s} s"
         end = "the session ended before" if found.until_s is None else changed
         short = f"the transient lasts {found.transient_s:.3g} s, and {end}"
-        if found.z_norm is None:
+        if found.error_deg is None:
             reasons |= dict.fromkeys(("z_norm", "error_deg"), short)
-        if found.true_z_norm is None:
-            why = short if found.z_norm is None and found.samples else no_truth
+        if found.true_error_deg is None:
+            why = short if found.error_deg is None and found.samples else no_truth
             reasons |= dict.fromkeys(("true_z_norm", "true_error_deg"), why)
+        if self._certified.law is None:
+            reasons |= dict.fromkeys(("z_norm", "true_z_norm"), found.verdict.rstrip("."))
         if found.broken is None:
             reasons["broken"] = "no true state satisfies the lemma's premises" if found.samples else no_truth
             if self._certified.bounds is None:
@@ -334,8 +339,12 @@ class TheoremCheck:
         return reasons
 
 
-def transient(law: LawSettings) -> float:
-    """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, and z₂ by J⁻¹C₂ (C.22) [s]."""
+def transient(law: AdaptiveSettings | None) -> float:
+    """Three times the slower time constant: ε̃ falls by C₁/2, as (C.12) has it near 0, and z₂ by J⁻¹C₂ (C.22) [s].
+
+    Of another law, whose constants are not known, that of the paper's gains.
+    """
+    law = law or AdaptiveSettings()
     return 3 * max(2 / min(law.C1), max(law.inertia) / min(law.C2))
 
 
@@ -355,12 +364,14 @@ def _larger(known: tuple[float, float] | None, norms: Array, angles: Array) -> t
     return max(norm, float(norms.max())), max(angle, float(angles.max()))
 
 
-def measured_norm(ticks: Ticks, law: LawSettings) -> tuple[Array, Array]:
-    """‖z^Q‖ and its V without θ̃ (C.24), from the errors that the controller computed. Shapes (n,)."""
-    sign, eps_e = ticks.sign[:, np.newaxis], ticks.attitude_error
+def measured_norm(ticks: Ticks, certified: CertifiedBounds) -> tuple[Array, Array]:
+    """‖z^Q‖ and its V without θ̃ (C.24), from the errors that the controller computed; NaN of another law. (n,)."""
+    law = certified.law or AdaptiveSettings()
+    paper, eps_e = PaperSignals.of(ticks, certified), ticks.attitude_error
+    sign = paper.sign[:, np.newaxis]
     eta_e = (ticks.attitude * ticks.desired).sum(axis=1)  # (C.32)
-    z1 = (1 - ticks.sign * eta_e) ** 2 + (eps_e**2).sum(axis=1)  # (C.39), its square
-    z2 = (ticks.rate_error + sign * ticks.gain * eps_e) ** 2  # (C.40); G z₁ = ±ε̃ by (C.49)
+    z1 = (1 - paper.sign * eta_e) ** 2 + (eps_e**2).sum(axis=1)  # (C.39), its square
+    z2 = (ticks.rate_error + sign * paper.gain * eps_e) ** 2  # (C.40); G z₁ = ±ε̃ by (C.49)
     norm: Array = np.sqrt(z1 + z2.sum(axis=1))
     V: Array = z1 + z2 @ np.array(law.inertia) / 2
     return norm, V

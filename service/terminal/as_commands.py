@@ -18,7 +18,7 @@ def as_commands(record: SessionRecord, options: Sequence[str] = ()) -> list[str]
 
     `options` are appended to each. Points stand in a here-document. A stream's time to reach a set-point has no option.
     """
-    gains = [word for name, value in record.gains if value is not None for word in (f"--{name}", *_numbers(value))]
+    gains = [word for name, value in record.gains.named.items() for word in (f"--{name}", *_numbers(value))]
     move, table = ["track", "hold"], ""
     match record.reference:
         case Hold(attitude=attitude) if attitude is not None:

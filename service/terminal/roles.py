@@ -101,7 +101,7 @@ def _lines(role: str, age: float, status: Status, silent: bool) -> Iterator[Text
         if begins is not None and begins < status.ticks and (ends is None or status.ticks <= ends):
             yield Text(f"{role}: {fault.fault} ({fault.source}): {fault.changed} {fault.effect}", style=BAD)
     if status.gains is not None:
-        gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in status.gains if gain)
+        gains = ", ".join(f"{name} {' '.join(f'{x:g}' for x in gain)}" for name, gain in status.gains.named.items())
         yield Text(f"{role}: reference {status.reference} ({status.reference_from})")
         yield Text(f"{role}: gains {gains} ({status.gains_from})")
 

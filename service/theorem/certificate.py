@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.messages.operator import Hold
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem
-from aeroloop.service.theorem.configured import Configured
+from aeroloop.service.theorem.configured import Configured, Sections, with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, beyond, evaluate, largest_voltage
 from aeroloop.service.theorem.invariant import Reach, reach, without_error
 from aeroloop.service.theorem.remedies import Holds, Remedy, remedies
@@ -93,7 +93,7 @@ class Certificate(BaseModel):
 
 
 def certify(
-    settings: Configured,
+    settings: Sections,
     *,
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
@@ -113,6 +113,7 @@ def certify(
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
         ValueError: A disturbance that is no number, or negative.
     """
+    settings = with_theorem(settings)
     evaluated = partial(evaluate, disturbance=disturbance, attitude_error_deg=attitude_error_deg, late_s=late_s)
     e = evaluated(settings)
     t = e.theorem

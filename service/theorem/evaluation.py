@@ -13,10 +13,11 @@ from math import asin, inf, radians, sin, sqrt
 import numpy as np
 
 from aeroloop.protocol.wire.spec import SignalSpec
-from aeroloop.service.control.law import ESTIMATE_REACH, check_invertible
+from aeroloop.service.control.laws.adaptive import ESTIMATE_REACH
+from aeroloop.service.control.laws.body import check_invertible
 from aeroloop.service.control.reference import Floats
 from aeroloop.service.theorem.bounds import Known, Lemma, Theorem, lemma_1, theorem_1
-from aeroloop.service.theorem.configured import Configured
+from aeroloop.service.theorem.configured import Configured, Sections, with_theorem
 from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
@@ -50,7 +51,7 @@ class Evaluated:
 
 
 def evaluate(
-    settings: Configured,
+    settings: Sections,
     *,
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
@@ -63,6 +64,7 @@ def evaluate(
     With `only_plant` the paper's body is left out, which does not decide whether a certificate holds; `desired` are the
     reference's extremes if they are known.
     """
+    settings = with_theorem(settings)
     stated = disturbance or 0.0
     if not 0 <= stated < inf:
         raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
@@ -85,7 +87,7 @@ def evaluate(
 
 
 def premises(
-    settings: Configured, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
+    settings: Sections, desired: Extremes, plant: PlantBounds, disturbance: float = 0.0, late_s: float = 0.0
 ) -> Premises:
     """Premises of the invariant set.
 
@@ -96,6 +98,7 @@ def premises(
         disturbance: Further torque [N·m].
         late_s: Further age of a command [s].
     """
+    settings = with_theorem(settings)
     wire, law = settings.wire, settings.law
     gravity = law.mass * law.gravity
     return Premises(
@@ -167,15 +170,17 @@ def _error(signal: SignalSpec, elements: int) -> float:
     return sqrt(elements) * signal.quantizer().bound
 
 
-def largest_voltage(settings: Configured, desired: Extremes, at: Reach) -> float:
+def largest_voltage(settings: Sections, desired: Extremes, at: Reach) -> float:
     """The largest |u_k| that the law commands within a set [V]."""
+    settings = with_theorem(settings)
     inverse = np.linalg.inv(_motors(settings))
     along = np.abs(feedforward(desired.samples, settings.law)[:, -len(inverse) :] @ inverse.T).max(axis=0)
     return float((along + np.linalg.norm(inverse, axis=1) * at.deviation).max())
 
 
-def beyond(settings: Configured, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
+def beyond(settings: Sections, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:
     """Ranges that a set exceeds: symbol, what it reaches, unit, range, and what fails, with its key."""
+    settings = with_theorem(settings)
     wire = settings.wire
     volts, limit = largest_voltage(settings, desired, at), min(wire.voltage.limit, settings.plant.voltage_limit)
     ranges = (

@@ -15,7 +15,7 @@ import numpy as np
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Reference, Stream
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Angles, Floats, Plan
 from aeroloop.service.theorem.bounds import attitude_error
 
@@ -113,7 +113,7 @@ def body_rates(angles: Angles) -> tuple[Floats, Floats]:
     return rate, acceleration
 
 
-def feedforward(angles: Angles, law: LawSettings) -> Floats:
+def feedforward(angles: Angles, law: AdaptiveSettings) -> Floats:
     """The torque that the law commands without error and with θ̂ = 0, −Ψ + J R ω̇_d of (C.22) [N·m]. Shape (n, 3)."""
     omega, omega_dot = body_rates(angles)
     roll, pitch, _ = angles.angle.T

@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.theorem.bounds import Known, Lemma
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -99,7 +99,7 @@ def coordinates(q: Floats, omega: Floats, q_d: Floats, omega_d: Floats, sign: Fl
     return Coordinates(R, omega_e, eps_e, eta_e[:, :, None] * np.identity(3) + skew(eps_e), z1, z2)
 
 
-def lemma_inequalities(samples: Samples, law: LawSettings, p: Known, d: Lemma) -> list[Inequality]:
+def lemma_inequalities(samples: Samples, law: AdaptiveSettings, p: Known, d: Lemma) -> list[Inequality]:
     """Both sides of the premises (C.28), (C.29), of (C.26), (C.27) and of every inequality of Lemma 1."""
     C1, J = np.array(law.C1), np.array(law.inertia)
     r_g, f_g = np.array(law.centre_of_mass), np.array([0.0, 0.0, -law.mass * law.gravity])
@@ -138,7 +138,7 @@ def lemma_inequalities(samples: Samples, law: LawSettings, p: Known, d: Lemma) -
     ]
 
 
-def lyapunov(c: Coordinates, theta_error: Floats, law: LawSettings) -> Floats:
+def lyapunov(c: Coordinates, theta_error: Floats, law: AdaptiveSettings) -> Floats:
     """V of the true state.
 
     Args:

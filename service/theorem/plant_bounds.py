@@ -16,7 +16,7 @@ from aeroloop.plant_emulator.model.aero import AeroSettings
 from aeroloop.plant_emulator.model.sensors import SensorSettings
 from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
 from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.service.theorem.configured import Configured
+from aeroloop.service.theorem.configured import Configured, Sections
 
 DEVIATIONS: Final = 4
 
@@ -48,7 +48,7 @@ class PlantBounds:
     unproven: list[str] = field(default_factory=list)
 
 
-def paper_body(settings: Configured) -> PlantBounds:
+def paper_body(settings: Sections) -> PlantBounds:
     """The paper's plant: three torques, perfect sensors, no lag; commands are held for a period."""
     return PlantBounds(age=settings.loop.period)
 

@@ -12,9 +12,9 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from aeroloop.protocol.messages.operator import MAX_GAIN
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.interface import MAX_GAIN
 from aeroloop.service.theorem.configured import Configured
 
 Holds = Callable[[Configured], bool]
@@ -105,7 +105,7 @@ def _by_bits_and_damping(settings: Configured, holds: Holds) -> Iterator[Remedy]
                 return
 
 
-def _bounds(law: LawSettings) -> list[float]:
+def _bounds(law: AdaptiveSettings) -> list[float]:
     """Smaller bounds of the damping that still hold the first estimate, the largest first."""
     least = hypot(*law.damping_estimate)
     tried = [_rounded(law.damping_bound, law.damping_bound * 0.85**n) for n in range(1, 25)]
@@ -119,7 +119,7 @@ def _damping_remedy(also: str, bound: float, overrides: list[str]) -> Remedy:
     )
 
 
-def _with_law(settings: Configured, law: LawSettings) -> Configured:
+def _with_law(settings: Configured, law: AdaptiveSettings) -> Configured:
     return settings.model_copy(update={"law": law})
 
 
@@ -137,13 +137,13 @@ def _least_factor(holds: Callable[[float], bool]) -> float | None:
     return None
 
 
-def scaled(law: LawSettings, factors: dict[str, float]) -> LawSettings:
+def scaled(law: AdaptiveSettings, factors: dict[str, float]) -> AdaptiveSettings:
     """The law with some gains multiplied."""
     changed = {name: tuple(gain * factor for gain in getattr(law, name)) for name, factor in factors.items()}
     return law.model_copy(update=changed)
 
 
-def _gains_remedy(law: LawSettings, factors: dict[str, float]) -> Remedy:
+def _gains_remedy(law: AdaptiveSettings, factors: dict[str, float]) -> Remedy:
     changed = {name: [_rounded(gain, gain * f) for gain in getattr(law, name)] for name, f in factors.items()}
     return Remedy(
         text=" and ".join(f"law.{name} = {gains}" for name, gains in changed.items()),

@@ -107,25 +107,27 @@ class Tracking(View, frozen=True):
     error_p_deg_s: float = Field(description="ω_e about the body's x axis [deg/s]")
     error_q_deg_s: float = Field(description="ω_e about the body's y axis [deg/s]")
     error_r_deg_s: float = Field(description="ω_e about the body's z axis [deg/s]")
-    damping_1: float = Field(description="θ̂₁ [N·m·s/rad]")
-    damping_2: float = Field(description="θ̂₂ [N·m·s/rad]")
-    damping_3: float = Field(description="θ̂₃ [N·m·s/rad]")
-    sign: int = Field(description="the equilibrium approached, z₁₊ or z₁₋")
+    damping_1: float | None = Field(description="θ̂₁; null with another law than the paper's [N·m·s/rad]")
+    damping_2: float | None = Field(description="θ̂₂ [N·m·s/rad]")
+    damping_3: float | None = Field(description="θ̂₃ [N·m·s/rad]")
+    sign: int | None = Field(description="the equilibrium approached, z₁₊ or z₁₋; null with a law that has none")
 
     @classmethod
     def of(cls, telemetry: Telemetry, period: float | None) -> Self:
         """Of the controller's telemetry, and the law's period [s]. The measured attitude is q = q_d ⊗ e of (C.16)."""
         x, y, z = telemetry.attitude_error
         scalar = sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
-        measured = _product(telemetry.desired, (scalar if telemetry.sign >= 0 else -scalar, x, y, z))
+        (sign,) = telemetry.state.get("sign", (None,))[:1]
+        damping = [*telemetry.state.get("damping_estimate", ()), None, None, None][:3]
+        measured = _product(telemetry.desired, (-scalar if sign == -1 else scalar, x, y, z))
         return cls.in_order(
             None if period is None else round(telemetry.tick * period, 6),
             _degree(angle(x, y, z)),
             *_degrees(to_euler(measured)),
             *_degrees(to_euler(telemetry.desired)),
             *_degrees(telemetry.rate_error),
-            *(round(theta, 6) for theta in telemetry.damping_estimate),
-            telemetry.sign,
+            *(theta if theta is None else round(theta, 6) for theta in damping),
+            sign if sign is None else int(sign),
         )
 
 

@@ -12,33 +12,61 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.messages.operator import MAX_GAIN
 
 Floats = npt.NDArray[np.float64]
+Vector = tuple[float, float, float]
 X = TypeVar("X")
 S = TypeVar("S", bound="LawSettings")
 
+MAX_GAIN: Final = 20.0
+"""The largest gain: no typing error makes one a hundred times too large."""
 PositiveGain = Annotated[float, Field(gt=0, le=MAX_GAIN)]
-"""A gain that must act; bounded, so that no typing error makes it a hundred times too large."""
+"""A gain that must act."""
 Gain = Annotated[float, Field(ge=0, le=MAX_GAIN)]
 """A gain that may be 0."""
 Gains3 = tuple[Gain, Gain, Gain]
 """One for each body axis: x, y, z."""
 
 
-class LawSettings(BaseModel):
-    """Settings of a law: `[law]` of the configuration. A law's own model derives from it and adds fields with units."""
+def _positive(values: Vector) -> Vector:
+    if min(values) <= 0:
+        raise ValueError("every element must be positive")
+    return values
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+
+Diagonal = Annotated[Vector, AfterValidator(_positive)]
+"""The diagonal of a positive definite matrix."""
+
+Row = Annotated[tuple[float, ...], Field(min_length=1, max_length=8)]
+
+
+class LawSettings(BaseModel):
+    """Settings of a law: `[law]` of the configuration. A law's own model derives from it and adds fields with units.
+
+    All have a model of the plant, which stays where only the kind is changed. The default is Table C.1.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="strings")
 
     kind: str = Field(description="which law: one of ours, an entry point of aeroloop.laws, or package.module:Class")
+    inertia: Diagonal = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
+    mass: float = Field(default=1.075, gt=0, description="m [kg]")
+    gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
+    centre_of_mass: Vector = Field(
+        default=(0.0, 0.0, -0.0038), description="r_g, origin to centre of mass, body frame [m]"
+    )
+    allocation: tuple[Row, Row, Row] = Field(
+        default=((1.0, 0.0, 0.0), (0.0, 0.0011, 0.0011), (0.0, -0.0014, 0.00176)),
+        description="B, control allocation of rank 3, a column for each motor [N·m/V]; the Aero's first row and column "
+        "are fictitious",
+    )
 
 
 class Now(NamedTuple, Generic[X]):
@@ -81,10 +109,12 @@ class Law(ABC, Generic[S]):
     Attributes:
         Settings: The model of its settings.
         gains: Names of those settings that may change while it runs: numbers, or tuples of them.
+        units: Unit of each part of its named state, for tables and pages; 1 where none is given.
     """
 
     Settings: ClassVar[type[LawSettings]]
     gains: ClassVar[tuple[str, ...]] = ()
+    units: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, settings: S, period: float, actuators: int) -> None:
         self.settings = settings
@@ -92,7 +122,7 @@ class Law(ABC, Generic[S]):
         self.actuators = actuators
 
     @classmethod
-    def certify(cls, configured: Any) -> Mapping[str, Any] | None:
+    def certify(cls, configured: Any) -> Mapping[str, Any] | None:  # noqa: ARG003  # for those that override it
         """What is proven of a configuration with this law: `holds` and `verdict`, with whatever else; None if nothing.
 
         Args:

@@ -1,0 +1,164 @@
+"""Registry of laws: `[law]` of the configuration, and the law that it names."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final
+
+from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError, create_model
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.operator import Gains
+from aeroloop.protocol.plugins import PluginError, find, own_words, source_of
+from aeroloop.protocol.wording import problems
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.interface import Law, LawSettings
+from aeroloop.service.control.laws.lqr import LQRSettings
+from aeroloop.service.control.laws.nonadaptive import NonadaptiveSettings
+from aeroloop.service.control.laws.pd import PDSettings
+from aeroloop.service.control.laws.pid import PIDSettings
+from aeroloop.service.control.laws.sliding import SlidingSettings
+
+GROUP: Final = "aeroloop.laws"
+_LAWS: Final = "aeroloop.service.control.laws"
+BUILT_IN: Final = {
+    "adaptive": f"{_LAWS}.adaptive:Adaptive",
+    "nonadaptive": f"{_LAWS}.nonadaptive:Nonadaptive",
+    "pd": f"{_LAWS}.pd:PD",
+    "pid": f"{_LAWS}.pid:PID",
+    "sliding": f"{_LAWS}.sliding:Sliding",
+    "lqr": f"{_LAWS}.lqr:LQR",
+}
+_OWN: Final = "package.module:Class"
+
+
+class OwnLawSettings(LawSettings):
+    """A user's law, as configured. Its own model checks the keys where the law is used: `own_settings`."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+def _tag(section: Any) -> str:
+    kind = section.get("kind", "adaptive") if isinstance(section, dict) else getattr(section, "kind", "")
+    return kind if kind in BUILT_IN else _OWN
+
+
+_MODELS: Final = {
+    "adaptive": AdaptiveSettings,
+    "nonadaptive": NonadaptiveSettings,
+    "pd": PDSettings,
+    "pid": PIDSettings,
+    "sliding": SlidingSettings,
+    "lqr": LQRSettings,
+    _OWN: OwnLawSettings,
+}
+
+LawSection = Annotated[
+    Annotated[AdaptiveSettings, Tag("adaptive")]
+    | Annotated[NonadaptiveSettings, Tag("nonadaptive")]
+    | Annotated[PDSettings, Tag("pd")]
+    | Annotated[PIDSettings, Tag("pid")]
+    | Annotated[SlidingSettings, Tag("sliding")]
+    | Annotated[LQRSettings, Tag("lqr")]
+    | Annotated[OwnLawSettings, Tag(_OWN)],
+    Discriminator(_tag),
+    Field(
+        json_schema_extra={
+            "discriminator": {
+                "propertyName": "kind",
+                "mapping": {kind: f"#/$defs/{model.__name__}" for kind, model in _MODELS.items()},
+            }
+        }
+    ),
+]
+
+
+class LawError(AeroloopError):
+    """A law that cannot be used; one line with its name."""
+
+
+def own_settings(section: LawSettings) -> LawSettings:
+    """The settings as the law's own model has them, defaults included.
+
+    Raises:
+        PluginError: There is no such law.
+        LawError: The settings are wrong.
+    """
+    return _class_and_settings(section)[1]
+
+
+def law_class(section: LawSettings) -> type[Law[Any]]:
+    """The class of the law that a section configures. Raises PluginError."""
+    return find("law.kind", section.kind, GROUP, BUILT_IN, Law)
+
+
+def version_of(section: LawSettings) -> dict[str, str]:
+    """Which source a user's law is of, for descriptions; nothing of ours. Raises PluginError."""
+    return {} if section.kind in BUILT_IN else {f"law {section.kind}": source_of(law_class(section))}
+
+
+def gains_of(section: LawSettings) -> Gains:
+    """The configured gains. Raises as `own_settings`."""
+    law, settings = _class_and_settings(section)
+    return Gains.model_validate({name: getattr(settings, name) for name in law.gains})
+
+
+def with_gains(section: LawSettings, gains: Gains) -> LawSettings:
+    """The settings with other gains; those not given stay.
+
+    Raises:
+        PluginError: There is no such law.
+        LawError: The law has no such gain, or it is out of its bounds; the text names all of its gains.
+    """
+    law, settings = _class_and_settings(section)
+    if unknown := [name for name in gains.named if name not in law.gains]:
+        known = ", ".join(law.gains) or "none that may change while it runs"
+        raise LawError(f"law {section.kind} has no gain {unknown[0]}; it has {known}")
+    numbers = {
+        name: isinstance(getattr(settings, name), int | float) and len(gain) == 1 for name, gain in gains.named.items()
+    }
+    changed = {name: gain[0] if numbers[name] else gain for name, gain in gains.named.items()}
+    return _valid(type(settings), settings.model_dump() | changed)
+
+
+def law_of(section: LawSettings, period: float, actuators: int) -> Law[Any]:
+    """The law that a section configures.
+
+    Args:
+        section: `[law]`.
+        period: Time between ticks [s].
+        actuators: Number of voltages to give.
+
+    Raises:
+        PluginError: There is no such law.
+        LawError: The settings are wrong, or it is no law for so many actuators.
+    """
+    law, settings = _class_and_settings(section)
+    try:
+        return law(settings, period, actuators)
+    except Exception as error:
+        raise LawError(words_of(section.kind, error)) from None
+
+
+def words_of(kind: str, error: Exception) -> str:
+    """What a law of this kind raised, in one line."""
+    if kind in BUILT_IN:
+        return str(error)
+    return f"law {kind}: {own_words(error)}"
+
+
+def _class_and_settings(section: LawSettings) -> tuple[type[Law[Any]], LawSettings]:
+    law = law_class(section)
+    model = getattr(law, "Settings", None)
+    if not (isinstance(model, type) and issubclass(model, LawSettings)):
+        raise PluginError(f"law.kind = {section.kind!r} has no Settings that derive from aeroloop.LawSettings")
+    if isinstance(section, model):
+        return law, section
+    return law, _valid(model, section.model_dump())
+
+
+def _valid(model: type[LawSettings], values: dict[str, Any]) -> LawSettings:
+    configuration = create_model("Configuration", law=(model, ...))  # so that messages have the whole key
+    try:
+        return configuration.model_validate({"law": values}).law  # type: ignore[attr-defined, no-any-return]  # its field
+    except ValidationError as error:
+        raise LawError("; ".join(problems(error, configuration))) from None
