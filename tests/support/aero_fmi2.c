@@ -11,7 +11,10 @@ enum { U, LOAD = 2, Q = 4, RATE = 8, ANGLES = 11, FAILS_AT = 13, FAILS_WITH, SIZ
 typedef struct {
   double v[SIZE], x[4], w[WORK];
   const fmi2CallbackFunctions* callbacks;
+  int calls; /* of those in between, which must come in this order */
 } Aero;
+
+static fmi2Status in_order(fmi2Component c, int call) { return ((Aero*)c)->calls++ == call ? fmi2OK : fmi2Error; }
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
     const fmi2CallbackFunctions* callbacks, fmi2Boolean visible, fmi2Boolean logging) {
@@ -25,6 +28,15 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
   }
   return aero;
 }
+
+fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean tolerance_defined, fmi2Real tolerance, fmi2Real start,
+    fmi2Boolean stop_defined, fmi2Real stop) {
+  return in_order(c, 0);
+}
+
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return in_order(c, 1); }
+
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return in_order(c, 2); }
 
 void fmi2FreeInstance(fmi2Component c) { free(c); }
 
@@ -41,6 +53,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real length, fmi2Boolean no_set_state) {
   Aero* aero = c;
   double* v = aero->v;
+  if (aero->calls != 3) return fmi2Error;
   if (time >= v[FAILS_AT] || fabs(length - PERIOD) > 1e-9) {
     fmi2Status status = time >= v[FAILS_AT] ? (fmi2Status)v[FAILS_WITH] : fmi2Error;
     aero->callbacks->logger(0, "aero", status, "error", status == fmi2Error && time < v[FAILS_AT]
@@ -55,10 +68,10 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real length, fmi2Boole
   return fmi2OK;
 }
 
-#define DOES_NOTHING(name) fmi2Status name(fmi2Component c) { return fmi2OK; }
+fmi2Status fmi2Terminate(fmi2Component c) { return fmi2OK; }
+
 #define IS_MISSING(name) fmi2Status name(fmi2Component c) { return fmi2Error; }
-DOES_NOTHING(fmi2SetupExperiment) DOES_NOTHING(fmi2EnterInitializationMode) DOES_NOTHING(fmi2ExitInitializationMode)
-DOES_NOTHING(fmi2Terminate) IS_MISSING(fmi2Reset) IS_MISSING(fmi2SetDebugLogging)
+IS_MISSING(fmi2Reset) IS_MISSING(fmi2SetDebugLogging)
 IS_MISSING(fmi2GetInteger) IS_MISSING(fmi2GetBoolean) IS_MISSING(fmi2GetString)
 IS_MISSING(fmi2SetInteger) IS_MISSING(fmi2SetBoolean) IS_MISSING(fmi2SetString)
 IS_MISSING(fmi2GetFMUstate) IS_MISSING(fmi2SetFMUstate) IS_MISSING(fmi2FreeFMUstate)

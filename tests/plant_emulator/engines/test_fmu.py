@@ -118,6 +118,14 @@ def test_start_values_are_the_fmus_parameters(fmus: dict[str, Path], mapping: st
     assert np.abs(theirs - ours).max() < 1e-12
 
 
+def test_until_the_first_command_its_voltages_are_zero_whatever_it_starts_with(fmus: dict[str, Path]) -> None:
+    started, still = (FmuPlant(settings_of(fmus["fmi2"], start=start), PERIOD) for start in ({"u2": 5.0}, {}))
+    for plant in (started, still):
+        plant.advance()
+        plant.close()
+    assert started.truth() == still.truth()
+
+
 def test_angles_in_degrees_are_angles(fmus: dict[str, Path]) -> None:
     radians, degrees = (
         FmuPlant(settings_of(fmus["fmi3"], "joints", angle_unit=angle, rate_unit=rate), PERIOD)
@@ -238,9 +246,13 @@ def test_casadis_export_alone_is_for_model_exchange_and_refused_as_that(tmp_path
 
 
 @pytest.mark.parametrize("status", [2, 3, FATAL])
-def test_a_step_that_fails_is_one_line_with_its_time_and_the_fmus_own_words(fmus: dict[str, Path], status: int) -> None:
+def test_a_step_that_fails_is_one_line_with_its_time_and_the_fmus_own_words(
+    fmus: dict[str, Path], status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     start = {"fails_at": 0.1, "fails_with": status}
     plant = FmuPlant(settings_of(fmus["fmi2"], start=start), PERIOD)
+    freed: list[None] = []
+    monkeypatch.setattr(plant._fmu._fmu, "freeInstance", lambda: freed.append(None))
     with pytest.raises(FmuError) as failed:
         driven(plant, WOBBLE)
     name = {2: "discard", 3: "error", FATAL: "fatal"}[status]
@@ -256,7 +268,7 @@ def test_a_library_that_cannot_be_loaded_is_one_line(fmus: dict[str, Path], tmp_
     broken = altered(fmus["fmi2"], tmp_path / "broken.fmu", files=(LIBRARY, "other"))
     with ZipFile(broken, "a") as archive:
         archive.writestr(f"binaries/{PLATFORM}/{LIBRARY}", "no library")
-    with pytest.raises(FmuError, match="broken.fmu: it does not start: Failed to load shared library") as refused:
+    with pytest.raises(FmuError, match=r"broken.fmu: it does not start: Failed to load shared library") as refused:
         FmuPlant(settings_of(broken), PERIOD)
     assert "\n" not in str(refused.value)
 
@@ -348,14 +360,24 @@ def test_lab_experiment_gives_the_figures_of_our_ideal_aero(
         assert theirs[name] == pytest.approx(ours[name], rel=1e-9)
 
 
-def test_an_fmu_that_fails_in_the_loop_ends_it_with_its_own_words(
-    configuration: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
+def test_an_fmu_that_fails_in_the_loop_ends_it_with_its_own_words_and_is_closed(
+    configuration: Callable[[str], Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    closed: list[FmuPlant] = []
+    close = FmuPlant.close
+
+    def noted(plant: FmuPlant) -> None:
+        closed.append(plant)
+        close(plant)
+
+    monkeypatch.setattr(FmuPlant, "close", noted)
     failing = ["--set", "plant.own.start.fails_at=0.5", "--set", "plant.own.start.fails_with=3"]
     assert execute(["lab", "experiment", "--duration", "2", "--config", str(configuration("fmi2")), *failing]) == 1
-    said = capsys.readouterr().err
-    assert "the motor burnt at 0.5 s" in said
-    assert said.count("\n") == 1
+    assert capsys.readouterr().err == (
+        "aeroloop: FmuPlant failed in advance(): aero.fmu: it failed at 0.5 s: fmi2DoStep failed with status 3 (error):"
+        " the motor burnt at 0.5 s\n"
+    )
+    assert len(closed) == 1
 
 
 @pytest.mark.processes
