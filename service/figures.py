@@ -7,7 +7,7 @@ are (C.81), summed as rectangles, because a sampled loop holds its values for a 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import degrees
+from math import degrees, sqrt
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,12 @@ class Figures(BaseModel):
     u_total: float | None = Field(description="∫ uᵀu dt of the commands as sent [V²·s]")
     max_error_deg: float | None = Field(description="largest attitude error as measured [deg]")
     final_error_deg: float | None = Field(description="attitude error at the last tick as measured [deg]")
+    second_half_error_deg: float | None = Field(
+        default=None, description="largest attitude error as measured in the second half, by whole seconds [deg]"
+    )
+    command_changes_per_s: float | None = Field(
+        default=None, description="changes of a commanded voltage, of all motors together [1/s]"
+    )
     measurement: StreamFigures
     command: StreamFigures
     skipped_ticks: int | None = Field(description="ticks without a command, whatever the reason")
@@ -74,6 +80,9 @@ class Score:
         self._largest: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._largest_square = 0.0
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self._largest_squares: list[float] = []  # of each second since the first error
+        self._voltages: Sequence[float] = ()
+        self._changes = 0
 
     def error(self, k: int, error: Sequence[float], *, sent: bool = True) -> None:
         """Add the attitude error ε̃ at tick k; it holds until the next. Shape (3,).
@@ -89,6 +98,7 @@ class Score:
         self._error_tick = k
         self._error_square = x * x + y * y + z * z
         self._last = x, y, z
+        self._second(int((k - self._first) * self._period), self._error_square)
         if self._error_square > self._largest_square:
             self._largest, self._largest_square = self._last, self._error_square
         self._errors += 1
@@ -99,6 +109,8 @@ class Score:
         A command without a valid value sets the plant to 0 V. It counts as a frame only if one was sent.
         """
         self._unsent_commands += not sent
+        self._changes += sum(a != b and (a == a or b == b) for a, b in zip(voltages, self._voltages, strict=False))
+        self._voltages = tuple(voltages)
         if self._commands:
             held = min(k - self._command_tick, self._longest_hold)
             self._u_total += self._command_square * (held * self._period)
@@ -122,6 +134,10 @@ class Score:
         square = squares(errors)
         before = np.append(self._error_square, square[:-1])
         self._z_track = added(self._z_track, before * (np.diff(k, prepend=self._error_tick) * self._period))
+        seconds = ((k - self._first) * self._period).astype(int)  # type: ignore[operator]  # there was a first error
+        starts = np.flatnonzero(np.diff(seconds, prepend=-1))
+        for second, most in zip(seconds[starts], np.fmax.reduceat(square, starts), strict=True):
+            self._second(int(second), float(most))
         largest = int(np.argmax(np.where(np.isnan(square), -1.0, square)))
         if square[largest] > self._largest_square:
             self._largest, self._largest_square = tuple(errors[largest].tolist()), float(square[largest])
@@ -135,6 +151,10 @@ class Score:
             k, voltages = k[1:], voltages[1:]
         if not len(k):
             return
+        rows = np.vstack([self._voltages, voltages])
+        known = ~(np.isnan(rows[1:]) & np.isnan(rows[:-1]))
+        self._changes += int(np.count_nonzero((rows[1:] != rows[:-1]) & known))
+        self._voltages = voltages[-1].tolist()
         square = squares(voltages)
         square[np.isnan(square)] = 0.0
         before = np.append(self._command_square, square[:-1])
@@ -142,6 +162,11 @@ class Score:
         self._u_total = added(self._u_total, before * (held * self._period))
         self._command_tick, self._command_square = int(k[-1]), float(square[-1])
         self._commands += len(k)
+
+    def _second(self, second: int, square: float) -> None:
+        self._largest_squares += [0.0] * (second + 1 - len(self._largest_squares))
+        if square > self._largest_squares[second]:
+            self._largest_squares[second] = square
 
     @property
     def ticks(self) -> int:
@@ -160,17 +185,20 @@ class Score:
         """The figures so far; the last error and the last command count for one period."""
         reasons = dict(reasons or {})
         duration = self.ticks * self._period
+        half = self._largest_squares[len(self._largest_squares) // 2 :]
         if not self._errors:
-            for name in ("z_track", "max_error_deg", "final_error_deg", "skipped_ticks"):
+            for name in ("z_track", "max_error_deg", "final_error_deg", "second_half_error_deg", "skipped_ticks"):
                 reasons[name] = "no measurement was answered"
         if not self._commands:
-            reasons["u_total"] = "no command was sent"
+            reasons |= dict.fromkeys(("u_total", "command_changes_per_s"), "no command was sent")
         return Figures(
             duration_s=round(duration, 9),
             z_track=self._z_track + self._error_square * self._period if self._errors else None,
             u_total=self._u_total + self._command_square * self._period if self._commands else None,
             max_error_deg=degrees(angle(*self._largest)) if self._errors else None,
             final_error_deg=degrees(angle(*self._last)) if self._errors else None,
+            second_half_error_deg=degrees(angle(sqrt(max(half)), 0.0, 0.0)) if half else None,
+            command_changes_per_s=self._changes / duration if duration and self._commands else None,
             measurement=_stream(self._errors - self._unsent_errors, self._wire.measurement, duration),
             command=_stream(self._commands - self._unsent_commands, self._wire.command, duration),
             skipped_ticks=self.ticks - self._commands if self._errors else None,

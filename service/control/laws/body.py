@@ -9,8 +9,6 @@ from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.interface import LawSettings
 
-BodySettings = LawSettings
-
 
 def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
     """Torque of the weight about the origin at attitude q, body frame: −g of (C.45) [N·m]. Shape (3,)."""

@@ -12,10 +12,22 @@ from aeroloop.protocol.plugins import PluginError, find, own_words, source_of
 from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import Law, LawSettings
+from aeroloop.service.control.laws.lqr import LQRSettings
+from aeroloop.service.control.laws.nonadaptive import NonadaptiveSettings
+from aeroloop.service.control.laws.pd import PDSettings
+from aeroloop.service.control.laws.pid import PIDSettings
+from aeroloop.service.control.laws.sliding import SlidingSettings
 
 GROUP: Final = "aeroloop.laws"
 _LAWS: Final = "aeroloop.service.control.laws"
-BUILT_IN: Final = {"adaptive": f"{_LAWS}.adaptive:Adaptive"}
+BUILT_IN: Final = {
+    "adaptive": f"{_LAWS}.adaptive:Adaptive",
+    "nonadaptive": f"{_LAWS}.nonadaptive:Nonadaptive",
+    "pd": f"{_LAWS}.pd:PD",
+    "pid": f"{_LAWS}.pid:PID",
+    "sliding": f"{_LAWS}.sliding:Sliding",
+    "lqr": f"{_LAWS}.lqr:LQR",
+}
 _OWN: Final = "package.module:Class"
 
 
@@ -30,10 +42,24 @@ def _tag(section: Any) -> str:
     return kind if kind in BUILT_IN else _OWN
 
 
-_MODELS: Final = {"adaptive": AdaptiveSettings, _OWN: OwnLawSettings}
+_MODELS: Final = {
+    "adaptive": AdaptiveSettings,
+    "nonadaptive": NonadaptiveSettings,
+    "pd": PDSettings,
+    "pid": PIDSettings,
+    "sliding": SlidingSettings,
+    "lqr": LQRSettings,
+    _OWN: OwnLawSettings,
+}
 
 LawSection = Annotated[
-    Annotated[AdaptiveSettings, Tag("adaptive")] | Annotated[OwnLawSettings, Tag(_OWN)],
+    Annotated[AdaptiveSettings, Tag("adaptive")]
+    | Annotated[NonadaptiveSettings, Tag("nonadaptive")]
+    | Annotated[PDSettings, Tag("pd")]
+    | Annotated[PIDSettings, Tag("pid")]
+    | Annotated[SlidingSettings, Tag("sliding")]
+    | Annotated[LQRSettings, Tag("lqr")]
+    | Annotated[OwnLawSettings, Tag(_OWN)],
     Discriminator(_tag),
     Field(
         json_schema_extra={

@@ -207,7 +207,8 @@ KEYS = {
     "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
     "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
     "gaps", "gap_count", "saturated", "invalid", "losses", "lapses", "marks", "theorem", "checks", "missing_ticks",
-    "missing", "frames", "clock_offset_us", "faults", "recorded", "disagreements",
+    "missing", "frames", "clock_offset_us", "faults", "recorded", "disagreements", "second_half_error_deg",
+    "command_changes_per_s",
 }  # fmt: skip
 THEOREM_KEYS = {
     "verdict", "holds", "held", "radius", "pointwise_radius", "pointwise_deg", "mean_square_share", "mean_square_at_s",
