@@ -18,7 +18,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.service.config import Settings
@@ -212,15 +211,20 @@ def diverges_at(config: dict[str, Any], lost: bool, duration_s: float) -> int | 
         late = {"lost": ticks} if lost else {"delay": ticks}
         return largest_error(settings, duration_s, **late) > DIVERGED
 
-    low, high = 0, max(1, settings.loop.ticks(0.1))
-    while not diverges(high):
+    return first_that(diverges, max(1, settings.loop.ticks(0.1)), settings.loop.ticks(OLDEST_S))
+
+
+def first_that(fails: Callable[[int], bool], start: int, most: int) -> int | None:
+    """The least count at which it fails, by doubling from `start` and bisection; None if none up to `most` does."""
+    low, high = 0, start
+    while not fails(high):
         low, high = high, 2 * high
-        if high * settings.loop.period > OLDEST_S:
+        if high > most:
             return None
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if diverges(middle) else (middle, high)
-    return 0 if high == 1 and diverges(0) else high
+        low, high = (low, middle) if fails(middle) else (middle, high)
+    return 0 if high == 1 and fails(0) else high
 
 
 def largest_error(settings: Settings, duration_s: float, *, delay: int = 0, lost: int = 0) -> float:
@@ -274,11 +278,10 @@ def three_torques(settings: Settings) -> Settings:
 
 
 class Late(Plant):
-    """An emulated plant whose commands act `delay` ticks later, and of which `lost` in a row never do."""
+    """A plant whose commands act `delay` ticks later, and of which `lost` in a row never do."""
 
-    actuators = 3
-
-    def __init__(self, plant: EmulatedPlant, delay: int, lost: int) -> None:
+    def __init__(self, plant: Plant, delay: int, lost: int) -> None:
+        self.actuators = plant.actuators
         self._plant, self._every = plant, lost + 1
         self._due = deque([(0.0,) * plant.actuators] * delay)
         self._ticks = 0
