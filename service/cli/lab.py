@@ -360,7 +360,7 @@ def tune(
         typer.Option(
             min=0,
             max=1,
-            help="Largest part of the ticks with a voltage at its limit; that of the configured gains if left out.",
+            help="Largest part of the ticks with a voltage at its limit; if left out, 1.25 of what the configured gains have.",
             show_default=False,
         ),
     ] = None,
@@ -368,7 +368,7 @@ def tune(
         float | None,
         typer.Option(
             min=0,
-            help="Most changes of a voltage a second; those of the configured gains if left out.",
+            help="Most changes of a voltage a second; if left out, 1.25 of what the configured gains have.",
             show_default=False,
         ),
     ] = None,

@@ -36,6 +36,8 @@ WEIGHT: Final = 1e-7
 BUDGET: Final = 1000
 REACH: Final = 10.0
 WITHIN_DEG: Final = 10.0
+MORE: Final = 1.25
+"""A limit that is not given is so many times what the configured gains have."""
 _DIGITS: Final = 4
 """Of every candidate's gains: what is printed is what ran."""
 _SPREAD: Final = 3.0
@@ -122,7 +124,7 @@ class Plan(NamedTuple):
         names: Fields of the law's settings; its gains if empty.
         scale: Whether a gain keeps the ratio between its elements.
         weight: Of u_total [1/V²].
-        max_saturated, max_chatter: Limits of the constraints; None is what the configured gains have.
+        max_saturated, max_chatter: Limits of the constraints; None is MORE times what the configured gains have.
         seeds: Training seeds, from 0 up.
         winds: Parts of plant.wind.torque in training, each with every seed.
         held_out: Cases held out: further seeds, each with a wind of its own.
@@ -356,9 +358,10 @@ class _Search:
         return {**self._settings.law.model_dump(mode="json"), **gains}
 
     def _set_limits(self, before: Summary) -> None:
-        configured = {} if before.trips else {"saturated": before.saturated, "changes_per_s": before.changes_per_s}
-        asked = self.limits.model_dump(exclude_none=True)
-        self.limits = Limits(**{"saturated": None, "changes_per_s": None} | configured | asked)
+        """Limits that were not given are those of the configured gains, and a part more."""
+        configured = {"saturated": before.saturated, "changes_per_s": before.changes_per_s}
+        given = {name: None if value is None or before.trips else MORE * value for name, value in configured.items()}
+        self.limits = Limits(**given | self.limits.model_dump(exclude_none=True))
 
     def _leave_out(self, before: list[Ran]) -> None:
         """Leave out what changes no figure, such as gains about an axis without a motor: it would be left at random."""
