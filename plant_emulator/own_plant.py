@@ -66,8 +66,8 @@ def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: f
         raise PlantError(f"plant.kind = {kind!r}: {'; '.join(problems(error, whole))}") from None
     try:
         return OwnPlant(found(settings.plant.own, period), voltage_limit)
-    except AeroloopError:
-        raise
+    except AeroloopError as error:
+        raise PlantError(str(error)) from None
     except Exception as error:
         raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.own_words(error)}") from None
 
@@ -144,7 +144,8 @@ class OwnPlant(Plant):
         try:
             return method(*values)
         except Exception as error:
-            raise self._failure(f"failed in {method.__name__}(): {plugins.own_words(error)}") from None
+            words = str(error) if isinstance(error, AeroloopError) else plugins.own_words(error)
+            raise self._failure(f"failed in {method.__name__}(): {words}") from None
 
     def _failure(self, what: str) -> PlantError:
         self._failed = True

@@ -48,6 +48,8 @@ def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_example_configuration_makes_a_loop_that_tracks(path: Path) -> None:
     settings = load(path)
+    if settings.plant.kind == "mujoco":
+        pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
     if settings.plant.faults:  # of frames, which the experiment has none of; tests/hil tries those
         settings.plant.faults = []
     figures = run_experiment(settings, 4.0)

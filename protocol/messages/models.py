@@ -200,6 +200,7 @@ class Tenure(BaseModel, extra="ignore"):
     process: str
     session: str | None = None
     cause: str | None = None
+    datagrams: str = ""
 
 
 class Telemetry(Message):

@@ -125,7 +125,7 @@ TOPICS: Final = {
         Topic("reference", "reference", "json", _OPERATOR, _CONTROLLER + _READERS, Setpoint, "limited", SAMPLE_BYTES),
         Topic("truth", "truth", "json", _PLANT, _READERS, Truth, "limited", SAMPLE_BYTES),
         Topic("status", "status/{role}", "json", _DAEMONS, _ENDS + _READERS, Status, "always", STATUS_BYTES),
-        Topic("event", "event", "json", _DAEMONS, _READERS, Event, "always"),
+        Topic("event", "event/{role}", "json", _DAEMONS, _READERS, Event, "always"),
         Topic("loss", "loss", "json", _RECORDER, _READERS, Loss, "always"),
         Topic("alive", "alive/{role}", "token", _DAEMONS, _ENDS + _READERS),
     )

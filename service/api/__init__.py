@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from aeroloop.plant_emulator.plant import Measurement as Measurement
     from aeroloop.plant_emulator.plant import Plant as Plant
+    from aeroloop.plant_emulator.plant import State as State
     from aeroloop.protocol.errors import AeroloopError as AeroloopError
     from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer as HysteresisQuantizer
     from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer as LogarithmicQuantizer
@@ -68,6 +69,7 @@ _HOMES: Final = {
     "RecordedRun": "aeroloop.research",
     "Settings": "aeroloop.service.config",
     "SignalSpec": "aeroloop.protocol.wire.spec",
+    "State": "aeroloop.plant_emulator.plant",
     "Ticks": "aeroloop.service.logs.ticks",
     "UniformQuantizer": "aeroloop.protocol.wire.quantizer",
     "WireSpec": "aeroloop.protocol.wire.spec",

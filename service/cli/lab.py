@@ -296,6 +296,102 @@ def burden(
 
 
 @group.command()
+def laws(
+    law: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="A kind of law: ours, an entry point, or package.module:Class; may be repeated; ours if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    bits: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OUT/IN",
+            help="Bits of ε and ω, and of u; may be repeated; 8/6 and cont/cont if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); may be repeated; encoders "
+            "if left out. A free body has no encoders: perfect.",
+            show_default=False,
+        ),
+    ] = None,
+    wind: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="calm or wind; may be repeated; both if left out.", show_default=False),
+    ] = None,
+    plant: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="aero, rigid_body (a free body like it, with three motors), or a plant of your own, as plant.kind "
+            "takes it; may be repeated; the first two if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    within: Annotated[
+        float,
+        typer.Option(
+            metavar="DEG", min=0.1, max=180, help="Error up to which delay and lost frames count as survived."
+        ),
+    ] = 10.0,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Runs of each combination, with seeds of wind and sensors from 0 up.")
+    ] = 1,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.parquet",
+            help="Table of all experiments. Rows are kept in FILE.jsonl: the same command goes on there.",
+            show_default=False,
+        ),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="Draw the laws beside each other: a .png, .svg or .pdf file.", show_default=False),
+    ] = None,
+    force: Force = False,
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Compare control laws, tuned alike: error, effort, chatter, bits, and the delay and loss that each survives."""
+    settings = loop_of(config, overrides)
+    _check_engine(engine)
+    from aeroloop.service.sweep.laws import compare, run_comparison
+    from aeroloop.service.sweep.sweep import rows_file
+    from aeroloop.service.sweep.table import check_table
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.laws_table import laws_table
+    from aeroloop.service.terminal.laws_table import markdown as as_markdown
+
+    axes = {"laws": law, "bits": bits, "sensors": sensors, "winds": wind, "plants": plant}
+    given = {name: values or () for name, values in axes.items()}
+    with checked():
+        _check_figure(figure, config, force)
+        if out is not None:
+            check_table(out, [config], force=force or rows_file(out).exists())  # as of `sweep`
+        comparison = compare(settings, **given, seeds=seeds, duration_s=duration, within_deg=within)
+    with guarded(), count_bar("experiments and searches", hidden=json) as update:
+        result = run_comparison(comparison, out, engine, update)
+    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else laws_table)
+    if figure is not None:
+        from aeroloop.service.sweep.laws_figure import draw_laws
+
+        with _new_file(figure, config, force) as part:
+            draw_laws(result, part)
+
+
+@group.command()
 def sweep(
     out: Annotated[
         Path,

@@ -71,13 +71,15 @@ def examples(
         str | None, typer.Argument(help="Example to print; all are listed if left out.", show_default=False)
     ] = None,
 ) -> None:
-    """List the example configurations, or print one of them."""
-    texts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(EXAMPLES.glob("*.toml"))}
+    """List the example configurations and programs, or print one of them."""
+    files = sorted(file for end in ("*.toml", "*.py") for file in EXAMPLES.glob(end) if file.name != "__init__.py")
+    texts = {file.name.removesuffix(".toml"): file.read_text(encoding="utf-8") for file in files}
     if name is None:
-        for stem, text in texts.items():
-            about = " ".join(line[2:] for line in text.split("\n\n")[0].splitlines() if line.startswith("# "))
-            typer.echo(f"{stem:12}  {about}")
-    elif name in texts:
-        typer.echo(texts[name], nl=False)
+        for file, text in texts.items():
+            comment = " ".join(line[2:] for line in text.split("\n\n")[0].splitlines() if line.startswith("# "))
+            docstring = text.removeprefix('"""').splitlines()[0].removesuffix('"""')
+            typer.echo(f"{file:20}  {comment or docstring}")
+    elif (known := name.removesuffix(".toml")) in texts:
+        typer.echo(texts[known], nl=False)
     else:
         fail(f"no example {name!r}; choose from {', '.join(texts)}", 2)

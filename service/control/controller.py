@@ -184,6 +184,10 @@ class Controller:
         for name, gain in gains.named.items():
             self._gains[name][:] = memoryview(array("d", gain))
 
+    def leave_out_law(self) -> None:
+        """Compute only attitude, desired attitude and errors from now on, where the law is in Python."""
+        self._tick.without_law = True
+
     def apply(self, change: Change) -> None:
         """Apply a recorded change; the next tick must be its first, or later."""
         if change.gains is not None:

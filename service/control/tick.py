@@ -51,6 +51,7 @@ class Tick:
         states, gains: Sizes of the law's named state and gains.
         initial: The state before the first tick, in a row.
         evaluate: Computes `found` from `inputs`.
+        without_law: Whether a law in Python is left out: only what is received is computed, and no voltages.
         fault: Why a law in Python gave no voltages at the last tick that failed; None before.
 
     Raises:
@@ -75,6 +76,7 @@ class Tick:
         self.row, self.kept_row = buffer(sum(sizes.values())), buffer(sum(sizes.values()))
         self.found, self.kept = parts(self.row, sizes), parts(self.kept_row, sizes)
         self.fault: str | None = None
+        self.without_law = False
         carried = {name: self.kept[output] for name, output in CARRIED.items()}
         if isinstance(law, PythonLaw):
             self._python(wire, law, carried)
@@ -97,7 +99,7 @@ class Tick:
         def evaluate() -> None:
             before.evaluate()
             found["computed"][0] = 0.0
-            if not found["measured"][0]:
+            if self.without_law or not found["measured"][0]:
                 return
             # Copies: the law may keep or change them.
             law.state = {name: np.array(values) for name, values in state.items()}

@@ -106,7 +106,9 @@ class CertificateGate:
             with _giving_way():
                 changed = self._settings.model_copy(update={"law": law, "reference": reference})
                 verdict = Verdict.of(_certify(changed, seek_remedies=self.required))
-        except (BoundlessError, NoTheoremError) as error:
+        except NoTheoremError as error:
+            verdict = Verdict(None, str(error))
+        except BoundlessError as error:
             verdict = Verdict(None, f"nothing is certified: {error}")
         self._cache.append((gains, reference, verdict))
         return verdict

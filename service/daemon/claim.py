@@ -8,11 +8,10 @@ from contextlib import suppress
 from typing import Final
 
 import zenoh
-from pydantic import ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Status
+from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Tenure
 from aeroloop.protocol.messages.operator import Answer
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.role import Role
@@ -22,6 +21,7 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
 
 ANSWER_WAIT_S: Final = 1.0
+_ANSWERS: Final[tuple[type[Grant | Refusal | Answer], ...]] = Grant, Refusal, Answer
 
 
 class SessionLostError(AeroloopError):
@@ -88,8 +88,8 @@ class ClaimClient:
             return
 
         def answered(reply: zenoh.Reply) -> None:
-            with suppress(ValidationError):
-                if reply.ok and Answer.model_validate_json(reply.ok.payload.to_bytes()).done:
+            with suppress(intake.IntakeError):
+                if reply.ok and intake.read(Answer, reply.ok.payload.to_bytes()).done:
                     self._kept = record
 
         self._role.zenoh.get(
@@ -132,9 +132,9 @@ class ClaimClient:
         if datagrams.linked:
             return datagrams.session
         for reply in role.zenoh.get(topics.key("status", role.vehicle, role="plant"), timeout=ANSWER_WAIT_S):
-            with suppress(ValidationError):
+            with suppress(intake.IntakeError):
                 if reply.ok is None or not (
-                    endpoint := Status.model_validate_json(reply.ok.payload.to_bytes()).datagrams
+                    endpoint := intake.read(Tenure, reply.ok.payload.to_bytes(), intake.STATUS).datagrams
                 ):
                     return role.zenoh
                 linked = datagrams.connect(endpoint)
@@ -153,9 +153,9 @@ class ClaimClient:
             if reply.ok is None:
                 continue
             payload = reply.ok.payload.to_bytes()
-            for model in (Grant, Refusal, Answer):
-                with suppress(ValidationError):
-                    read = model.model_validate_json(payload)
+            for model in _ANSWERS:
+                with suppress(intake.IntakeError):
+                    read = intake.read(model, payload, intake.REFERENCE)
                     return Refusal(reason=read.text) if isinstance(read, Answer) else read
         return None
 

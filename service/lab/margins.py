@@ -211,12 +211,12 @@ def diverges_at(config: dict[str, Any], lost: bool, duration_s: float) -> int | 
         late = {"lost": ticks} if lost else {"delay": ticks}
         return largest_error(settings, duration_s, **late) > DIVERGED
 
-    return first_that(diverges, max(1, settings.loop.ticks(0.1)), settings.loop.ticks(OLDEST_S))
+    return least(diverges, settings.loop.ticks(0.1), settings.loop.ticks(OLDEST_S))
 
 
-def first_that(fails: Callable[[int], bool], start: int, most: int) -> int | None:
-    """The least count at which it fails, by doubling from `start` and bisection; None if none up to `most` does."""
-    low, high = 0, start
+def least(fails: Callable[[int], bool], guess: int, most: int) -> int | None:
+    """The least number that fails, if all larger ones do, by bisection from a guess; None if none up to `most` does."""
+    low, high = 0, max(1, guess)
     while not fails(high):
         low, high = high, 2 * high
         if high > most:

@@ -115,7 +115,11 @@ class BatchController:
         self._sender.resume(state.sent_codes, state.sent_tick)
 
     def follow(self, other: BatchController) -> None:
-        """Copy state, gains and reference of another controller with the same configuration."""
+        """Copy state, gains and reference of another controller with the same configuration.
+
+        What follows is beside the loop, where no voltages count: a user's code does not run for it. It may never end.
+        """
+        self._controller.leave_out_law()
         self.restore(other.state)
         self._gains = dict(other._gains)
         self._motion.plan = self._controller.motion.plan = other._motion.plan

@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
@@ -273,6 +273,8 @@ def _blocks(file: BinaryIO, starts: list[int], damages: list[Damage]) -> Iterato
             wrong = "no record begins here"
         elif offset + _HEAD.size + length > size:
             wrong = f"the file is cut within a record of {length} bytes"
+        elif bisect_left(starts, offset + _HEAD.size + length) > bisect_right(starts, offset):
+            wrong = f"a record of {length} bytes ends beyond the next one's begin"
         elif opcode == Opcode.DATA_END and starts and offset < starts[-1]:
             wrong = "the data end here, though not by the index"
         if wrong:

@@ -126,7 +126,7 @@ class TickReader:
                 if beside is not None:
                     columns[i][over] = beside[i]
         attitude, desired, rate, attitude_error, rate_error, unquantized, gains, state, after = columns
-        unquantized[over] = state[over] = after[over] = np.nan
+        unquantized[over] = state[over] = np.nan
         ticks = Ticks(
             block.k, *self._times(block), attitude, desired, rate, rate - rate_error, attitude_error, rate_error,
             self._voltages(block, commanded), unquantized, gains, state, after,

@@ -27,7 +27,8 @@ class Ticks(NamedTuple):
         unquantized: u before quantization [V].
         gains: The law's gains, one beside the other.
         state: Its named state that it used, likewise; of the paper's law θ̂ [N·m·s/rad].
-        state_next: The same after the tick; of the paper's law the sign of the equilibrium approached.
+        state_next: The same after the tick; of the paper's law the sign of the equilibrium approached. Where the
+            controller computed nothing, of the law's own state at the last tick that it did.
     """
 
     k: Integers

@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
 
+SOON_S: Final = 0.05
+MANY: Final = 100
+"""After so many messages at once, as of a flood, the next are taken soon: each may hold 64 KiB of Zenoh's buffers."""
+
 STATUS_EVERY_S: Final = 1.0
 
 TAKEN_BYTES: Final = 8_388_608
@@ -51,7 +55,7 @@ QUIET_S: Final = 0.3
 ANSWER_S: Final = 5.0
 """Longest wait for a role's answer at the end; after it recording ends without the role's last messages [s]."""
 
-TRIM_BYTES: Final = 32_000_000
+TRIM_BYTES: Final = 4_000_000
 """After so many bytes are written, freed memory goes back to the system: after a flood, malloc would keep it."""
 
 GOES_ON_S: Final = 1.0
@@ -91,8 +95,9 @@ class Recorder:
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
         try:
-            while not self._role.stop.wait(0.0 if self._behind else WORK_EVERY_S):
-                self._take()
+            taken = 0
+            while not self._role.stop.wait(0.0 if self._behind else WORK_EVERY_S if taken < MANY else SOON_S):
+                taken = self._take()
                 self._role.take_inbox()
                 if time.monotonic() >= self._status_due:
                     self._publish_losses()

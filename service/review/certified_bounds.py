@@ -87,7 +87,8 @@ def certified_bounds(
         begun = with_theorem(settings.model_copy(update={"law": law, "reference": reference}))
         bounds = evaluate(begun)
     except NoTheoremError as error:
-        verdict = (promised or {}).get("verdict", f"Nothing is promised: {error}.")
+        text = str(error)
+        verdict = (promised or {}).get("verdict", f"{text[0].upper()}{text[1:]}.")
         return CertifiedBounds(None, None, None, verdict)
     except BoundlessError as error:
         return CertifiedBounds(own, None, None, f"Nothing is promised: {error}.")

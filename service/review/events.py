@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -132,15 +132,15 @@ class EventLog:
     def _event(self, address: Address, payload: bytes, at_ns: int) -> None:
         if self._is_duplicate(address.vehicle, payload, at_ns):
             return
-        event = Event.model_validate_json(payload)
+        event, role = Event.model_validate_json(payload), address.role or ""
         of_session = event.session == self._which[1]
-        repeats_a_change = event.kind == "changed" and event.role == "controller" and of_session
+        repeats_a_change = event.kind == "changed" and role == "controller" and of_session
         if address.vehicle != self._which[0] or repeats_a_change:
             return
-        if event.kind == "tripped" and (of_session or not self._alone):
+        if event.kind == "tripped" and role == "plant" and (of_session or not self._alone):
             self.trips.append(event.text)
         tick = event.tick if of_session else None
-        self._add(event.kind, event.role, event.text, tick, event.session)
+        self._add(event.kind, role, event.text, tick, event.session)
 
     def _loss(self, address: Address, payload: bytes, at_ns: int) -> None:
         if address.vehicle != self._which[0] or self._is_duplicate(address.vehicle, payload, at_ns):
@@ -196,8 +196,9 @@ def described(change: Change) -> str:
     """A change in words."""
     parts = []
     if change.gains is not None:
-        diagonals: dict[str, Any] = {name: value for name, value in change.gains if value is not None}
-        parts.append(", ".join(f"{name} = diag({', '.join(f'{x:g}' for x in xs)})" for name, xs in diagonals.items()))
+        parts.append(
+            ", ".join(f"{name} = [{', '.join(f'{x:g}' for x in xs)}]" for name, xs in change.gains.named.items())
+        )
     if change.reference is not None:
         within = f" within {change.within_s:g} s" if change.within_s else ""
         parts.append(f"follows {in_words(change.reference)}{within}")

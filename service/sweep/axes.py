@@ -12,11 +12,14 @@ import tomllib
 from collections.abc import Sequence
 from fractions import Fraction
 from hashlib import sha256
+from inspect import getfile
 from itertools import product
 from math import prod
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from aeroloop.service.config import ConfigError, Settings, load_over
+from aeroloop.service.control.laws.registry import BUILT_IN, OwnLawSettings, law_class
 
 LIMIT: Final = 10_000_000
 """Experiments of a sweep, at most: what fits into memory."""
@@ -101,7 +104,7 @@ def configurations(settings: Settings, axes: Sequence[Axis], seeds: int, duratio
         overrides = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
         description = load_over(settings, overrides).description()
         columns = tuple(_column(description, *pair) for pair in zip(axes, values, strict=True))
-        digest = _digest(description, duration_s)
+        digest = digest_of(description, duration_s)
         if digest in found:
             raise ConfigError(f"--vary gives the same twice: {_words(found[digest].overrides)} and {_words(overrides)}")
         found[digest] = Configuration(overrides, columns, digest)
@@ -112,9 +115,15 @@ def _words(overrides: Sequence[str]) -> str:
     return " ".join(overrides) or "the configuration"
 
 
-def _digest(description: dict[str, Any], duration_s: float) -> str:
-    """SHA-256 of what an experiment depends on but for the seed, however it was configured."""
+def digest_of(description: dict[str, Any], duration_s: float) -> str:
+    """SHA-256 of what an experiment depends on but for the seed, however it was configured.
+
+    Of a law of one's own, the file of its class is part of it; what that imports is not.
+    """
     parts: dict[str, Any] = {name: description[name] for name in SECTIONS}
+    law = OwnLawSettings.model_validate(description["law"])
+    if law.kind not in BUILT_IN:
+        parts["law_file"] = sha256(Path(getfile(law_class(law))).read_bytes()).hexdigest()
     parts["plant"] |= {name: {**parts["plant"][name], "seed": None} for name in ("wind", "sensors")}
     canonical = json.dumps({**parts, "duration_s": duration_s}, sort_keys=True, separators=(",", ":"))
     return sha256(canonical.encode()).hexdigest()

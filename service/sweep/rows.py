@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.figures import Figures
+from aeroloop.service.lab.experiment import ExperimentFigures
 
-_HEAD: Final = b'{"aeroloop": "sweep", "layout": 1}\n'
+_HEAD: Final = b'{"aeroloop": "sweep", "layout": 2}\n'
 
 
 class SweepError(AeroloopError):
@@ -32,21 +32,24 @@ class Key(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What an experiment gave, by the names of `Figures`; without figures, the reason."""
+    """What an experiment gave, by the names of `ExperimentFigures`; without figures, the reason."""
 
     z_track: float | None = None
     u_total: float | None = None
     max_error_deg: float | None = None
     final_error_deg: float | None = None
+    second_half_error_deg: float | None = None
+    command_changes_per_s: float | None = None
     skipped_ticks: int | None = None
     measurement_frames_per_s: float | None = None
     measurement_bits_per_s: float | None = None
     command_frames_per_s: float | None = None
     command_bits_per_s: float | None = None
+    path: str | None = None
     reason: str | None = None
 
 
-def measured(found: Figures | str) -> Measured:
+def measured(found: ExperimentFigures | str) -> Measured:
     """What stands in a row of figures, or of the reason why there are none."""
     if isinstance(found, str):
         return Measured(reason=found)
@@ -55,8 +58,10 @@ def measured(found: Figures | str) -> Measured:
         for name in ("measurement", "command")
         for figure in ("frames_per_s", "bits_per_s")
     }
-    names = ("z_track", "u_total", "max_error_deg", "final_error_deg", "skipped_ticks")
-    return Measured(**{name: getattr(found, name) for name in names}, **of_streams)
+    return Measured(**{name: getattr(found, name) for name in _OF_FIGURES}, **of_streams)
+
+
+_OF_FIGURES: Final = [name for name in Measured._fields if name in ExperimentFigures.model_fields]
 
 
 class Rows:

@@ -16,7 +16,7 @@ import pyarrow.parquet
 
 from aeroloop.protocol.wording import Shapes
 from aeroloop.service.config import Settings
-from aeroloop.service.figures import Figures
+from aeroloop.service.lab.experiment import ExperimentFigures
 from aeroloop.service.logs.outputs import OutputError, check_output, writing
 from aeroloop.service.sweep.rows import Key, Measured
 
@@ -52,8 +52,8 @@ def write_table(out: Path, planned: Plan, keys: Sequence[Key], rows: Sequence[Me
     }
     columns["seed"] = pa.array([key.seed for key in keys], pa.int64()), ""
     for i, name in enumerate(Measured._fields):
-        kind = {"reason": pa.string(), "skipped_ticks": pa.int64()}.get(name, pa.float64())
-        field = Figures.model_fields.get(name)
+        kind = {"reason": pa.string(), "path": pa.string(), "skipped_ticks": pa.int64()}.get(name, pa.float64())
+        field = ExperimentFigures.model_fields.get(name)
         columns[name] = pa.array([row[i] for row in rows], kind), (field and field.description) or ""
     columns["configuration"] = pa.array([key.configuration for key in keys]), ""
     columns["version"] = pa.array([key.version for key in keys]), ""

@@ -150,18 +150,22 @@ def _utc(started: str) -> str:
 
 def theorem_table(findings: Findings, found: TheoremFindings) -> Table:
     """The theorem's bounds beside the run's values."""
-    table = labelled()
+    table, nothing = labelled(), found.verdict.rstrip(".")
 
     def row(label: str, name: str, form: Callable[[float], str]) -> None:
         value = getattr(found, name)
         reason = findings.reasons.get(f"theorem.{name}", "not available")
+        if value is None and reason == nothing:
+            return  # the certificate's row says so
         table.add_row(label, Text(f"— ({reason})" if value is None else form(value)))
 
     table.add_row("certificate", Text(found.verdict, style="" if found.holds else "bold red"))
-    table.add_row("this run", Text(*_held(findings, found)))
+    if findings.reasons.get("theorem.held") != nothing:
+        table.add_row("this run", Text(*_held(findings, found)))
     row("mean square", "mean_square_share", lambda share: _mean_square(found, share))
     row("every instant", "pointwise_share", lambda share: _pointwise(found, share))
-    table.add_row("Lemma 1", Text(_lemma(findings, found), style="bold red" if found.broken else ""))
+    if findings.reasons.get("theorem.broken") != nothing:
+        table.add_row("Lemma 1", Text(_lemma(findings, found), style="bold red" if found.broken else ""))
     since = f"since {found.since_s + found.transient_s:.3g} s"
     row(f"largest ‖z‖ {since}", "z_norm", "{:.4f}".format)
     row(f"largest error {since}", "error_deg", "{:.2f}°".format)

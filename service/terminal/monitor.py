@@ -76,7 +76,9 @@ class Top:
                         vehicle.settings = from_description(Description.model_validate_json(payload).config)
                     case "event":
                         event = Event.model_validate_json(payload)
-                        self._events.append(f"{time.strftime('%H:%M:%S')} {address.vehicle} {event.role}: {event.text}")
+                        self._events.append(
+                            f"{time.strftime('%H:%M:%S')} {address.vehicle} {address.role}: {event.text}"
+                        )
             except (ValidationError, ConfigError):
                 pass  # of another version; its other messages may still parse
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import Condition
 from typing import Any, Final, Self
@@ -23,7 +23,6 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
 from aeroloop.protocol.messages.operator import Advance, Answer, Gains, Hold, Inject, Message, Reference, Request, Track
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.service.config import Settings, as_overrides, load
 from aeroloop.service.host.operator import send, stop
 from aeroloop.service.points_file import read_points
@@ -191,9 +190,9 @@ class Hil:
         followed = read_points(reference) if isinstance(reference, Path) else reference
         return self._operate("track", self._made(Track, reference=followed, within_s=within_s))
 
-    def set_gains(self, *, C1: Vector | None = None, C2: Vector | None = None, Gamma: Vector | None = None) -> str:
-        """Change the law's gains, as `aeroloop op set-gains`; None keeps one. Returns and raises as `arm`."""
-        return self._operate("set_gains", self._made(Gains, C1=C1, C2=C2, Gamma=Gamma))
+    def set_gains(self, **gains: float | Sequence[float]) -> str:
+        """Change gains of the law by name, as `aeroloop op set-gains`. Returns and raises as `arm`."""
+        return self._operate("set_gains", self._made(Gains, **gains))
 
     def kill(self, role: RoleName) -> None:
         """Kill a role with SIGKILL."""

@@ -66,7 +66,7 @@ def with_theorem(settings: Sections) -> Configured:
     """
     law = settings.law
     if not isinstance(law, AdaptiveSettings):
-        raise NoTheoremError(f"no theorem for this law: law.kind is {law.kind!r}, and the paper's is 'adaptive'")
+        raise NoTheoremError(f"no theorem for this law, {law.kind}")
     if {len(row) for row in law.allocation} != {3}:
-        raise NoTheoremError("no theorem for this vehicle: law.allocation is not 3 × 3")
+        raise NoTheoremError("no theorem for this vehicle, whose law.allocation is not 3 × 3")
     return cast(Configured, settings)

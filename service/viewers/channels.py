@@ -222,7 +222,7 @@ class Decoder:
     def _event(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         event = Event.model_validate_json(payload)
         level = _LEVELS.get(event.kind, LogLevel.Info)
-        return [_logged(address.vehicle, level, event.role, f"{event.kind}: {event.text}", at_ns)]
+        return [_logged(address.vehicle, level, f"{address.role}", f"{event.kind}: {event.text}", at_ns)]
 
     def _loss(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         loss = Loss.model_validate_json(payload)

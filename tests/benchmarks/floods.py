@@ -52,7 +52,7 @@ WELL_FORMED: Final = {
     "advance": Advance(seconds=1.0),
     "reference": Setpoint(attitude=(0.0, 1.0, 2.0)),
     "event": Event(role="plant", kind="fault", text="it never happened"),
-    "loss": Loss(key="aeroloop/aero/event", count=1, reason="network"),
+    "loss": Loss(key="aeroloop/aero/event/plant", count=1, reason="network"),
 }  # fmt: skip
 """Without certificates an arm, a stop or a plant's status would be taken at its word: of those garbage alone."""
 

@@ -21,7 +21,7 @@ from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.lab.experiment import run_experiment
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of
@@ -32,7 +32,7 @@ TICKS = 2000
 
 def test_a_tick_in_plain_numpy(benchmark: BenchmarkFixture) -> None:
     """The tests' NumPy twin of the law and the reference, between the project's own frames and quantizers."""
-    wire, p, paper = WireSpec(), LawSettings(), Sinusoid()
+    wire, p, paper = WireSpec(), AdaptiveSettings(), Sinusoid()
     body = body_of(p)
     reference = twin.Sinusoids(np.radians(paper.amplitude), np.array(paper.frequency))
     level, quantizer = wire.attitude.quantizer().level, wire.voltage.quantizer()

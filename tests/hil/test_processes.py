@@ -53,7 +53,7 @@ def events(log: Path) -> list[Event]:
         return [
             Event.model_validate_json(message.data)
             for _, channel, message in make_reader(file).iter_messages()
-            if channel.topic == topics.key("event", "aero")
+            if channel.topic.startswith(topics.key("event", "aero", role=""))
         ]
 
 

@@ -35,6 +35,15 @@ def test_the_sweep_prints_a_line_for_each_number_of_bits_and_draws_them(tmp_path
     assert "<svg" in (tmp_path / "sweep.svg").read_text()
 
 
+def test_a_satellite_of_ones_own_in_mujoco_is_flown_with_each_number_of_bits(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
+    printed = run(tmp_path, str(EXAMPLES / "mujoco_plant.py"), "5").splitlines()
+    errors = [float(line.split("=")[1].split()[0]) for line in printed]
+    assert errors == sorted(errors, reverse=True)
+    assert len(errors) == 3
+    assert max(errors) < 20
+
+
 def test_a_log_is_read_back_into_numpy(tmp_path: Path) -> None:
     make_log(tmp_path / "run.mcap", 500)
     printed = run(tmp_path, str(EXAMPLES / "read_log.py"), "run.mcap")

@@ -15,7 +15,7 @@ from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
 from aeroloop.service import examples
 from aeroloop.service.config import ConfigError, Settings, load, with_bits
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
 
@@ -75,7 +75,7 @@ WIRE = WireSpec(transmit=Transmit(measurement="on_change", command="on_change"))
 
 
 def controller(wire: WireSpec = WIRE) -> Controller:
-    return Controller(wire, LawSettings(), Sinusoid(), PERIOD)
+    return Controller(wire, AdaptiveSettings(), Sinusoid(), PERIOD)
 
 
 def measurement(k: int, yaw: float = 0.1) -> bytes:
@@ -91,7 +91,7 @@ def test_silence_is_computed_as_the_frame_that_was_not_sent_would_be() -> None:
         changed = k in (0, 7, 30)
         yaw = 0.1 if k < 7 else 0.3 if k < 30 else -0.2
         assert sparse.tick(measurement(k, yaw) if changed else SILENCE, k) == periodic.tick(measurement(k, yaw), k)
-        assert (sparse.voltages, sparse.damping_estimate) == (periodic.voltages, periodic.damping_estimate)
+        assert (sparse.voltages, sparse.law_state) == (periodic.voltages, periodic.law_state)
         assert (sparse.tick_index, sparse.counter) == (k, k % COUNTERS)
 
 

@@ -133,9 +133,8 @@ def telemetry(error: Quaternion, sign: int = 1) -> Telemetry:
         attitude_error=error[1:],
         rate_error=(0.0, radians(2.0), radians(-3.0)),
         desired=ATTITUDE,
-        damping_estimate=(0.0, 0.007, 0.0095),
+        state={"damping_estimate": (0.0, 0.007, 0.0095), "sign": (sign,)},
         voltages=(1.0, 2.0),
-        sign=sign,
     )
 
 

@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Event
 from aeroloop.protocol.messages.operator import Message as Model
 from aeroloop.protocol.messages.trace import HEADER_BYTES, STEPS, End, read_batch
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion
@@ -44,9 +45,11 @@ class Said(NamedTuple):
 
 
 def message_of(
-    name: str, message: Model | bytes, published_ns: int, role: str = "controller", session: str = SESSION
+    name: str, message: Model | bytes, published_ns: int, role: str | None = None, session: str = SESSION
 ) -> Said:
-    """A message of the made log's vehicle."""
+    """A message of the made log's vehicle, of its controller where neither `role` nor an event names one."""
+    if role is None:
+        role = message.role if isinstance(message, Event) else "controller"
     key = topics.key(name, VEHICLE, session=session, role=role)
     return Said(key, published_ns, message if isinstance(message, bytes) else message.encode())
 
@@ -133,8 +136,8 @@ def ticks_of(k: int, attitude: Quaternion = IDENTITY, desired: Quaternion = IDEN
         zero,
         (0.0, 0.0),
         (0.0, 0.0),
-        1.0,
-        zero,
-        zero,
+        (0.0,) * 9,
+        (0.0, 0.0, 0.0, 1.0),
+        (0.0, 0.0, 0.0, 1.0),
     )
     return Ticks(*(np.array([column]) for column in columns))

@@ -89,9 +89,8 @@ class Ends:
             attitude_error=(x, y, z),
             rate_error=(p, q, r),
             desired=(0.99123456789, 0.0123456789, 0.0456789123, 0.0789123456),
-            damping_estimate=(0.00123456789, 0.00456789123, 0.00789123456),
+            state={"damping_estimate": (0.00123456789, 0.00456789123, 0.00789123456), "sign": (1.0,)},
             voltages=(100 * x, 100 * y),
-            sign=1,
         )
 
     def _truth(self, k: int) -> Truth:

@@ -26,14 +26,15 @@ from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.registry import gains_of
 from aeroloop.service.daemon import operator_changes
 from aeroloop.service.daemon.certificate_gate import CertificateGate
 from aeroloop.service.daemon.operator_changes import SETPOINTS, OperatorChanges
 from aeroloop.service.settings import ControllerSettings
 
 PERIOD = 0.002
-LAW = LawSettings()
+LAW = AdaptiveSettings()
 LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
 SWING = Sinusoid(amplitude=(0.0, 5.0, 20.0), frequency=(0.0, 0.5, 0.4))
 CONFIGURED = ControllerSettings(after_restart="configured")
@@ -145,7 +146,7 @@ class Loop:
             patch.setattr(role, "join", lambda *_: self.network)
             self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
-        self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), reference)
+        self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), gains_of(LAW), reference)
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
         self.live = OperatorChanges(
             self.role, LAW, reference, settings, self.trace, self.gate if certified else None, rolls=rolls
@@ -214,7 +215,7 @@ class Loop:
         """Bytes come where set-points should."""
         self.network.received[topics.key("reference", "aero")].append(SimpleNamespace(payload=_bytes(payload)))
 
-    def read_again(self, law: LawSettings, reference: Reference) -> None:
+    def read_again(self, law: AdaptiveSettings, reference: Reference) -> None:
         """A configuration is read again, as reload.py's SIGHUP does."""
         self.role.enqueue(lambda: self.live.adopt(law, reference))
 

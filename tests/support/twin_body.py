@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from tests.support.numpy_twin import Body
 
 
-def body_of(p: LawSettings) -> Body:
+def body_of(p: AdaptiveSettings) -> Body:
     """The body and the gains that a law believes in."""
     return Body(
         J=np.diag(p.inertia),

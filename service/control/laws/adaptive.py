@@ -16,8 +16,9 @@
 
 The equations without quantization, (C.16)–(C.23), are the same expressions with unquantized arguments; where the paper
 repeats an equation for its quantized form, the line carries both numbers. That (C.25) follows from them is proved in
-tests/service/control/test_law.py. Received values are within the bounds (C.28) and (C.29) of the true ones; errors are
-(C.31), (C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the bound (C.30).
+tests/service/control/laws/test_adaptive.py. Received values are within the bounds (C.28) and (C.29) of the true ones;
+errors are (C.31), (C.33) and (C.34). (C.36) is the quantizer at the controller's exit, with the error (C.35) in the
+bound (C.30).
 """
 
 from __future__ import annotations

@@ -16,20 +16,22 @@ def gravity_torque(p: LawSettings, q: ca.SX) -> ca.SX:
     return S(ca.SX(p.centre_of_mass)) @ R(q).T @ weight
 
 
-def voltages_for(p: LawSettings, torque: ca.SX, actuators: int) -> ca.SX:
+def voltages_for(p: LawSettings, torque: Any, actuators: int) -> Any:
     """The voltages whose torque B u is this, the least ones if there are several [V]. Shape (actuators,).
 
     A B of three columns serves two motors, too: they are its last two, and the first row is fictitious.
 
     Args:
         p: Has B.
-        torque: Body frame [N·m]. Shape (3,).
+        torque: Body frame, an expression or an array [N·m]. Shape (3,).
         actuators: Number of motors.
 
     Raises:
         ValueError: B has no inverse, or another number of columns.
     """
     B: np.ndarray[Any, Any] = check_allocation(p, actuators)
+    if isinstance(torque, np.ndarray):
+        return (np.linalg.pinv(B) @ torque)[-actuators:]
     if B.shape == (3, 3):
         return ca.solve(ca.SX(B), torque)[3 - actuators :]
     return ca.mtimes(ca.SX(np.linalg.pinv(B)), torque)

@@ -20,11 +20,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, Literal
 
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat
 
 from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.lazy import numpy as np
-from aeroloop.service.control.laws.interface import Diagonal, Floats, Gains3, Now, Vector
+from aeroloop.service.control.laws.interface import Diagonal, Floats, Now, Vector
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_lqr
 
@@ -40,7 +40,7 @@ class LQRSettings(TrackingSettings):
     attitude_weight: Diagonal = Field(
         default=_TUNED["attitude_weight"], description="q_φ, of the angle's square against the torque's [(N·m/rad)²]"
     )
-    rate_weight: Gains3 = Field(
+    rate_weight: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
         default=_TUNED["rate_weight"], description="q_ω, of the rate's square against the torque's [(N·m·s/rad)²]"
     )
 

@@ -81,5 +81,5 @@ def feedforward(p: TrackingSettings, now: Now[ca.SX]) -> ca.SX:
     omega, J, theta = now.rate, ca.SX(p.inertia), ca.SX(p.damping_estimate)
     desired = now.rate - now.rate_error  # R ω_d in the body frame, (C.18)
     R_ib = R(now.attitude).T  # (C.48)
-    cancelled = S(omega) @ (J * omega) + gravity_torque(p, now.attitude) + omega * theta  # −Ψ − Φθ̂, (C.43), (C.44)
+    cancelled = S(omega) @ (J * omega) - gravity_torque(p, now.attitude) + omega * theta  # −Ψ − Φθ̂, (C.43), (C.44)
     return cancelled - J * (S(omega) @ desired - R_ib @ now.desired_acceleration)

@@ -96,6 +96,11 @@ RULES: Final[Mapping[str, Callable[[LawSettings, Response], Fields]]] = {
 """By the kind of law. The law without adaptation has the paper's own gains."""
 
 
+def tuned(kind: str, body: LawSettings, response: Response) -> Fields:
+    """The settings that give a law of this kind a response with this body; none for a kind without a rule."""
+    return RULES[kind](body, response) if kind in RULES else {}
+
+
 def _each(body: LawSettings, response: Response, one: Callable[[float, float, float], Mapping[str, float]]) -> Fields:
     return _columns([one(*axis) for axis in zip(body.inertia, *response, strict=True)])
 

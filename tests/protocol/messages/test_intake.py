@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol import wording
 from aeroloop.protocol.messages.intake import FEW, REFERENCE, STATUS, IntakeError, read
 from aeroloop.protocol.messages.models import FaultStatus, Status, Tenure
-from aeroloop.protocol.messages.operator import MAX_POINTS, Gains, Inject, Message, Points, Request, Track
+from aeroloop.protocol.messages.operator import MAX_POINTS, Inject, Message, Points, Request, Track
 from aeroloop.protocol.messages.topics import POINTS_BYTES, STATUS_BYTES, TOPICS
 from tests.support.every_message import MESSAGES
 from tests.support.hostile import mutated
@@ -83,8 +83,8 @@ def test_only_the_first_of_many_errors_is_put_into_words(monkeypatch: pytest.Mon
     monkeypatch.setattr(wording, "_problem", counted)
     keys = "{" + ",".join(f'"k{number}":0' for number in range(FEW)) + "}"
     with pytest.raises(IntakeError) as refused:
-        read(Gains, keys.encode())
-    assert said == [str(refused.value).removeprefix("not a Gains: ")]
+        read(Request, keys.encode())
+    assert said == [str(refused.value).removeprefix("not a Request: ")]
     assert said[0].startswith("unknown key k0")
 
 

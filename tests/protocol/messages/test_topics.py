@@ -57,6 +57,12 @@ def test_every_topic_is_called_what_the_table_calls_it_and_has_a_key_of_its_own(
 
 
 @every_topic
+def test_what_several_roles_publish_has_the_role_in_its_key(topic: Topic) -> None:
+    """Access rules compare keys, not payloads: on a shared key a recorder could publish an event of the plant's."""
+    assert topic.carries == "query" or ("{role}" in topic.key) == (len(topic.senders) > 1)
+
+
+@every_topic
 def test_every_json_topic_has_a_model_and_no_frame_trace_or_token_has_one(topic: Topic) -> None:
     if topic.carries != "query":
         assert (topic.model is not None) == (topic.carries == "json")

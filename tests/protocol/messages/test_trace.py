@@ -56,7 +56,7 @@ def test_the_golden_batch_of_the_controller_is_what_the_writer_writes() -> None:
     rows, batch = golden("Controller")
     writer = TraceWriter("controller", WIRE, 0x0123456789ABCDEF, S)
     writer.session = "s1"
-    writer.changes.append(Change(session="s1", tick=0, gains=Gains(C2=(0.2, 0.2, 0.2))))
+    writer.changes.append(Change(session="s1", tick=0, gains=Gains(C1=None, C2=(0.2, 0.2, 0.2), Gamma=None)))
     for row in rows:
         add(writer, row)
     assert len(rows) == 3

@@ -16,11 +16,12 @@ from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoi
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.control.law import LawSettings, law_function
+from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings
+from aeroloop.service.control.laws.evaluation import law_function
 from aeroloop.service.control.motion import Motion
 
 PERIOD = 0.002
-LAW = LawSettings(Gamma=(0.5, 0.5, 0.5), damping_estimate=(0.0, 0.03, 0.039))
+LAW = AdaptiveSettings(Gamma=(0.5, 0.5, 0.5), damping_estimate=(0.0, 0.03, 0.039))
 """Its θ̂ reaches the projection."""
 
 REFERENCES: tuple[Reference, ...] = (
@@ -35,13 +36,13 @@ class Composed:
 
     def __init__(self, wire: WireSpec, reference: Reference) -> None:
         self.wire = wire
-        self.law = Compiled(law_function(LAW, PERIOD))
+        self.law = Compiled(law_function(Adaptive(LAW, PERIOD, wire.actuators)))
         given = self.law.inputs
         self.motion = Motion(reference, {name: given[name] for name in ("q_d", "omega_d", "omega_d_dot")})
         self.decoders = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
         self.encoders = [wire.voltage.quantizer() for _ in range(wire.actuators)]
         given["last"][0] = 1.0
-        for name, values in (("theta", LAW.damping_estimate), ("C1", LAW.C1), ("C2", LAW.C2), ("Gamma", LAW.Gamma)):
+        for name, values in (("state", LAW.damping_estimate), ("gains", (*LAW.C1, *LAW.C2, *LAW.Gamma))):
             for i, value in enumerate(values):
                 given[name][i] = value
         self.refused = self.invalid = 0
@@ -62,13 +63,13 @@ class Composed:
         for i in range(3):
             given["eps"][i], given["omega"][i] = levels[i], levels[3 + i]
         self.motion.at(k * PERIOD)
-        if not given["s"][0]:
-            given["s"][0] = 1.0
+        if not given["state"][3]:
+            given["state"][3] = 1.0
             self.law()
-            given["s"][0] = 1.0 if found["eta_e"][0] >= 0 else -1.0
+            given["state"][3] = 1.0 if found["eta_e"][0] >= 0 else -1.0
         self.law()
-        given["last"][:], given["theta"][:] = found["q"], found["theta_next"]
-        voltages = list(found["u"])[3 - self.wire.actuators :]
+        given["last"][:], given["state"][:] = found["q"], found["state_next"]
+        voltages = list(found["u"])
         if isnan(sum(voltages)):
             self.failed = True
             return no_command
@@ -79,16 +80,17 @@ class Composed:
     def seen(self) -> str:
         """All that a controller reports, as text: it keeps every bit, and NaN equals itself."""
         given, found = self.law.inputs, self.law.outputs
-        vectors = given["last"], given["omega"], given["q_d"], given["theta"], found["eps_e"], found["omega_e"]
-        counts = self.refused, self.invalid, self.failed, int(given["s"][0]), sum(q.saturated for q in self.encoders)
+        vectors = given["last"], given["omega"], given["q_d"], given["state"], found["eps_e"], found["omega_e"]
+        counts = self.refused, self.invalid, self.failed, sum(q.saturated for q in self.encoders)
         return repr(([vector.tolist() for vector in vectors], self.voltages, counts))
 
 
 def seen(controller: Controller) -> str:
     """The same of a controller."""
     c = controller
-    vectors = c.attitude, c.rate, c.desired, c.damping_estimate, c.attitude_error, c.rate_error
-    counts = c.refused, c.invalid, c.failed, c.sign, c.saturated
+    state = [value for values in c.law_state.values() for value in values]
+    vectors = c.attitude, c.rate, c.desired, state, c.attitude_error, c.rate_error
+    counts = c.refused, c.invalid, c.fault is not None, c.saturated
     return repr(([list(vector) for vector in vectors], c.voltages, counts))
 
 
@@ -150,7 +152,7 @@ def test_a_tick_has_the_bits_of_its_parts_one_after_the_other(wire: WireSpec, re
 def test_no_tick_allocates_memory_that_stays() -> None:
     """Not of valid measurements, nor of those without a value, malformed ones and late ones, over 20 000 ticks."""
     wire = WireSpec.model_validate({"transmit": "on_change"})
-    controller = Controller(wire, LawSettings(), Sinusoid(), PERIOD)
+    controller = Controller(wire, AdaptiveSettings(), Sinusoid(), PERIOD)
     given = frames(wire, Random(0), 500)
 
     def run(start: int) -> int:

@@ -7,9 +7,10 @@ import threading
 import pytest
 
 from aeroloop.protocol.messages.operator import Gains, Hold, Reference, Sinusoid, Stream, Track
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.registry import gains_of
 from aeroloop.service.daemon import certificate_gate
-from aeroloop.service.daemon.certificate_gate import UncertifiedError, Verdict, gains_of
+from aeroloop.service.daemon.certificate_gate import UncertifiedError, Verdict
 from aeroloop.service.settings import ControllerSettings
 from tests.support.certified import certified_settings
 from tests.support.operated_loop import LAW, LEVEL, Loop, gains_with
@@ -19,8 +20,8 @@ FAILING = Gains(C2=(0.03, 0.03, 0.03))
 BETTER = Gains(C2=(0.2, 0.2, 0.2))
 
 
-def of(gains: Gains) -> LawSettings:
-    return LAW.model_copy(update={name: value for name, value in gains if value is not None})
+def of(gains: Gains) -> AdaptiveSettings:
+    return LAW.model_copy(update=gains.named)
 
 
 class Certified(Loop):

@@ -9,8 +9,9 @@ from typing import Any, cast
 import pytest
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.intake import STATUS
 from aeroloop.protocol.messages.models import Grant, SessionRecord, Status
-from aeroloop.protocol.messages.operator import Answer, Gains, Hold, Message
+from aeroloop.protocol.messages.operator import Answer, Gains, Hold
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -69,13 +70,13 @@ def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_cha
 class Plant:
     """A Zenoh session on which a plant answers, or none."""
 
-    def __init__(self, status: Status | None) -> None:
-        self._answers: dict[str, Message] = {} if status is None else {"status": status, "claim": Grant(session="s")}
+    def __init__(self, status: bytes | None) -> None:
+        self._answers = {} if status is None else {"status": status, "claim": Grant(session="s").encode()}
 
     def get(self, key: str, **_: object) -> list[SimpleNamespace]:
         """What the plant answers."""
         answers = [answer for topic, answer in self._answers.items() if f"/{topic}" in key]
-        return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer.encode()))) for answer in answers]
+        return [SimpleNamespace(ok=SimpleNamespace(payload=_bytes(answer))) for answer in answers]
 
 
 def _bytes(payload: bytes) -> SimpleNamespace:
@@ -90,15 +91,21 @@ def _bytes(payload: bytes) -> SimpleNamespace:
         ("udp/h:1", None, "none"),
         ("", True, "first"),
         (None, True, "none"),
+        (b"\xff", True, "none"),
+        (
+            b'{"state": "idle", "process": "p", "datagrams": "udp/h:1", "notes": [' + b"0," * STATUS + b"0]}",
+            True,
+            "none",
+        ),
     ],
-    ids=["the plant takes datagrams", "none pass", "not linked yet", "it takes none", "no plant answers"],
+    ids=["it takes datagrams", "none pass", "not linked yet", "it takes none", "no plant answers", "junk", "too much"],
 )
 def test_a_claims_frames_travel_by_datagrams_where_the_plant_takes_them(
-    monkeypatch: pytest.MonkeyPatch, endpoint: str | None, passes: bool | None, carrier: str
+    monkeypatch: pytest.MonkeyPatch, endpoint: str | bytes | None, passes: bool | None, carrier: str
 ) -> None:
-    status = None if endpoint is None else Status(
+    status = endpoint if not isinstance(endpoint, str) else Status(
         role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0, datagrams=endpoint
-    )  # fmt: skip
+    ).encode()  # fmt: skip
     first, datagrams, warned = Plant(status), SimpleNamespace(name="datagrams"), []
     asked = SimpleNamespace(wanted=True, linked=False, connect=lambda _: passes, session=datagrams)
     role = SimpleNamespace(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Message, Points, Reference, Sinusoid, Stream, Track
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.settings import ControllerSettings
 from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, gains_with, measured, turned
 
@@ -54,7 +54,11 @@ def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     ("topic", "payload", "why"),
     [
         ("set_gains", b'{"C1": [0.3, 0.3, 300]}', "at most 20"),
-        ("set_gains", b'{"C9": [1, 1, 1]}', "Gains"),
+        ("set_gains", b'{"C9": [1, 1, 1]}', "no gain C9; it has C1, C2, Gamma"),
+        ("set_gains", b'{"C1": [0.3, 0.0, 0.3]}', "every element must be positive"),
+        ("set_gains", b'{"C2": [0.3, 0.3]}', "law.C2"),
+        ("set_gains", b'{"C2": 0.3}', "law.C2"),
+        ("set_gains", b'{"mass": 2}', "no gain mass"),
         ("set_gains", b"gains, please", "Gains"),
         ("track", b'{"reference": {"kind": "dance"}}', "Track"),
         ("track", b"", "Track"),
@@ -234,7 +238,7 @@ def test_the_next_session_begins_with_the_gains_and_the_reference_of_now(loop: L
     loop.begin()
     gains = gains_with(C2=(0.4, 0.4, 0.4))
     assert loop.changes() == [Change(session="s1", tick=0, gains=gains, reference=SWING)]
-    expected = Controller(WIRE, LawSettings(C2=(0.4, 0.4, 0.4)), SWING, PERIOD)
+    expected = Controller(WIRE, AdaptiveSettings(C2=(0.4, 0.4, 0.4)), SWING, PERIOD)
     for k in range(100):
         assert loop.tick() == expected.tick(measured(k), k)
 
@@ -243,7 +247,7 @@ def test_the_next_session_begins_with_the_gains_and_the_reference_of_now(loop: L
 
 
 def test_a_configuration_read_again_takes_over_what_differs_and_leaves_an_operators_word(loop: Loop) -> None:
-    law = LawSettings(C1=(0.5, 0.5, 0.5))
+    law = AdaptiveSettings(C1=(0.5, 0.5, 0.5))
     loop.ask("track", Track(reference=SWING, within_s=0.5))
     loop.run(0.1)
     loop.read_again(law, LEVEL)  # LEVEL is configured
@@ -345,5 +349,5 @@ def test_from_the_logged_changes_a_fresh_controller_gives_the_same_commands_byte
                     loop.end()
                     loop.begin()
                 case "read again":
-                    loop.read_again(LawSettings(C1=(0.7, 0.7, 0.7)), SWING)
+                    loop.read_again(AdaptiveSettings(C1=(0.7, 0.7, 0.7)), SWING)
         loop.assert_it_runs_again()

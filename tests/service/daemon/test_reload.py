@@ -14,6 +14,7 @@ from aeroloop.protocol.runtime.role import Action, Role
 from aeroloop.service.config import Settings, load
 from aeroloop.service.daemon.reload import LIVE, differences, reload_on_hangup
 from aeroloop.service.points_file import PointsError, read_points
+from aeroloop.service.theorem.configured import with_theorem
 
 ROLES = ("controller", "plant", "recorder")
 
@@ -175,7 +176,7 @@ def test_what_was_read_again_takes_effect_between_ticks_and_is_reported() -> Non
     act = role.reload()
     assert (taken, role.reported) == ([], [])  # reading takes time, so it is done elsewhere
     act()
-    assert [settings.law.C1 for settings in taken] == [(1.0, 1.0, 1.0)]
+    assert [with_theorem(settings).law.C1 for settings in taken] == [(1.0, 1.0, 1.0)]
     assert role.description["law"]["C1"] == [1.0, 1.0, 1.0]
     role.hang_up()
     assert role.reported == [
@@ -224,7 +225,7 @@ def test_what_the_certificate_refuses_changes_nothing_and_may_be_read_again() ->
     with pytest.raises(AeroloopError):
         role.hang_up()
     role.hang_up()
-    assert [settings.law.C1[0] for settings in taken] == [1.0]
+    assert [with_theorem(settings).law.C1[0] for settings in taken] == [1.0]
     assert role.reported == [("changed", "configuration read again: law.C1: [0.3, 0.3, 0.3] → [1.0, 1.0, 1.0]")]
 
 

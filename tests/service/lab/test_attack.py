@@ -27,6 +27,7 @@ from aeroloop.service.lab.attacked_lemma import SIZE, Instants
 from aeroloop.service.lab.attacked_loops import Experiments, Loops, Outcome, balance, quantized
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.theorem.bounds import Theorem, lemma_1, theorem_1
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import evaluate
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from aeroloop.service.theorem.lemma import coordinates
@@ -69,7 +70,9 @@ def any_experiments(settings: Settings, rows: int, quantizers: bool = True) -> E
     """Random ones from x = 0, with damping that damps."""
     points = np.random.default_rng(3).uniform(-1, 1, (rows, 34))
     points[:, :3] = np.abs(points[:, :3])
-    return experiments(points, settings.law.damping_bound, 0.0, np.zeros(rows), np.full(rows, float(quantizers)))
+    return experiments(
+        points, with_theorem(settings).law.damping_bound, 0.0, np.zeros(rows), np.full(rows, float(quantizers))
+    )
 
 
 def largest(found: Attack, what: str, errors: str, *, start: bool = False) -> float:
@@ -82,7 +85,7 @@ def largest(found: Attack, what: str, errors: str, *, start: bool = False) -> fl
 @pytest.mark.parametrize("bits", ["8", "cont"])
 def test_a_row_of_the_batch_is_the_loop_that_runs_through_real_frames(bits: str) -> None:
     settings = with_bits(load(overrides=TURNED), bits, bits)
-    law, body, ticks = settings.law, settings.plant.rigid_body, 2000
+    law, body, ticks = with_theorem(settings).law, settings.plant.rigid_body, 2000
     plant = settings.plant.build(settings.loop.period)
     assert isinstance(plant, EmulatedPlant)
     q, omega = [], []

@@ -37,6 +37,7 @@ from aeroloop.service.lab.workers import Workers
 from aeroloop.service.terminal import margins_table
 from aeroloop.service.terminal.console import Console
 from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import beyond, evaluate
 
 SMALL = ["law.damping_bound=0.0119", "loop.lockstep=true"]
@@ -206,7 +207,7 @@ def test_the_error_is_the_largest_z_of_the_second_half() -> None:
     norms = list[float]()
 
     def watch(_k: int, _measurement: bytes, _command: bytes) -> None:
-        eps, omega, gains = controller.attitude_error, controller.rate_error, body.law.C1
+        eps, omega, gains = controller.attitude_error, controller.rate_error, with_theorem(body).law.C1
         z2 = [w + c * e for w, c, e in zip(omega, gains, eps, strict=True)]
         norms.append(hypot(1 - sqrt(1 - hypot(*eps) ** 2), *eps, *z2))
 

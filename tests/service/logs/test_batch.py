@@ -123,11 +123,12 @@ class Run:
             codes = [row[i] if self.wire.measurement.widths[i] is None else int(row[i]) for i in range(6)]
             states.append(before := controller.state)
             sent.append(controller.tick(self.wire.measurement.pack(k % 16, codes), k))
-            c, said = controller, [float("nan")] * (24 + self.wire.actuators)
+            c, said = controller, [float("nan")] * (34 + self.wire.actuators)
             if c.tick_index == k:
-                u = [float("nan")] * self.wire.actuators if c.failed else c.voltages
+                u = [float("nan")] * self.wire.actuators if c.fault else c.voltages
                 said = [*c.attitude, *c.desired, *c.rate, *c.attitude_error, *c.rate_error, *u]
-                said += [c.sign, *c.gains.C1, *before.damping_estimate]
+                for named in (c.gains.named, before.law, c.law_state):
+                    said += [value for values in named.values() for value in values]
             computed.append(said)
         return [*states, controller.state], computed, sent
 

@@ -25,7 +25,7 @@ from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import CHANGE_METADATA, DESCRIPTION_METADATA
 from aeroloop.service.recording import backlog, rolling
 from aeroloop.service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
-from aeroloop.service.recording.recorder import Recorder
+from aeroloop.service.recording.recorder import MANY, SOON_S, WORK_EVERY_S, Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.settings import RecorderSettings
 from tests.service.recording.conftest import CHANGES
@@ -259,6 +259,32 @@ def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_mes
     running.end()
     assert running.numbers() == list(range(20_000))
     assert running.losses() == []
+
+
+class Waits(threading.Event):
+    """An event that keeps how long it was waited for [s]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[float | None] = []
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.asked.append(timeout)
+        return super().wait(timeout)
+
+
+def test_while_many_messages_come_the_next_are_taken_soon_and_then_as_seldom_as_before(
+    record: Record, publisher: Publisher
+) -> None:
+    """What waits in a ring may hold far more memory than its own size."""
+    running, waits = record(), Waits()
+    running.role.stop = waits
+    publisher.send(1)
+    eventually("the first", lambda: running.recorder.log.written > 2)
+    assert set(waits.asked) <= {WORK_EVERY_S}
+    publisher.send(2 * MANY)
+    eventually("soon", lambda: SOON_S in waits.asked)
+    eventually("quiet", lambda: waits.asked[-1] == WORK_EVERY_S)
 
 
 def test_what_a_role_publishes_before_it_answers_is_awaited_at_the_end(record: Record, publisher: Publisher) -> None:

@@ -15,7 +15,7 @@ from aeroloop.service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlo
 from aeroloop.service.recording.subscriptions import Subscriptions
 from tests.support.zenoh_network import Gathering, eventually
 
-EVENT, TRUTH = "aeroloop/aero/event", "aeroloop/v2/truth"
+EVENT, TRUTH = "aeroloop/aero/event/plant", "aeroloop/v2/truth"
 
 
 @pytest.fixture

@@ -51,9 +51,9 @@ def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
     assert [mark.text for mark in happened if mark.kind == "changed"] == ["configuration read again"]
     marks = [(mark.time_s, mark.text) for mark in happened if mark.kind == "change"]
     assert [time for time, _ in marks] == [0.0, 0.24, 0.5, 0.8]
-    assert "C2 = diag(0.2, 0.2, 0.2)" in marks[1][1]
+    assert "C2 = [0.2, 0.2, 0.2]" in marks[1][1]
     assert "0°, 5°, -10°" in marks[2][1]
-    assert "Gamma = diag(0.01, 0.01, 0.01)" in marks[3][1]
+    assert "Gamma = [0.01, 0.01, 0.01]" in marks[3][1]
     assert "sinusoid" in marks[3][1]
 
 
@@ -75,7 +75,7 @@ def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_r
         event(60.0, "plant", "stopped", "at 0 V", session=None),
         event(0.52, "controller", "fault", "16 ticks missed", session=None),
         event(0.53, "controller", "fault", "5 ticks missed", tick=260),
-        event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event"),
+        event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event/controller"),
     ]
     findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
     marks = [mark for mark in findings.marks if mark.kind != "change"]
@@ -95,6 +95,15 @@ def test_what_a_restarted_recorder_received_again_counts_once(whole: Path, tmp_p
     findings = found(rewrite(whole, tmp_path / "a.mcap", more=[event, event]))
     assert findings.trips == ["tilted"]
     assert len([mark for mark in findings.marks if mark.kind == "tripped"]) == 1
+
+
+def test_a_trip_is_the_plant_s_by_the_key_of_its_event_whatever_an_event_claims_to_be(
+    whole: Path, tmp_path: Path
+) -> None:
+    forged = message_of("event", Event(role="plant", kind="tripped", text="never"), START_NS + 5 * 10**8, "recorder")
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=[forged]))
+    assert findings.trips == []
+    assert [mark.role for mark in findings.marks if mark.text == "never"] == ["recorder"]
 
 
 def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> None:
@@ -118,7 +127,7 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
     more = [
         loss("aeroloop/aero/s1/measurement", 3, 0.21),
         loss("aeroloop/aero/s1/measurement", 4, 0.41),
-        loss("aeroloop/aero/event", 1, 0.51),
+        loss("aeroloop/aero/event/plant", 1, 0.51),
     ]
     findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
     assert findings.losses == {"measurement": 7, "event": 1}

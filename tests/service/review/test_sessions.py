@@ -58,7 +58,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         for session, at in (("s1", START_NS + 10**8), ("s2", START_NS + 2 * HOUR_NS + 10**8))
     ]
-    trips.append(trips[0]._replace(key=topics.key("event", OTHER)))
+    trips.append(trips[0]._replace(key=topics.key("event", OTHER, role="plant")))
     rewrite(path.with_name("plain"), path, more=trips)
     path.with_name("plain").unlink()
     return path

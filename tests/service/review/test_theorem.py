@@ -27,6 +27,7 @@ from aeroloop.service.review.review import read, report
 from aeroloop.service.review.theorem_check import TheoremCheck
 from aeroloop.service.terminal.log_tables import review_account
 from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import coordinates
 from tests.support import numpy_twin as twin
@@ -222,7 +223,8 @@ def block(first: int, count: int) -> Ticks:
     k, zeros, upright = np.arange(first, first + count), np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     one = np.ones(count)
     times = k, k, one, one, one
-    return Ticks(k, *times, upright, upright, zeros, zeros, zeros, zeros, zeros, zeros, one, zeros + 0.3, zeros)
+    state = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))  # θ̂, and the sign
+    return Ticks(k, *times, upright, upright, *[zeros] * 6, np.full((count, 9), 0.3), state, state)
 
 
 def trial(*changes: Change) -> TheoremCheck:
@@ -296,7 +298,7 @@ def test_the_largest_norm_and_error_are_those_after_the_transient(tmp_path: Path
         q, omega, q_d, omega_d = (
             np.array([row]) for row in (after.attitude[i], after.rate[i], after.desired[i], rate_d)
         )
-        c = coordinates(q, omega, q_d, omega_d, after.sign[i : i + 1], np.array(settings.law.C1))
+        c = coordinates(q, omega, q_d, omega_d, after.state_next[i : i + 1, 3], np.array(with_theorem(settings).law.C1))
         norms.append(float(c.norm[0]))
     assert theorem.z_norm == pytest.approx(max(norms), rel=1e-9)
     largest = np.linalg.norm(after.attitude_error, axis=1).max()

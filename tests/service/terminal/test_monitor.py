@@ -45,7 +45,7 @@ def top_of(**messages: Message) -> Top:
 
 TELEMETRY = Telemetry(
     session="s", tick=1, counter=1, attitude_error=(0.0, 0.0, 0.008726535), rate_error=(0.0, 0.0, 0.0),
-    desired=(1.0, 0.0, 0.0, 0.0), damping_estimate=(0.0, 0.0, 0.0), voltages=(12.5, -3.0), sign=1,
+    desired=(1.0, 0.0, 0.0, 0.0), state={"damping_estimate": (0.0, 0.0, 0.0), "sign": (1.0,)}, voltages=(12.5, -3.0),
 )  # fmt: skip
 
 
@@ -76,10 +76,17 @@ def test_attitude_error_volts_and_bits_are_shown() -> None:
             ),
             telemetry=TELEMETRY,
             truth=Truth(tick=1, attitude=(half, 0.0, 0.0, half), rate=(0.0, 0.0, 0.0), voltages=(0.0, 0.0)),
-            event=Event(role="plant", kind="tripped", text="no fresh command for 100 ms: 0 V"),
+            event__plant=Event(role="recorder", kind="tripped", text="no fresh command for 100 ms: 0 V"),
         )
     )
-    for words in ("yaw   +90.0°", "error  1.00°", "+12.5", "-3.0", "28.0 + 12.0 kbit/s", "no fresh command for 100 ms"):
+    for words in (
+        "yaw   +90.0°",
+        "error  1.00°",
+        "+12.5",
+        "-3.0",
+        "28.0 + 12.0 kbit/s",
+        "aero plant: no fresh command",
+    ):
         assert words in shown
 
 

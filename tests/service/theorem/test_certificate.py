@@ -17,10 +17,11 @@ from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Plan, reference_function
 from aeroloop.service.theorem.bounds import attitude_error
 from aeroloop.service.theorem.certificate import certify
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.extremes import BoundlessError, extremes
 from aeroloop.service.theorem.lemma import Samples, coordinates, lemma_inequalities, rotation
@@ -89,7 +90,7 @@ def test_the_paper_s_experiment_agrees_with_its_formulas_worked_by_hand() -> Non
 
 def test_a_body_at_rest_near_its_reference_agrees_with_the_formulas_worked_by_hand() -> None:
     """No ω_d, no weight, three motors, an error of at most 60°: k_ε is then 1/cos 30° but for second order."""
-    law = LawSettings(
+    law = AdaptiveSettings(
         inertia=(0.02, 0.03, 0.01), centre_of_mass=(0, 0, 0), allocation=((0.01, 0, 0), (0, 0.02, 0), (0, 0, 0.01)),
         C1=(0.2, 0.1, 0.2), C2=(0.3, 0.2, 0.2), damping_estimate=(0, 0, 0), damping_bound=0.01,
     )  # fmt: skip
@@ -230,7 +231,7 @@ def test_a_machine_holds_only_with_a_stated_disturbance() -> None:
 
 def test_c0_is_the_least_share_of_z1_that_the_gain_reaches() -> None:
     """The correction of (C.66), against random errors: z₁ᵀGᵀC₁Gz₁ = ε̃ᵀC₁ε̃ ≥ c₀ ‖z₁‖², and c₀ is all but attained."""
-    law = LawSettings(C1=(0.3, 0.1, 0.2), C2=(9, 9, 9))
+    law = AdaptiveSettings(C1=(0.3, 0.1, 0.2), C2=(9, 9, 9))
     most = radians(100)
     settings = Settings(wire=PAPER.wire.with_bits(None, None), law=law, reference=STILL)
     c0 = evaluate(settings, attitude_error_deg=degrees(most)).theorem.c0
@@ -374,10 +375,10 @@ def test_an_ideal_body_ends_within_the_radius_and_breaks_no_inequality_on_its_wa
     settings = load_over(load(EXAMPLES / "rigid-body.toml"), [off, *wire])
     bounds = evaluate(settings)
     samples = _run(settings, duration_s=16)
-    inequalities = lemma_inequalities(samples, settings.law, bounds.known, bounds.lemma)
+    inequalities = lemma_inequalities(samples, with_theorem(settings).law, bounds.known, bounds.lemma)
     assert {i.equation: int(i.broken.sum()) for i in inequalities if i.broken.any()} == {}
     x = samples
-    z = coordinates(x.q, x.omega, x.q_d, x.omega_d, x.sign, np.array(settings.law.C1)).norm
+    z = coordinates(x.q, x.omega, x.q_d, x.omega_d, x.sign, np.array(with_theorem(settings).law.C1)).norm
     assert bounds.plant_reach is not None
     assert z[0] > bounds.plant_reach.radius
     assert z[len(z) // 2 :].max() < bounds.plant_reach.radius
@@ -400,7 +401,7 @@ def _run(settings: Settings, duration_s: float) -> Samples:
         assert u is not None
         omega_d = twin.rotation(np.array(controller.attitude)) @ np.subtract(controller.rate, controller.rate_error)
         known = true.attitude, true.rate, controller.attitude, controller.rate, controller.desired, omega_d
-        rows.append([*(value for part in known for value in part), controller.sign])
+        rows.append([*(value for part in known for value in part), *controller.law_state["sign"]])
         plant.actuate([quantizer.quantize(value) for quantizer, value in zip(voltage, u, strict=True)])
         plant.advance()
     assert not any(quantizer.saturated for quantizer in voltage)

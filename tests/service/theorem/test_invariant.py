@@ -13,8 +13,9 @@ import pytest
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
 from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.config import Settings, load_over
-from aeroloop.service.control.law import Law, LawSettings, build_law
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings, Equations, equations
 from aeroloop.service.control.reference import Floats, Plan
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import evaluate, premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
 from aeroloop.service.theorem.invariant import Premises, largest_start, reach
@@ -48,9 +49,9 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
     at = reach(p, start)
     assert at is not None
     rng = np.random.default_rng(seed)
-    law = settings.law
+    law = with_theorem(settings).law
     C1, C2, J, B = (np.array(v) for v in (law.C1, law.C2, law.inertia, law.allocation))
-    built = build_law(law)
+    built = equations(law)
     inputs = [built.q, built.omega, built.q_d, built.omega_d, built.omega_d_dot, built.theta, built.s]
     inputs += [built.C1, built.C2, built.Gamma]
     command = ca.Function("command", inputs, [built.u, built.theta_dot])
@@ -195,7 +196,7 @@ def test_the_reached_attitude_error_is_that_of_the_angle() -> None:
     )
 
 
-def _psi(law: LawSettings, built: Law) -> ca.SX:
+def _psi(law: AdaptiveSettings, built: Equations) -> ca.SX:
     """Ψ of (C.4) at the true state."""
     J = ca.diag(ca.SX(law.inertia))
     f_g = ca.vertcat(0, 0, -law.mass * law.gravity)
@@ -236,13 +237,13 @@ GENTLE = load_over(
 
 def test_no_state_of_a_body_with_a_held_roll_is_disturbed_by_more_than_its_bounds() -> None:
     """The Aero's own equations, pitch and yaw near the reference; derivatives by differences over a microsecond."""
-    law = GENTLE.law
+    law = with_theorem(GENTLE).law
     p = replace(of(GENTLE), tilt=extremes(GENTLE.reference).tilt)
     at = reach(p, 0.02)
     assert at is not None
     C1, C2, J = (np.array(v) for v in (law.C1, law.C2, law.inertia))
     kappa1 = 1 / (1 + C1 * C2)
-    built = build_law(law)
+    built = equations(law)
     inputs = [built.q, built.omega, built.q_d, built.omega_d, built.omega_d_dot, built.theta, built.s]
     command = ca.Function("c", [*inputs, built.C1, built.C2, built.Gamma], [built.u, built.theta_dot])
     plan, rng, step = Plan.of(GENTLE.reference), np.random.default_rng(7), 1e-6

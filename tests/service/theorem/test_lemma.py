@@ -18,14 +18,14 @@ from aeroloop.protocol.wire.quantizer import Quantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
-from aeroloop.service.control.law import LawSettings
+from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.reference import Plan, reference_function
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import Floats, Samples, coordinates, lemma_inequalities, lyapunov, rotation, times
 from tests.support import numpy_twin as twin
 from tests.support.twin_body import body_of
 
-LAW = LawSettings(
+LAW = AdaptiveSettings(
     inertia=(0.02, 0.03, 0.01),
     centre_of_mass=(0.03, -0.02, 0.02),
     allocation=((0.01, 0, 0), (0, 0.02, 0), (0, 0, 0.01)),

@@ -11,8 +11,9 @@ import pytest
 
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
 from aeroloop.service.config import Settings, load
-from aeroloop.service.control.law import build_law
+from aeroloop.service.control.laws.adaptive import equations
 from aeroloop.service.control.reference import Floats, Plan
+from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate
 from aeroloop.service.theorem.lemma import coordinates
 from aeroloop.service.theorem.mean_square import decay, mechanism_torque
@@ -26,10 +27,10 @@ UNEVEN = load(
 
 def shares(settings: Settings, size: float, count: int) -> list[float]:
     """z₂ᵀ(J ż₂ + ε̃ + C₂ z₂ − Φ θ̃) of an Aero under the law without noise, as a share of its bound, at random states."""
-    law, rng = settings.law, np.random.default_rng(7)
+    law, rng = with_theorem(settings).law, np.random.default_rng(7)
     plant = AeroSettings(inertia=law.inertia, centre_of_mass=law.centre_of_mass)
     dynamics = aero_dynamics(plant)
-    built = build_law(law)
+    built = equations(law)
     inputs = [built.q, built.omega, built.q_d, built.omega_d, built.omega_d_dot, built.theta, built.s]
     command = ca.Function("command", [*inputs, built.C1, built.C2], [built.u])
     angles = Plan.of(settings.reference).samples()

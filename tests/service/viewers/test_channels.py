@@ -153,12 +153,15 @@ def test_the_body_hangs_in_the_frame_that_its_transform_moves(kind: str, rotors:
         ("loss", Loss(key="k", count=7, reason="disk"), 3, b"7 messages of k"),
     ],
 )
-def test_what_happens_is_a_line_of_the_log(name: str, message: Message, level: int, words: bytes) -> None:
-    (shown,) = configured(1.0).take(address(name), message.encode(), NOW)
+def test_what_happens_is_a_line_of_the_log_of_the_role_in_its_key(
+    name: str, message: Message, level: int, words: bytes
+) -> None:
+    (shown,) = configured(1.0).take(address(name, "recorder"), message.encode(), NOW)
     assert (shown.topic, shown.shape.name) == ("/aero/log", "foxglove.Log")
     line = fields(shown.data)
     assert line[2] == [level]
     assert line[3][0].startswith(words)
+    assert line[4] == [b"recorder"]  # by its key, whatever it claims to be
 
 
 def test_frames_give_nothing_before_a_description_and_are_read_by_the_plants() -> None:

@@ -17,7 +17,8 @@ import pytest
 
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, received_quaternion
 from aeroloop.protocol.wire.symbolic import Compiled
-from aeroloop.service.control.law import Law, LawSettings, build_law, law_function, law_steps, projection
+from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, Equations, equations, projection
+from aeroloop.service.control.laws.evaluation import law_function, received
 from tests.support import numpy_twin as twin
 from tests.support.numpy_twin import Array
 from tests.support.twin_body import body_of
@@ -68,10 +69,10 @@ def _triple(values: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _random_settings(rng: np.random.Generator) -> LawSettings:
+def _random_settings(rng: np.random.Generator) -> AdaptiveSettings:
     """A body and gains that have nothing in common with Table C.1."""
     allocation = rng.normal(size=(3, 3)) + 3 * np.identity(3)  # + 3 I: well away from singular
-    return LawSettings(
+    return AdaptiveSettings(
         inertia=_triple(rng.uniform(0.5, 2.0, 3)),
         mass=float(rng.uniform(0.5, 2.0)),
         gravity=float(rng.uniform(5.0, 10.0)),
@@ -95,9 +96,9 @@ class ClosedLoop:
     the last row of the rotation matrix.
     """
 
-    def __init__(self, p: LawSettings) -> None:
+    def __init__(self, p: AdaptiveSettings) -> None:
         self._p = p
-        self.law = law = build_law(p)
+        self.law = law = equations(p)
         self.true_theta = ca.SX.sym("true_theta", 3)
         self._moves = [
             (law.q, _product(law.q, ca.vertcat(0, law.omega)) / 2),  # (C.1): ω in the body frame
@@ -130,7 +131,7 @@ def _product(p: ca.SX, q: ca.SX) -> ca.SX:
     )
 
 
-def _omega_dot(p: LawSettings, law: Law, true_theta: ca.SX) -> ca.SX:
+def _omega_dot(p: AdaptiveSettings, law: Equations, true_theta: ca.SX) -> ca.SX:
     """(C.2) solved for ω̇, with the law's u."""
     w, x, y, z = (law.q[i] for i in range(4))
     up = ca.vertcat(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))  # seen from the body
@@ -160,7 +161,7 @@ def test_the_law_agrees_with_the_twin_at_moving_states(paper: bool, s: float) ->
     rng = np.random.default_rng(1)
     projected = 0
     for _ in range(1 if paper else 20):
-        p = LawSettings() if paper else _random_settings(rng)
+        p = AdaptiveSettings() if paper else _random_settings(rng)
         loop = ClosedLoop(p)
         law = loop.law
         e = ca.vertcat(law.eta_e, law.eps_e)
@@ -182,21 +183,20 @@ def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -
         p = _random_settings(rng)
         x = _point(rng, 0.5 * p.damping_bound)  # so far inside k_θ that a period does not lead out
         expected = twin.law(body_of(p), x.q, x.omega, x.q_d, x.omega_d, x.omega_d_dot, x.theta, s)
-        tick = law_function(p, period)(
-            eps=_sent(x.q),
+        tick = law_function(Adaptive(p, period, 3))(
             last=x.q,
+            state=[*x.theta, s],
+            gains=[*p.C1, *p.C2, *p.Gamma],
+            eps=_sent(x.q),
             omega=x.omega,
             q_d=x.q_d,
             omega_d=x.omega_d,
             omega_d_dot=x.omega_d_dot,
-            theta=x.theta,
-            s=s,
-            C1=p.C1,
-            C2=p.C2,
-            Gamma=p.Gamma,
         )
         assert _close(_array(tick["u"]), expected.u)
-        assert _close(_array(tick["theta_next"]), x.theta + period * expected.theta_dot)
+        *theta_next, s_next = _array(tick["state_next"])
+        assert _close(np.array(theta_next), x.theta + period * expected.theta_dot)
+        assert s_next == s
         assert _close(np.append(_array(tick["eta_e"]), _array(tick["eps_e"])), expected.e)
         assert _close(_array(tick["omega_e"]), expected.omega_e)
 
@@ -206,7 +206,7 @@ def test_one_tick_is_the_law_with_the_estimate_carried_over_a_period(s: float) -
 def test_without_quantization_the_lyapunov_function_falls_exactly_as_c25_says(paper: bool, s: float) -> None:
     rng = np.random.default_rng(3)
     for _ in range(1 if paper else 10):
-        p = LawSettings() if paper else _random_settings(rng)
+        p = AdaptiveSettings() if paper else _random_settings(rng)
         loop = ClosedLoop(p)
         z1, z2 = loop.law.z1, loop.law.z2
         wrong = loop.true_theta - loop.law.theta
@@ -323,8 +323,8 @@ def test_the_projection_never_hurts_the_lyapunov_function() -> None:
 def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> None:
     """Remark 5, with k_θ/0.95 for k_θ: at every tick and not only in continuous time."""
     rng = np.random.default_rng(10)
-    p = LawSettings(Gamma=_triple(0.02 * gain * np.ones(3)))
-    tick = law_function(p, 0.002)
+    p = AdaptiveSettings(Gamma=_triple(0.02 * gain * np.ones(3)))
+    tick, gains = law_function(Adaptive(p, 0.002, 3)), [*p.C1, *p.C2, *p.Gamma]
     theta = np.array([0.0, 0.0, p.damping_bound])
     x = _point(rng, p.damping_bound)
     pressed = 0
@@ -332,7 +332,7 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
         if k % 300 == 0:
             x = _point(rng, p.damping_bound)  # another drive, kept long enough to press against the bound
         desired = x.q_d, x.omega_d, x.omega_d_dot
-        theta = _array(tick(x.q, theta, _sent(x.q), x.omega, *desired, 1.0, p.C1, p.C2, p.Gamma)[2])
+        theta = _array(tick(x.q, [*theta, 1.0], gains, _sent(x.q), x.omega, *desired)[2])[:3]
         pressed += bool(np.linalg.norm(theta) > p.damping_bound)
         # scaling to a length of k_θ/0.95 rounds in the last place
         assert np.linalg.norm(theta) <= p.damping_bound / 0.95 * (1 + 1e-15)
@@ -347,18 +347,19 @@ def test_the_estimate_stays_within_its_bound_under_any_drive(gain: float) -> Non
     ],
 )
 def test_an_allocation_without_inverse_is_refused(allocation: tuple[tuple[float, float, float], ...]) -> None:
-    settings = LawSettings.model_validate({"allocation": allocation})
+    settings = AdaptiveSettings.model_validate({"allocation": allocation})
     with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
-        build_law(settings)
+        equations(settings)
     with pytest.raises(ValueError, match=r"law\.allocation \(B\) has no inverse"):
-        law_function(settings, 0.002)
+        law_function(Adaptive(settings, 0.002, 3))
 
 
 def test_attitudes_are_received_to_the_bits_of_the_plain_function() -> None:
     """Whether the last pointed away, along, or at a right angle, or ε was longer than 1, or −0."""
     corners = [0.0, -0.0, 0.6, -0.6, 0.8, -0.8, 1.0, -1.0, 1.3, 1e200]
     rng = np.random.default_rng(0)
-    step = Compiled(law_steps(LawSettings(), 0.002).attitude)
+    given = ca.SX.sym("eps", 3), ca.SX.sym("last", 4)
+    step = Compiled(ca.Function("attitude", [*given], [received(*given)], ["eps", "last"], ["q"]))
     last, eps, q = step.inputs["last"], step.inputs["eps"], step.outputs["q"]
     starts: list[Quaternion] = [IDENTITY, (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.6, -0.8)]
     for before in starts:

@@ -1,0 +1,1 @@
+"""Other engines as plants: MuJoCo models and FMUs."""

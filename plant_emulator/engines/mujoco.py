@@ -1,0 +1,231 @@
+"""MuJoCo as a plant: one body of an MJCF model, its attitude measured, its actuators driven by the loop's voltages.
+
+Each period: voltages → rotor lag → `allocation` → controls of the model → steps of MuJoCo → sensors. What moves,
+and how it rubs, weighs and collides, is the MJCF's; its integrator is used, in equal steps no longer than its timestep.
+A simulation that diverges measures NaN, on which the plant end trips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from math import ceil, copysign, exp, hypot, inf, log
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import AfterValidator, BaseModel, Field
+
+from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
+from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.protocol.lazy import numpy as np
+from aeroloop.protocol.plugins import PluginError
+from aeroloop.protocol.wire.attitude import Quaternion, Vector
+
+SHIPPED: Final = {path.stem: path for path in sorted((Path(__file__).parent / "models").glob("*.xml"))}
+"""Our models, by name."""
+
+
+def _has_a_direction(attitude: Quaternion) -> Quaternion:
+    if not 0 < hypot(*attitude) < inf:
+        raise ValueError("a quaternion of any finite length but zero")
+    return attitude
+
+
+class MujocoSettings(BaseModel, extra="forbid"):
+    """A body of an MJCF model, and what lies between it and the loop."""
+
+    model: str = Field(
+        default="aero", description="MJCF: aero or quadrotor of ours, the path of a file, or the text itself, from < on"
+    )
+    body: str = Field(default="body", description="the body whose attitude and angular velocity are measured")
+    keyframe: str | None = Field(
+        default=None, description="the model's keyframe to start from; its controls are those at 0 V, else 0"
+    )
+    attitude: Annotated[Quaternion, AfterValidator(_has_a_direction)] | None = Field(
+        default=None, description="q of the body at the start [1]; for a body on a free or ball joint"
+    )
+    allocation: list[list[float]] | None = Field(
+        default=None,
+        description="controls per volt, a row for each actuator of the model, a column for each voltage [control's "
+        "unit/V]; a voltage for each actuator and 1 each if left out",
+    )
+    rotor: RotorSettings = Field(
+        default=RotorSettings(lag_up_s=0.0, lag_down_s=0.0), description="lag and dead zone; by default neither"
+    )
+    contacts: bool = Field(default=True, description="bodies collide, if the model's own flags let them")
+    substeps: int | None = Field(
+        default=None,
+        ge=1,
+        le=1000,
+        description="steps of MuJoCo a period; if left out, the fewest no longer than the model's timestep",
+    )
+    sensors: SensorSettings = Field(
+        default=SensorSettings(attitude="perfect", rate="perfect"), description="sensors of attitude and rate"
+    )
+    joints: tuple[str, str] = Field(
+        default=("pitch", "yaw"), description="hinge joints that carry the encoders, if there are any"
+    )
+
+
+class MujocoPlant(Plant):
+    """A body in MuJoCo, stepped `period` by `period` [s].
+
+    Raises:
+        PluginError: MuJoCo is not installed, the MJCF is none, or lacks what the settings name.
+    """
+
+    Settings = MujocoSettings
+    repeatable = True
+
+    def __init__(self, settings: MujocoSettings, period: float) -> None:
+        try:
+            self._mujoco: Any = import_module("mujoco")  # 0.3 s and 25 MB
+        except ModuleNotFoundError:
+            raise PluginError("this needs MuJoCo, which is not installed: pip install 'aeroloop[mujoco]'") from None
+        self._model = model = self._loaded(settings.model)
+        flags = self._mujoco.mjtDisableBit
+        model.opt.disableflags |= flags.mjDSBL_AUTORESET  # a state that is not finite is to be seen
+        if not settings.contacts:
+            model.opt.disableflags |= flags.mjDSBL_CONTACT
+        self._substeps = settings.substeps or max(1, ceil(period / model.opt.timestep - 1e-9))
+        model.opt.timestep = period / self._substeps
+
+        self._data = data = self._mujoco.MjData(model)
+        if settings.keyframe is not None:
+            key = self._named("keyframe", "key", settings.keyframe)
+            self._mujoco.mj_resetDataKeyframe(model, data, key)
+        self._body = self._named("body", "body", settings.body)
+        if settings.attitude is not None:
+            self._turn(settings.attitude)
+        self._at_rest = data.ctrl.copy()
+        self._allocation = self._allocated(settings.allocation)
+        self.actuators = self._allocation.shape[1]
+
+        self._rotor = settings.rotor
+        self._commanded = self._at_rotors = [0.0] * self.actuators
+        self._sensors = Sensors(settings.sensors, period)
+        encoders = settings.sensors.attitude == "encoders" or settings.sensors.rate == "derivative"
+        self._joints = [
+            model.jnt_qposadr[self._named("joint", "joint", name)] for name in (settings.joints if encoders else ())
+        ]
+        self._ctrl, self._qpos, self._xquat = data.ctrl, data.qpos, data.xquat[self._body]  # views
+        self._velocity = np.empty(6)
+        self._sense()
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Hold voltages [V]; the model clips its controls to their ranges. Shape (actuators,)."""
+        self._commanded = [float(voltage) for voltage in voltages]
+
+    def advance(self) -> None:
+        """Step through one period and sample the sensors."""
+        step, model, data = self._mujoco.mj_step, self._model, self._data
+        if self._rotor.present:
+            half = model.opt.timestep / 2
+            for _ in range(self._substeps):
+                self._lag(half)
+                self._control(self._at_rotors)  # held over the step: its value in the middle
+                step(model, data)
+                self._lag(half)
+        else:
+            self._control(self._commanded)
+            step(model, data, self._substeps)
+        self._sense()
+
+    def measure(self) -> Measurement:
+        """Sensor values at the end of the last period."""
+        return self._measurement
+
+    def truth(self) -> State:
+        """The present true state, and the commanded voltages."""
+        return State(self._attitude, self._rate, tuple(self._commanded))
+
+    def close(self) -> None:
+        """0 V."""
+        self.actuate((0.0,) * self.actuators)
+
+    def _loaded(self, model: str) -> Any:
+        """The compiled model."""
+        load = self._mujoco.MjModel
+        try:
+            if model.lstrip().startswith("<"):
+                return load.from_xml_string(model)
+            path = SHIPPED.get(model, Path(model).expanduser())
+            if not path.is_file():
+                raise PluginError(f"there is no MJCF file {model}; ours are {', '.join(SHIPPED)}")
+            return load.from_xml_path(str(path))
+        except ValueError as error:
+            said = " ".join(str(error).split())
+            raise PluginError(f"MuJoCo refuses the MJCF {'given' if '<' in model else model}: {said}") from None
+
+    def _named(self, what: str, kind: str, name: str) -> int:
+        """The index of what the model calls `name`; `kind` is MuJoCo's word for what it is."""
+        m = self._mujoco
+        type_ = getattr(m.mjtObj, f"mjOBJ_{kind.upper()}")
+        if (found := m.mj_name2id(self._model, type_, name)) < 0:
+            count = {"body": self._model.nbody, "joint": self._model.njnt, "key": self._model.nkey}[kind]
+            names = [m.mj_id2name(self._model, type_, i) for i in range(count)]
+            known = ", ".join(each for each in names if each and each != "world")
+            raise PluginError(f"the MJCF has no {what} {name!r}; it has {known or 'none with a name'}")
+        return int(found)
+
+    def _allocated(self, allocation: list[list[float]] | None) -> Any:
+        """Controls per volt. Shape (controls, voltages)."""
+        controls = self._model.nu
+        if not controls:
+            raise PluginError("the MJCF has no actuators")
+        if allocation is None:
+            return np.eye(controls)
+        widths = {len(row) for row in allocation}
+        if len(allocation) != controls or len(widths) != 1 or 0 in widths:
+            raise PluginError(f"allocation needs {controls} rows of one length: the MJCF has so many actuators")
+        return np.array(allocation)
+
+    def _turn(self, attitude: Quaternion) -> None:
+        """Set the quaternion of the body's joint such that the body has this attitude."""
+        m, model, data = self._mujoco, self._model, self._data
+        joint = model.body_jntadr[self._body]
+        kind = m.mjtJoint(model.jnt_type[joint]) if joint >= 0 else None
+        if kind not in (m.mjtJoint.mjJNT_FREE, m.mjtJoint.mjJNT_BALL):
+            raise PluginError("attitude sets that of a body on a free or ball joint; start others from a keyframe")
+        start = model.jnt_qposadr[joint] + (3 if kind == m.mjtJoint.mjJNT_FREE else 0)
+        quaternion = data.qpos[start : start + 4]
+        quaternion[:] = 1, 0, 0, 0
+        m.mj_kinematics(model, data)
+        back = np.empty(4)
+        m.mju_negQuat(back, data.xquat[self._body])
+        m.mju_mulQuat(quaternion, back, np.array(attitude) / np.linalg.norm(attitude))
+
+    def _control(self, voltages: list[float]) -> None:
+        """Set the controls [their units] for voltages at the rotors [V]."""
+        if zone := self._rotor.dead_zone_v:
+            voltages = [copysign(max(abs(voltage) - zone, 0.0), voltage) for voltage in voltages]
+        self._ctrl[:] = self._at_rest + self._allocation.dot(voltages)
+
+    def _lag(self, time: float) -> None:
+        pairs = zip(self._at_rotors, self._commanded, strict=True)
+        self._at_rotors = [lagged(self._rotor, voltage, command, time) for voltage, command in pairs]
+
+    def _sense(self) -> None:
+        """Attitude and rate of the state after the last step, and what the sensors make of them."""
+        m, model, data = self._mujoco, self._model, self._data
+        m.mj_kinematics(model, data)
+        m.mj_comPos(model, data)
+        m.mj_comVel(model, data)
+        m.mj_objectVelocity(model, data, m.mjtObj.mjOBJ_XBODY, self._body, self._velocity, 1)
+        w, x, y, z = self._xquat.tolist()
+        self._attitude: Quaternion = (w, x, y, z)
+        a, b, c, *_ = self._velocity.tolist()
+        self._rate: Vector = (a, b, c)
+        self._measurement = self._sensors.read(self._attitude, self._rate, self._qpos[self._joints].tolist())
+
+
+def lagged(rotor: RotorSettings, voltage: float, command: float, time: float) -> float:
+    """The voltage that makes thrust, `time` [s] later under a held command [V]: `rotor_derivative`, solved exactly."""
+    if (command - voltage) * voltage >= 0:
+        return command + (voltage - command) * exp(-time / rotor.lag_up_s)
+    after = command + (voltage - command) * exp(-time / rotor.lag_down_s)
+    if after * voltage >= 0:
+        return after
+    to_zero = rotor.lag_down_s * log(1 - voltage / command)  # a rotor that reverses falls first, then rises
+    return command - command * exp(-(time - to_zero) / rotor.lag_up_s)

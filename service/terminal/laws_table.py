@@ -1,0 +1,86 @@
+"""Terminal tables of compared laws: figures of each combination, then what each law survives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import groupby
+
+from rich.table import Table
+from rich.text import Text
+
+from aeroloop.service.lab.tables import markdown_table
+from aeroloop.service.sweep.laws import LawMargin, LawRow, Laws
+from aeroloop.service.terminal.console import Console
+
+_HEADER = ["law", "z_track 10⁻⁴ s", "u_total V²·s", "largest", "settled", "changes/s", "kbit/s"]
+Sections = Iterator[tuple[str, list[list[str]]]]
+
+
+def laws_table(laws: Laws) -> None:
+    """Print a comparison of laws."""
+    console = Console()
+    for title, (header, *rows) in _sections(laws):
+        table = Table(title=Text(title), title_justify="left", title_style="italic", box=None, pad_edge=False)
+        for i, name in enumerate(header):
+            table.add_column(name, justify="right" if i else "left", min_width=0 if i else 11, no_wrap=not i)
+        failed = [row for row in rows if len(row) == 2]
+        for row in rows:
+            if row not in failed:
+                table.add_row(*map(Text, row))
+        console.print(table)
+        for law, reason in failed:
+            console.print(Text(f"{law}: {reason}", style="red"), soft_wrap=not console.is_terminal)
+        console.print()
+    for line in _notes(laws):
+        console.print(Text(line), soft_wrap=not console.is_terminal)
+
+
+def markdown(laws: Laws) -> str:
+    """The same as Markdown."""
+    lines: list[str] = []
+    for title, (header, *rows) in _sections(laws):
+        filled = [row if len(row) == len(header) else [row[0], row[1], *[""] * (len(header) - 2)] for row in rows]
+        lines += [f"**{title}**", "", markdown_table([header, *filled]), ""]
+    return "\n\n".join(["\n".join(lines).rstrip(), *_notes(laws)])
+
+
+def _sections(laws: Laws) -> Sections:
+    """Titles and rows of text, a header first; a row of two has no figures."""
+    for (plant, sensors, wind, bits), rows in groupby(laws.rows, lambda r: (r.plant, r.sensors, r.wind, r.bits)):
+        title = " · ".join(dict.fromkeys((plant, f"sensors {sensors}", wind, f"{bits} bits")))
+        yield title, [_HEADER, *map(_figures, rows)]
+    plants = list(dict.fromkeys(margin.plant for margin in laws.margins))
+    kinds = dict.fromkeys(margin.law for margin in laws.margins)
+    of = {(margin.law, margin.plant): _margin(margin) for margin in laws.margins}
+    header = ["law", *(f"{plant}: {what}" for plant in plants for what in ("delay", "lost"))]
+    rows_of = [[law, *(text for plant in plants for text in of[law, plant])] for law in kinds]
+    yield f"survives, calm, {laws.margin_at.split(',')[0]}: error within {laws.within_deg:g}°", [header, *rows_of]
+
+
+def _figures(row: LawRow) -> list[str]:
+    if row.reason is not None:
+        return [row.law, row.reason]
+    figures = ((row.z_track, "{:.1f}", 1e4), (row.u_total, "{:.0f}", 1), (row.max_error_deg, "{:.1f}°", 1),
+               (row.second_half_error_deg, "{:.2f}°", 1), (row.command_changes_per_s, "{:.0f}", 1),
+               (row.bits_per_s, "{:.1f}", 1e-3))  # fmt: skip
+    return [row.law, *("–" if value is None else form.format(value * scale) for value, form, scale in figures)]
+
+
+def _margin(margin: LawMargin) -> tuple[str, str]:
+    delay, lost = margin.delay_ms, margin.lost_frames
+    return "none" if delay is None else f"{delay:g} ms", "none" if lost is None else str(lost)
+
+
+def _notes(laws: Laws) -> Iterator[str]:
+    bandwidth, damping = ("/".join(dict.fromkeys(f"{value:.2f}" for value in values)) for values in (
+        laws.bandwidth, laws.damping_ratio))  # fmt: skip
+    yield (
+        f"Tuned to ωₙ = {bandwidth} rad/s and ζ = {damping} of the linearised error, which the paper's gains have "
+        "(service/control/laws/README.md has the rule); a law of your own, and the configured one, as configured."
+    )
+    yield (
+        f"{laws.duration_s:g} s each, {laws.seeds} seed{'s' * (laws.seeds > 1)}, sent on change. Settled is the "
+        f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
+        "that act later, or of which so many in a row never do, again and again, up to 1 s."
+    )
+    yield f"path: {laws.path}{'' if laws.out is None else f'; all experiments: {laws.out}'}"

@@ -1,0 +1,361 @@
+"""MuJoCo plant: the Aero's twin agrees with ours, bodies fly through full turns, runs repeat, errors are one line.
+
+The twin is written in MuJoCo's own terms and stepped by its integrator. What differs is Coulomb friction: ours changes
+its torque smoothly within 0.01 rad/s, MuJoCo's is a constraint that holds still. So without it the two agree tightly.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from math import degrees, inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aeroloop.plant_emulator.engines.mujoco import SHIPPED, MujocoPlant, MujocoSettings, lagged
+from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
+from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.plant import Measurement, Plant, State
+from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
+from aeroloop.protocol.messages.operator import Sinusoid
+from aeroloop.protocol.plugins import PluginError
+from aeroloop.service.cli.show import EXAMPLES
+from aeroloop.service.config import Settings, load
+from aeroloop.service.lab.experiment import through_frames
+from tests.support.numpy_twin import Array
+
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
+
+PERIOD = 0.002
+DURATION = 12.0
+"""Of a run along the paper's experiment [s]: pitch and yaw each turn back once."""
+
+AERO = SHIPPED["aero"].read_text()
+SMOOTH = AERO.replace(' frictionloss="0.003040"', "").replace(' frictionloss="0.0009"', "")
+"""The Aero without Coulomb friction."""
+
+TOP = """
+<mujoco>
+  <option integrator="RK4" timestep="0.0005" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body name="arm" quat="0.8 0 0.6 0">
+      <body name="top" quat="0.6 0 0 0.8">
+        <joint type="ball"/>
+        <inertial pos="0.01 0.02 -0.03" mass="1.2" fullinertia="{inertia}"/>
+        <site name="origin"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor site="origin" gear="0 0 0 0.02 0 0.001"/>
+    <motor site="origin" gear="0 0 0 0 0.01 0"/>
+    <motor site="origin" gear="0 0 0 0.003 0 0.03"/>
+  </actuator>
+</mujoco>
+"""
+
+
+FLIGHT = load(EXAMPLES / "quadrotor.toml")
+QUADROTOR = MujocoSettings.model_validate(FLIGHT.plant.own)
+
+
+class Recorded(Plant):
+    """Passes everything on to a plant and keeps what it was given and what became of it."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.actuators = plant.actuators
+        self.voltages: list[tuple[float, ...]] = []
+        self.states: list[State] = []
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        self.voltages.append(tuple(voltages))
+        self.plant.actuate(voltages)
+
+    def advance(self) -> None:
+        self.plant.advance()
+        state = self.plant.truth()
+        assert state is not None
+        self.states.append(state)
+
+    def measure(self) -> Measurement:
+        return self.plant.measure()
+
+    def close(self) -> None:
+        self.plant.close()
+
+
+def _apart(some: Sequence[State], others: Sequence[State]) -> float:
+    """The largest angle between two courses of attitudes [deg]; precise near 0, where an arc cosine is not."""
+    p, q = (np.array([state.attitude for state in states]) for states in (some, others))
+    chord = np.minimum(np.linalg.norm(p - q, axis=1), np.linalg.norm(p + q, axis=1))
+    return degrees(4 * np.arcsin(chord / 2).max())
+
+
+def _experiment(coulomb: bool, bits: int | str) -> Settings:
+    """The paper's experiment on our Aero with perfect sensors."""
+    edge = {"attitude": 1.0, "rate": 1.0, "voltage": 24.0}
+    return Settings.model_validate(
+        {
+            "plant": {
+                "friction": FrictionSettings() if coulomb else FrictionSettings(coulomb=()),
+                "sensors": IDEAL_SENSORS,
+            },
+            "wire": {signal: {"bits": bits, "limit": limit} for signal, limit in edge.items()},
+            "controller": {"after_restart": "configured"},
+        }
+    )
+
+
+def test_accelerations_of_the_aero_are_ours_at_any_state() -> None:
+    model = mujoco.MjModel.from_xml_string(SMOOTH)
+    data, ours, friction = mujoco.MjData(model), aero_dynamics(AeroSettings()), FrictionSettings()
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        pitch, yaw = rng.uniform(-3, 3, 2)
+        rates, u = rng.normal(size=2) * 3, rng.uniform(-24, 24, 2)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (yaw, pitch), rates[::-1], u
+        mujoco.mj_forward(model, data)
+        load = -np.array(friction.viscous) * rates
+        expected = np.array(ours([pitch, yaw, *rates], u, load)).ravel()[2:]
+        assert data.qacc[::-1] == pytest.approx(expected, rel=1e-9, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("coulomb", "bits", "held_deg", "closed_deg"),
+    [
+        (False, "cont", 0.003, 0.0005),  # the rotor's lag is held over a step of 1 ms
+        (True, 8, 1.5, 0.5),
+    ],
+)
+def test_the_aero_follows_ours_along_the_papers_experiment(
+    coulomb: bool, bits: int | str, held_deg: float, closed_deg: float
+) -> None:
+    settings = _experiment(coulomb, bits)
+    twin = MujocoSettings(model=AERO if coulomb else SMOOTH, rotor=RotorSettings())
+
+    ours = Recorded(settings.plant.build(PERIOD))
+    figures = through_frames(settings, DURATION, plant=ours)
+
+    same_voltages = Recorded(MujocoPlant(twin, PERIOD))
+    for voltages in ours.voltages:
+        same_voltages.actuate(voltages)
+        same_voltages.advance()
+    assert _apart(ours.states, same_voltages.states) < held_deg
+
+    same_law = Recorded(MujocoPlant(twin, PERIOD))
+    other_figures = through_frames(settings, DURATION, plant=same_law)
+    assert _apart(ours.states, same_law.states) < closed_deg
+    within = 0.02 if coulomb else 0.005
+    assert other_figures.z_track == pytest.approx(figures.z_track, rel=within)
+    assert other_figures.u_total == pytest.approx(figures.u_total, rel=within)
+
+
+def test_a_top_on_a_ball_joint_is_our_free_body() -> None:
+    """An inclined joint, a start that is not the model's, a centre of mass off every axis, motors that act on two."""
+    J, m, r = np.diag([0.02, 0.03, 0.025]), 1.2, np.array([0.01, 0.02, -0.03])
+    central = J - m * (r @ r * np.eye(3) - np.outer(r, r))
+    xx, yy, zz, xy, xz, yz = (central[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+    start = (0.5, -0.5, 0.1, 0.7)
+    text = TOP.format(inertia=f"{xx} {yy} {zz} {xy} {xz} {yz}")
+    top = Recorded(MujocoPlant(MujocoSettings(model=text, body="top", attitude=start), PERIOD))
+    body = RigidBodySettings(
+        inertia=(0.02, 0.03, 0.025),
+        mass=m,
+        centre_of_mass=(0.01, 0.02, -0.03),
+        allocation=((0.02, 0.0, 0.003), (0.0, 0.01, 0.0), (0.001, 0.0, 0.03)),
+        damping=(0.0, 0.0, 0.0),
+        attitude=start,
+    )
+    free = PlantSettings(
+        kind="rigid_body",
+        rigid_body=body,
+        rotor=IDEAL_ROTOR,
+        friction=IDEAL_FRICTION,
+        sensors=IDEAL_SENSORS,
+        substeps=4,
+    )
+    ours = Recorded(free.build(PERIOD))
+    assert np.array(top.measure().attitude) == pytest.approx(np.array(ours.measure().attitude), abs=1e-12)
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        voltages = rng.uniform(-5, 5, 3)
+        for plant in (top, ours):
+            plant.actuate(voltages.tolist())
+            for _ in range(50):
+                plant.advance()
+    assert _apart(top.states, ours.states) < 1e-5
+    rates = (np.array([state.rate for state in plant.states]) for plant in (top, ours))
+    assert np.subtract(*rates) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_free_body_flies_through_full_turns() -> None:
+    """Roll by one turn and yaw by two at once; half a turn of the error would be the wrong way round."""
+    plant = Recorded(MujocoPlant(QUADROTOR, PERIOD))
+    figures = through_frames(FLIGHT, 20.0, plant=plant)
+    assert figures.max_error_deg is not None
+    assert figures.max_error_deg < 6  # at the start: the reference begins at full speed
+
+    assert isinstance(FLIGHT.reference, Sinusoid)
+    times = PERIOD * np.arange(1, len(plant.states) + 1)
+    size, speed = np.radians(FLIGHT.reference.amplitude), np.array(FLIGHT.reference.frequency)
+    roll, _, yaw = (size * np.sin(np.outer(times, speed))).T / 2
+    assert (roll.max(), yaw.max()) == pytest.approx((np.pi, 2 * np.pi), abs=1e-3)
+    turned = (
+        np.cos(roll) * np.cos(yaw),
+        np.sin(roll) * np.cos(yaw),
+        np.sin(roll) * np.sin(yaw),
+        np.cos(roll) * np.sin(yaw),
+    )
+    true = np.array([state.attitude for state in plant.states])
+    errors = 2 * np.arccos(np.abs((np.column_stack(turned) * true).sum(axis=1)))
+    assert degrees(errors[times > 2.0].max()) < 0.6
+
+
+@pytest.mark.parametrize("twin", [MujocoSettings(rotor=RotorSettings()), QUADROTOR], ids=["aero", "quadrotor"])
+def test_two_runs_are_the_same_to_the_last_bit(twin: MujocoSettings) -> None:
+    def course() -> list[Measurement]:
+        plant = MujocoPlant(twin, PERIOD)
+        voltages = np.random.default_rng(3).uniform(-10, 10, (300, plant.actuators))
+        seen = []
+        for each in voltages:
+            plant.actuate(each.tolist())
+            plant.advance()
+            seen.append(plant.measure())
+        return seen
+
+    assert course() == course()
+
+
+def test_lag_is_that_of_our_rotors() -> None:
+    rotor = RotorSettings(lag_up_s=0.1, lag_down_s=0.2)
+    rng = np.random.default_rng(4)
+    for voltage, command in rng.normal(size=(20, 2)):
+        fine, steps = voltage, 20_000
+        for _ in range(steps):
+            rising = (command - fine) * fine >= 0
+            fine += (command - fine) / (0.1 if rising else 0.2) * 0.3 / steps
+        assert lagged(rotor, voltage, command, 0.3) == pytest.approx(fine, abs=1e-4)
+
+
+def test_encoders_and_dead_zone_are_those_of_our_aero() -> None:
+    """One motor turns both joints, the other is in its dead zone; counts are so coarse that all are ours."""
+    settings = PlantSettings(rotor=RotorSettings(dead_zone_v=2.0), friction=FrictionSettings(coulomb=()))
+    ours = settings.build(PERIOD)
+    twin = MujocoPlant(MujocoSettings(model=SMOOTH, rotor=settings.rotor, sensors=settings.sensors), PERIOD)
+    for _ in range(500):
+        for plant in (ours, twin):
+            plant.actuate((-8.0, 1.9))
+            plant.advance()
+        assert twin.measure() == ours.measure()
+    assert twin.measure().rate[1] < -0.1 < 0.1 < twin.measure().rate[2]
+
+
+def test_the_rate_is_that_of_the_instant_of_the_attitude() -> None:
+    """A constant torque: the rate rises evenly, and is not that before the last step."""
+    wheel = """
+    <mujoco>
+      <option integrator="implicitfast"/>
+      <worldbody>
+        <body name="body"><joint name="z" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body>
+      </worldbody>
+      <actuator><motor joint="z" gear="3"/></actuator>
+    </mujoco>
+    """
+    plant = MujocoPlant(MujocoSettings(model=wheel), PERIOD)
+    plant.actuate((4.0,))
+    for _ in range(10):
+        plant.advance()
+    assert plant.measure().rate == pytest.approx((0.0, 0.0, 4.0 * 3 / 2 * 10 * PERIOD), abs=1e-12)
+
+
+def test_controls_at_0_v_are_the_keyframes_and_close_goes_there() -> None:
+    """At hover the weight is carried, so nothing moves; the attitude is measured where it starts."""
+    plant = MujocoPlant(QUADROTOR.model_copy(update={"attitude": (0.0, 0.0, 0.0, 2.0)}), PERIOD)
+    plant.actuate((1.0, 2.0, 3.0))
+    plant.close()
+    plant.advance()
+    assert plant.measure() == Measurement((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+
+
+def test_a_simulation_that_diverges_measures_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo would begin anew at the start, as if nothing had happened."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    plant = MujocoPlant(MujocoSettings(model=SMOOTH.replace('damping="0.0220"', 'damping="-1e4"')), PERIOD)
+    plant.actuate((1.0, 1.0))
+    for _ in range(20):
+        plant.advance()
+    assert np.isnan(plant.measure().attitude).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"model": "no.xml"}, "there is no MJCF file no.xml; ours are aero, quadrotor"),
+        ({"model": "<mujoco><worl/></mujoco>"}, "MuJoCo refuses the MJCF given: .* 'worl', line 1"),
+        ({"model": "<mujoco/>", "body": "world"}, "the MJCF has no actuators"),
+        ({"body": "rotor"}, "the MJCF has no body 'rotor'; it has body"),
+        ({"keyframe": "start"}, "the MJCF has no keyframe 'start'; it has none with a name"),
+        ({"sensors": {"rate": "derivative"}, "joints": ["p", "yaw"]}, "no joint 'p'; it has yaw, pitch"),
+        ({"allocation": [[1.0]]}, "allocation needs 2 rows of one length"),
+        ({"allocation": [[], []]}, "allocation needs 2 rows of one length"),
+        ({"allocation": [[1.0], [1.0, 2.0]]}, "allocation needs 2 rows of one length"),
+        ({"attitude": (1.0, 0.0, 0.0, 0.0)}, "attitude sets that of a body on a free or ball joint"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(changed: dict[str, object], text: str) -> None:
+    with pytest.raises(PluginError, match=text) as refused:
+        MujocoPlant(MujocoSettings.model_validate(changed), PERIOD)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0, 0.0), (inf, 0.0, 0.0, 0.0)])
+def test_an_attitude_has_a_direction(attitude: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="any finite length but zero"):
+        MujocoSettings.model_validate({"attitude": attitude})
+
+
+def test_without_mujoco_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(PluginError, match=r"not installed: pip install 'aeroloop\[mujoco\]'"):
+        MujocoPlant(MujocoSettings(), PERIOD)
+
+
+def test_a_file_and_a_smaller_step_may_be_given(tmp_path: Path) -> None:
+    """Whatever the period, steps are equal and no longer than the model's."""
+    path = tmp_path / "mine.xml"
+    path.write_text(AERO)
+    courses: list[Array] = []
+    for substeps in (None, 3, 12):
+        plant = MujocoPlant(MujocoSettings(model=str(path), substeps=substeps), 0.0025)
+        plant.actuate((5.0, 8.0))
+        for _ in range(400):
+            plant.advance()
+        courses.append(np.array(plant.measure().rate))
+    assert (courses[0] == courses[1]).all()  # 2.5 ms are three steps of less than 1 ms
+    assert courses[2] == pytest.approx(courses[1], abs=1e-4)
+    assert (courses[2] != courses[1]).any()
+
+
+@pytest.mark.processes
+def test_processes_in_lockstep_fly_it_as_the_experiment_does_and_both_ends_replay(tmp_path: Path) -> None:
+    """Through the network it is the same to the last bit. No slack: nothing here depends on a clock."""
+
+    def aeroloop(*words: str) -> str:
+        command = [sys.executable, "-P", "-m", "aeroloop", *words]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    run = ("--config", str(EXAMPLES / "quadrotor.toml"), "--duration", "2", "--json")
+    demo = json.loads(aeroloop("demo", "--lockstep", "--log", "flight.mcap", *run))
+    experiment = json.loads(aeroloop("lab", "experiment", *run))
+    same = ("duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg")
+    assert [demo[name] for name in same] == [experiment[name] for name in same]
+    assert aeroloop("log", "replay", "flight.mcap").count("every tick is the same, byte for byte") == 2
