@@ -97,7 +97,7 @@ class Laws(BaseModel):
     period_ms: float = Field(description="time between ticks [ms]")
     within_deg: float = Field(description="bound of the attitude error in the second half, for the margins [deg]")
     margin_duration_s: float = Field(description="length of a run with delay or lost frames [s]")
-    margin_at: str = Field(description="bits and sensors of these")
+    margin_at: str = Field(description="bits of these; the sensors are the first of each plant")
     gains: dict[str, dict[str, Any]] = Field(description="settings of each law, for the first plant")
     path: str = Field(description=PATH)
     rows: list[LawRow]
@@ -301,7 +301,7 @@ def run_comparison(
         period_ms=period_ms,
         within_deg=comparison.within_deg,
         margin_duration_s=PUSHED_S,
-        margin_at=f"{first.bits} bits, sensors: {first.sensors}",
+        margin_at=f"{first.bits} bits",
         gains={choice.law: _gains(plan, configuration) for choice, configuration in
                zip(choices, plan.found, strict=True) if choice.plant == first.plant},
         path=paths(row["path"] or "frames" for row in rows),

@@ -47,14 +47,11 @@ def markdown(laws: Laws) -> str:
 def _sections(laws: Laws) -> Sections:
     """Titles and rows of text, a header first; a row of two has no figures."""
     for (plant, sensors, wind, bits), rows in groupby(laws.rows, lambda r: (r.plant, r.sensors, r.wind, r.bits)):
-        title = " · ".join(dict.fromkeys((plant, f"sensors {sensors}", wind, f"{bits} bits")))
-        yield title, [_HEADER, *map(_figures, rows)]
-    plants = list(dict.fromkeys(margin.plant for margin in laws.margins))
-    kinds = dict.fromkeys(margin.law for margin in laws.margins)
-    of = {(margin.law, margin.plant): _margin(margin) for margin in laws.margins}
-    header = ["law", *(f"{plant}: {what}" for plant in plants for what in ("delay", "lost"))]
-    rows_of = [[law, *(text for plant in plants for text in of[law, plant])] for law in kinds]
-    yield f"survives, calm, {laws.margin_at.split(',')[0]}: error within {laws.within_deg:g}°", [header, *rows_of]
+        around = [f"sensors and wind: {wind}"] if sensors == wind else [f"sensors: {sensors}", wind]
+        yield " · ".join([plant, *around, f"{bits} bits"]), [_HEADER, *map(_figures, rows)]
+    for plant, margins in groupby(laws.margins, lambda margin: margin.plant):
+        title = f"{plant} · calm · {laws.margin_at} · survived with an error within {laws.within_deg:g}°"
+        yield title, [["law", "delay", "frames lost in a row"], *map(_margin, margins)]
 
 
 def _figures(row: LawRow) -> list[str]:
@@ -66,9 +63,9 @@ def _figures(row: LawRow) -> list[str]:
     return [row.law, *("–" if value is None else form.format(value * scale) for value, form, scale in figures)]
 
 
-def _margin(margin: LawMargin) -> tuple[str, str]:
+def _margin(margin: LawMargin) -> list[str]:
     delay, lost = margin.delay_ms, margin.lost_frames
-    return "none" if delay is None else f"{delay:g} ms", "none" if lost is None else str(lost)
+    return [margin.law, "none" if delay is None else f"{delay:g} ms", "none" if lost is None else str(lost)]
 
 
 def _notes(laws: Laws) -> Iterator[str]:

@@ -1,0 +1,128 @@
+"""Comparison of laws: what each combination is, that a law which fails is a row, and that margins are edges."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from matplotlib.image import imread
+
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import Settings, load, load_over
+from aeroloop.service.control.laws.tuning import response_of
+from aeroloop.service.lab import law_margins
+from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.sweep.axes import digest_of
+from aeroloop.service.sweep.laws import LAWS, Choice, LawsError, compare
+
+SLOW = load(overrides=["loop.rate_hz=100"])
+RUNAWAY, RAISING = (f"tests.support.own_laws:{name}" for name in ("Runaway", "Raising"))
+
+
+def compared(settings: Settings, **given: Any) -> dict[Choice, Settings]:
+    """The configuration of every combination."""
+    plan, choices, *_ = compare(settings, **given, duration_s=1.0)
+    return {choice: load_over(settings, each.overrides) for choice, each in zip(choices, plan.found, strict=True)}
+
+
+def test_by_default_every_law_of_ours_flies_both_plants_calm_and_in_wind_with_two_choices_of_bits() -> None:
+    found = compared(SLOW)
+    assert len(found) == len(LAWS) * 2 * 2 * 2
+    for choice, settings in found.items():
+        law, plant = settings.law, settings.plant
+        assert (law.kind, plant.kind, plant.wind.blowing) == (choice.law, choice.plant, choice.wind == "wind")
+        bits = (8, 8, 6) if choice.bits == "8/6" else (None,) * 3
+        wire = settings.wire
+        assert (wire.attitude.bits, wire.rate.bits, wire.voltage.bits) == bits
+        assert (plant.sensors.attitude == "encoders") == (choice.sensors == "encoders") == (choice.plant == "aero")
+        if choice.plant == "rigid_body":
+            assert wire.actuators == 3
+            assert law.allocation == plant.rigid_body.allocation
+            assert plant.wind.torque == (0.0, *SLOW.plant.wind.torque)
+
+
+def test_others_have_the_response_that_the_configured_gains_give_and_a_configured_law_stays_as_it_is() -> None:
+    C1, C2 = (0.5, 0.6, 0.7), (0.2, 0.1, 0.3)
+    own = load_over(SLOW, [f"law.C1={[*C1]}", f"law.C2={[*C2]}", "law.inertia=[0.02, 0.03, 0.04]"])
+    laws = {choice.law: settings.law.model_dump() for choice, settings in compared(own, plants=["aero"]).items()}
+    assert laws["adaptive"] == own.law.model_dump()
+    assert (laws["nonadaptive"]["C1"], laws["nonadaptive"]["C2"]) == (C1, C2)
+    wn, zeta = response_of((0.02, 0.03, 0.04), C1, C2)
+    for i, J in enumerate((0.02, 0.03, 0.04)):
+        assert laws["pd"]["kp"][i] == pytest.approx(2 * J * wn[i] ** 2, rel=1e-4)
+        assert laws["pd"]["kd"][i] == pytest.approx(2 * J * zeta[i] * wn[i], rel=1e-4)
+    mine = load_over(SLOW, ["law.kind=pd", "law.kp=[1, 2, 3]"])
+    [settings] = compared(mine, laws=["pd"], bits=["8/6"], winds=["calm"], plants=["aero"]).values()
+    assert settings.law == mine.law
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"sensors": ["radar"]}, "--sensors 'radar' is not known"),
+        ({"winds": ["storm"]}, "--wind 'storm' is not known"),
+        ({"bits": ["8"]}, "--bits takes bits out and in"),
+    ],
+)
+def test_an_unknown_choice_is_one_line(given: dict[str, Any], text: str) -> None:
+    with pytest.raises(LawsError, match=text):
+        compare(SLOW, **given, duration_s=1.0)
+
+
+def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_have_their_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, figure = tmp_path / "laws.parquet", tmp_path / "laws.png"
+    laws = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
+    few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero", "--duration", "3", "--set", "loop.rate_hz=100"]
+    assert execute(["lab", "laws", *laws, *few, "--out", str(out), "--figure", str(figure), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    pd, runaway, raising = found["rows"]
+    # sent on change, which changes no figure but the frames'
+    figures = run_experiment(load_over(SLOW, ["law.kind=pd"]), 3.0)
+    for name in ("z_track", "u_total", "max_error_deg", "second_half_error_deg", "command_changes_per_s"):
+        assert pd[name] == pytest.approx(getattr(figures, name), rel=1e-4)  # the rule's gains have five digits
+    assert 0 < pd["bits_per_s"] < figures.measurement.bits_per_s + figures.command.bits_per_s
+    assert (pd["path"], found["path"]) == ("compiled", "compiled, frames")
+    assert runaway["z_track"] is None
+    assert "the loop ended after" in runaway["reason"]
+    assert "ZeroDivisionError: by nothing (own_laws.py, line" in raising["reason"]
+    margins = {margin["law"]: margin for margin in found["margins"]}
+    assert margins["pd"]["delay_ms"] > 0
+    assert margins[RUNAWAY]["delay_ms"] is margins[RAISING]["lost_frames"] is None
+    table = pq.read_table(out)
+    assert table["law"].to_pylist() == ["pd", RUNAWAY, RAISING]
+    assert table["delay_ms"].to_pylist() == [margins["pd"]["delay_ms"], None, None]
+    assert imread(figure).size > 1e5
+
+    assert execute(["lab", "laws", *laws, *few, "--markdown"]) == 0
+    text = capsys.readouterr().out
+    assert f"| {RUNAWAY} | the loop ended after" in text
+    assert "| pd | none |" not in text
+
+
+def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(law_margins, "PUSHED_S", 4.0)
+    settings = load_over(SLOW, ["law.kind=pd"])
+    for lost in (False, True):
+        most = law_margins.survives(settings.description(), lost, 10.0)
+        assert most is not None
+        errors = [
+            law_margins.largest_error_deg(settings, *((0, ticks) if lost else (ticks, 0))) for ticks in (most, most + 1)
+        ]
+        assert errors[0] <= 10 < errors[1]
+    assert law_margins.survives(settings.description(), False, 0.01) is None
+
+
+def test_a_changed_law_of_ones_own_is_another_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    file = tmp_path / "changing_law.py"
+    digests = []
+    for gain in (1, 2):
+        file.write_text(f"from tests.support.own_laws import Runaway\nclass Mine(Runaway):\n    gain = {gain}\n")
+        description = load_over(SLOW, ["law.kind=changing_law:Mine"]).description()
+        digests.append(digest_of(description, 1.0))
+    assert digests[0] != digests[1]
