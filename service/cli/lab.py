@@ -456,7 +456,7 @@ def tune(
         typer.Option(
             min=0,
             max=1,
-            help="Largest part of the ticks with a voltage at its limit; if left out, 1.25 of what the configured gains have.",
+            help="Largest part of the ticks with a voltage at its limit; 1.25 × that of the configured gains if left out.",
             show_default=False,
         ),
     ] = None,
@@ -464,7 +464,7 @@ def tune(
         float | None,
         typer.Option(
             min=0,
-            help="Most changes of a voltage a second; if left out, 1.25 of what the configured gains have.",
+            help="Most changes of a voltage a second; 1.25 × those of the configured gains if left out.",
             show_default=False,
         ),
     ] = None,
@@ -479,7 +479,7 @@ def tune(
     duration: Annotated[float, typer.Option(metavar="S", min=0.01, help="Length of an experiment, in s.")] = 10.0,
     reach: Annotated[float, typer.Option(min=1.01, help="Largest factor of a gain, up or down.")] = 10.0,
     within: Annotated[
-        float, typer.Option(metavar="DEG", min=0, help="Error in the second half with which a delay is withstood.")
+        float, typer.Option(metavar="DEG", min=0, help="Bound of the attitude error with delay or lost frames.")
     ] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="The same seed finds the same.")] = 0,
     out: Annotated[

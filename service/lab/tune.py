@@ -25,7 +25,8 @@ from aeroloop.service.config import Settings, as_overrides
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.lab.experiment import PATH, paths
-from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, largest_voltage, run_cases, with_law, withstands
+from aeroloop.service.lab.law_margins import PUSHED_S, survives
+from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, largest_voltage, run_cases, with_case, with_law
 from aeroloop.service.lab.workers import Workers
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.configured import NoTheoremError, with_theorem
@@ -86,8 +87,8 @@ class Tuned(BaseModel):
     gains: dict[str, Gain]
     training: Summary
     held_out: Summary
-    delay_ms: float | None = Field(description="largest further delay of commands withstood; null: not even none [ms]")
-    lost_frames: int | None = Field(description="most frames lost in a row, again and again; null: not even none")
+    delay_ms: float | None = Field(description="largest further delay of commands within the bound [ms]; null: none is")
+    lost_frames: int | None = Field(description="most commands lost in a row, again and again; null: none may be")
     certificate: str = Field(description="verdict of the certificate, or why the law has none")
 
 
@@ -103,7 +104,8 @@ class Tuning(BaseModel):
     duration_s: float = Field(description="length of an experiment [s]")
     training: list[Case]
     held_out: list[Case] = Field(description="cases that the search has not seen")
-    within_deg: float = Field(description="error in the second half with which a delay counts as withstood [deg]")
+    within_deg: float = Field(description="bound of the attitude error in the second half, for the margins [deg]")
+    margin_duration_s: float = Field(default=PUSHED_S, description="length of a run with delay or lost frames [s]")
     searched: list[str] = Field(description="gains that were searched, and element where they are several")
     without_effect: list[str] = Field(description="gains that change no figure of the training cases; they stay")
     before: Tuned
@@ -314,26 +316,23 @@ class _Search:
         """What the search has not seen, of two sets of gains: held-out cases, late commands, certificate."""
         plan, both = self._plan, (self.law(before), self.law(after))
         held = [(self.config, law, [case], plan.duration_s) for law in both for case in self.held_out]
-        late = [
-            (self.config, law, self.training[0], lost, plan.within_deg, plan.duration_s)
-            for law in both
-            for lost in (False, True)
-        ]
+        pushed = [with_case(with_law(self.config, law), self.training[0]).description() for law in both]
+        late = [(config, lost, plan.within_deg) for config in pushed for lost in (False, True)]
         done, total = self.experiments, self.experiments + len(held) + len(late)
         rans = self._workers.each(run_cases, held, lambda count: self._progress(done + count, total))
         done += len(held)
-        withstood = self._workers.each(withstands, late, lambda count: self._progress(done + count, total))
+        survived = self._workers.each(survives, late, lambda count: self._progress(done + count, total))
         trained = self._evaluate([before, after])
         found = list[Tuned]()
         for side, gains in enumerate((before, after)):
-            delay, lost = withstood[2 * side : 2 * side + 2]
+            delay, lost = survived[2 * side : 2 * side + 2]
             n = len(self.held_out)
             of_held_out = [ran for runs in rans[side * n : (side + 1) * n] for ran in runs]
             tuned = Tuned(
                 gains=gains,
                 training=_summary(trained[side], plan.weight),
                 held_out=_summary(of_held_out, plan.weight),
-                delay_ms=None if delay is None else delay * self._settings.loop.period * 1e3,
+                delay_ms=None if delay is None else round(delay * self._settings.loop.period * 1e3, 6),
                 lost_frames=lost,
                 certificate=verdict(with_law(self.config, both[side])),
             )

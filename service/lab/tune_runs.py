@@ -1,4 +1,4 @@
-"""Runs of a search for gains: experiments with a candidate's gains under a seed and a wind, and with late commands.
+"""Runs of a search for gains: experiments with a candidate's gains, each under a seed and a wind.
 
 A run that trips, or whose law fails, is a result like any other: it has the part of the time that it lasted.
 """
@@ -16,8 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, with_law_settings
 from aeroloop.service.lab.cells import with_seed
-from aeroloop.service.lab.experiment import Path, experiment, run_experiment
-from aeroloop.service.lab.margins import OLDEST_S, Late, first_that
+from aeroloop.service.lab.experiment import Path, experiment
 
 LawValues = dict[str, Any]
 """`[law]` as plain data."""
@@ -109,30 +108,3 @@ def run_case(settings: Settings, duration_s: float) -> Ran:
     if not all(map(isfinite, (z_track, u_total, changes, settled))):
         return Ran(0, 0, 0, 0, 0, 0, path, "it has no figures: it answers nothing, or no number")
     return Ran(z_track, u_total, saturated, changes, settled, path=path)
-
-
-def withstands(config: str, law: LawValues, case: Case, lost: bool, within_deg: float, duration_s: float) -> int | None:
-    """How many ticks of delay, or frames lost in a row again and again, a law withstands; None if not even none.
-
-    It withstands them if nothing trips and the error in the second half is at most `within_deg`. No watchdog acts, and
-    more than a second is not tried.
-    """
-    settings = with_case(with_law(config, law), case)
-    passed: int | None = None
-
-    def fails(count: int) -> bool:
-        nonlocal passed
-        plant = Late(settings.plant.make(settings.loop.period), *((0, count) if lost else (count, 0)))
-        try:
-            error = run_experiment(settings, duration_s, plant=plant).second_half_error_deg
-        except (ValueError, AeroloopError):
-            return True
-        finally:
-            plant.close()
-        if error is None or not error <= within_deg:
-            return True
-        passed = count if passed is None else max(passed, count)
-        return False
-
-    first_that(fails, max(1, settings.loop.ticks(0.05)), settings.loop.ticks(OLDEST_S))
-    return passed

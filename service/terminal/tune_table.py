@@ -67,7 +67,7 @@ def _figures(tuning: Tuning) -> Table:
             cells.append(Text("–" if value is None else words(value), style="red" if over else ""))
         table.add_row(name, *cells, "" if limit is None else words(limit))
     both = tuning.before, tuning.after
-    table.add_row("delay withstood, ms", *(_number(side.delay_ms) for side in both), "", "", "")
+    table.add_row("delay survived, ms", *(_number(side.delay_ms) for side in both), "", "", "")
     table.add_row("frames lost in a row", *(_number(side.lost_frames) for side in both), "", "", "")
     return table
 
@@ -86,8 +86,8 @@ def _notes(tuning: Tuning) -> Iterator[str]:
         f"{_cases(tuning, held_out=False)}. Held out: {_cases(tuning, held_out=True)}."
     )
     yield (
-        f"Withstood, in the first training case: nothing trips and the error in the second half stays within "
-        f"{tuning.within_deg:g}°, without a watchdog, up to 1 s."
+        f"Delay and frames lost again and again: the most with which the error stays within {tuning.within_deg:g}° in "
+        f"the second half of {tuning.margin_duration_s:g} s, without a watchdog, in the first training case."
     )
     if tuning.without_effect:
         yield f"Without effect here, and not changed: {', '.join(tuning.without_effect)}."
