@@ -27,6 +27,7 @@ from aeroloop.service.cli.common import (
     show,
     with_bits_of,
 )
+from aeroloop.service.cli.entry import INTERRUPTED
 
 if TYPE_CHECKING:
     from aeroloop.service.config import Settings
@@ -434,6 +435,85 @@ def sweep(
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = run_sweep(planned, out, engine=engine, progress=update)
     show(result, json, sweep_table)
+
+
+@group.command()
+def tune(
+    gain: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Gain, or other number of the law's settings; may be repeated; all of the law's gains if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    scale: Annotated[
+        bool, typer.Option("--scale", help="Keep the ratio between a gain's axes: fewer dimensions.")
+    ] = False,
+    weight: Annotated[float, typer.Option(min=0, help="Of u_total beside z_track in the cost, in 1/V².")] = 1e-7,
+    max_saturated: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Largest part of the ticks with a voltage at its limit; 1.25 × that of the configured gains if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    max_chatter: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Most changes of a voltage a second; 1.25 × those of the configured gains if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Training seeds of wind and sensors.")] = 2,
+    winds: Annotated[
+        str, typer.Option(metavar="A,B,…", help="Training winds, as parts of plant.wind.torque; 0 is calm.")
+    ] = "0,1",
+    held_out: Annotated[
+        int, typer.Option(min=1, max=100, help="Runs with other seeds and winds, which the search does not see.")
+    ] = 4,
+    budget: Annotated[int, typer.Option(min=1, help="Experiments of the search, at most.")] = 1000,
+    duration: Annotated[float, typer.Option(metavar="S", min=0.01, help="Length of an experiment, in s.")] = 10.0,
+    reach: Annotated[float, typer.Option(min=1.01, help="Largest factor of a gain, up or down.")] = 10.0,
+    within: Annotated[
+        float, typer.Option(metavar="DEG", min=0, help="Bound of the attitude error with delay or lost frames.")
+    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed finds the same.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the gains to this file, as TOML to paste.", show_default=False)
+    ] = None,
+    engine: EngineOption = "processes",
+    force: Force = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Search the gains of a law for the least error and effort; exit 1 if they are worse in runs not searched."""
+    settings = loop_of(config, overrides)
+    _check_engine(engine)
+    from aeroloop.service.lab.tune import Plan, parse_winds, toml_of, tune
+    from aeroloop.service.lab.workers import Workers
+    from aeroloop.service.logs.outputs import check_output
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.tune_table import tune_table
+
+    with checked():
+        if out is not None:
+            check_output(out, [config], force=force)
+        plan = Plan(
+            gain or (), scale, weight, max_saturated, max_chatter, seeds, parse_winds(winds), held_out, budget,
+            duration, reach, seed, within,
+        )  # fmt: skip
+    with guarded(), count_bar("experiments", hidden=json) as update, Workers(engine) as workers:
+        found = tune(settings, plan, workers, update)
+    show(found, json, tune_table)
+    if out is not None:
+        with _new_file(out, config, force) as part:
+            part.write_text(toml_of(found), encoding="utf-8")
+    raise typer.Exit(INTERRUPTED if found.interrupted else 1 if found.worse else 0)
 
 
 def _check_engine(engine: str) -> None:

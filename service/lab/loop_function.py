@@ -1,8 +1,9 @@
 """The closed loop in lockstep as one function: measurement, law, command and plant of a tick, mapped over the ticks.
 
 It contains the functions of law, plant and sensors as the two ends evaluate them, and the quantizers as expressions,
-all `as_written`: so every bit is that of the loop through frames. Bits, limits, and zeros of the encoders are part of
-its state; reference, wind and a gyro's errors are computed beforehand. One function serves all that differ in these.
+all `as_written`: so every bit is that of the loop through frames. Bits, limits, gains, and zeros of the encoders are
+part of its state; reference, wind and a gyro's errors are computed beforehand. One function serves all that differ in
+these, such as every candidate of a search for gains.
 
 A run near a limit of the guard, or with a value that is no number, is abnormal: it is to be run through frames, which
 gives its exact reason.
@@ -11,7 +12,9 @@ gives its exact reason.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from functools import lru_cache
+from itertools import chain
+from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,15 +29,15 @@ from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
-from aeroloop.service.control.laws.interface import ExpressionLaw
-from aeroloop.service.control.laws.registry import law_of
+from aeroloop.service.control.laws.interface import ExpressionLaw, Law
+from aeroloop.service.control.laws.registry import law_class, law_of
 from aeroloop.service.control.reference import Floats, desired
 from aeroloop.service.lab.c_code import in_c
 
 BLOCK: Final = 512
 """Ticks of one call."""
 COMPILED_FROM: Final = 20_000
-"""Ticks of a run from which on its function is compiled to C, which takes as long as some 40 000 ticks without."""
+"""Ticks of all runs from which on a function is compiled to C, which takes as long as some 40 000 ticks without."""
 _LOOPS: Final = 8
 _NEAR: Final = 1e-9
 """A value this close to a limit, as a part of it, is left to the frames: sums and roots round differently."""
@@ -67,20 +70,24 @@ class Loop:
 
     def __init__(self, settings: Settings) -> None:
         wire, period, plant = settings.wire, settings.loop.period, settings.plant.effective
-        law = law_of(settings.law, period, wire.actuators)
-        assert isinstance(law, ExpressionLaw)  # `experiment` runs others through frames
-        self._gains = [value for gain in configured_gains(law).values() for value in gain]
-        self._law_state = [value for values in initial_state(law).values() for value in values]
+        law = _evaluated(settings)
         self._mechanism = mechanism = plant.mechanism()
         self._initially = initially(mechanism)
         step = step_function(mechanism, plant.rotor, plant.friction, period, plant.substeps)
-        held = {"measured": 6, "commanded": wire.actuators, "numbers": 3 * len(NUMBERS), "zeros": 2}
-        sizes = {"x": step.numel_in("x"), "last": 4, "law": len(self._law_state), "seen": 7, "filters": 4, **held}
+        held = {
+            "measured": 6,
+            "commanded": wire.actuators,
+            "numbers": 3 * len(NUMBERS),
+            "zeros": 2,
+            "gains": len(law.gains),
+        }
+        sizes = {"x": step.numel_in("x"), "last": 4, "law": len(law.state), "seen": 7, "filters": 4, **held}
         self._still = [0.0] * (sizes["x"] - len(mechanism.initial))
-        functions = law_function(law), step, sensor_function(plant.sensors, period)
+        functions = law.function, step, sensor_function(plant.sensors, period)
         with as_written():
             self.tick = self._tick(settings, sizes, functions)
         self.in_c = self._tried_c = False
+        self._ticks = 0
         self._map(self.tick)
         self._desired: tuple[object, Floats] = None, np.empty(0)
 
@@ -104,7 +111,7 @@ class Loop:
         levels = ca.vertcat(*(level(kinds[i], measured[i]) for i in range(6)))
 
         parts = ca.vertsplit(wanted, [0, 4, 7, 10])
-        answers = law.call([state["last"], state["law"], ca.SX(self._gains), levels[:3], levels[3:], *parts])
+        answers = law.call([state["last"], state["law"], state["gains"], levels[:3], levels[3:], *parts])
         answer = dict(zip(law.name_out(), answers, strict=True))
         u = answer["u"]
         commanded = [encode(voltage, u[i], state["commanded"][i]) for i in range(wire.actuators)]
@@ -137,7 +144,8 @@ class Loop:
 
     def run(self, settings: Settings, ticks: int, report: Callable[[int], None] = lambda _: None) -> Run | None:
         """Run so many ticks, at least one; None if anything is abnormal. `report` is called with the ticks done."""
-        if ticks >= COMPILED_FROM and not self._tried_c:
+        self._ticks += ticks
+        if self._ticks >= COMPILED_FROM and not self._tried_c:
             self._tried_c = True
             if (compiled := in_c(self.tick)) is not None:
                 self.in_c = True
@@ -167,8 +175,9 @@ class Loop:
         held = [np.nan] * (6 + wire.actuators)
         quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate, wire.voltage)]
         x = *self._mechanism.initial, *self._still
-        first = [*x, *IDENTITY, *self._law_state, *seen.attitude, *seen.rate, *sensors.held, *held]
-        state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros])
+        law = _evaluated(settings)
+        first = [*x, *IDENTITY, *law.state, *seen.attitude, *seen.rate, *sensors.held, *held]
+        state = np.array([*first, *(number for q in quantizers for number in numbers(q)), *sensors.zeros, *law.gains])
         torque, error = np.zeros((ticks, self._mechanism.axes)), np.zeros((ticks, 3))
         if not wind.calm:
             torque[:] = [wind.sample() for _ in range(ticks)]
@@ -202,16 +211,38 @@ def _normal(settings: Settings, voltages: Floats, u: Floats, seen: Floats) -> bo
     return bool(longest < limits.max_saturated_s * (1 - _NEAR))
 
 
+class _Evaluated(NamedTuple):
+    """A law as a function, the function as text, its configured gains and its state before the first tick."""
+
+    function: ca.Function
+    text: str
+    gains: list[float]
+    state: list[float]
+
+
+def _evaluated(settings: Settings) -> _Evaluated:
+    return _law(law_class(settings.law), settings.law.model_dump_json(), settings.loop.period, settings.wire.actuators)
+
+
+@lru_cache(maxsize=16)
+def _law(kind: type[Law[Any]], section: str, period: float, actuators: int) -> _Evaluated:
+    law = law_of(kind.Settings.model_validate_json(section), period, actuators)
+    assert isinstance(law, ExpressionLaw)  # `experiment` runs others through frames
+    function = law_function(law)
+    gains, state = configured_gains(law).values(), initial_state(law).values()
+    return _Evaluated(function, function.serialize(), list(chain(*gains)), list(chain(*state)))
+
+
 _loops: dict[str, Loop] = {}
 
 
 def loop_of(settings: Settings) -> Loop:
-    """The loop of a configuration; the last few are kept."""
+    """The loop of a configuration; the last few are kept. Laws that are the same but for their gains share one."""
     plant, wire = settings.plant, settings.wire
     sensors = plant.sensors.model_copy(update={"seed": 0, "gyro_noise": 0.0, "gyro_bias": (0.0, 0.0, 0.0)})
     alike = plant.model_copy(update={"wind": WindSettings(), "sensors": sensors, "limits": LimitSettings()})
     kinds = [(signal.bits is None, signal.kind) for signal in (wire.attitude, wire.rate, wire.voltage)]
-    key = f"{alike.model_dump_json()}{settings.law.model_dump_json()}{settings.loop.period_ns}{wire.actuators}{kinds}"
+    key = f"{alike.model_dump_json()}{_evaluated(settings).text}{settings.loop.period_ns}{wire.actuators}{kinds}"
     if key not in _loops:
         while len(_loops) >= _LOOPS:
             del _loops[next(iter(_loops))]
