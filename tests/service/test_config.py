@@ -41,7 +41,7 @@ ODD = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.sampled_from(list(KEYS)), ODD)
 def test_no_words_of_pydantic_reach_a_person_whatever_is_set(key: str, value: Any) -> None:
     tree: dict[str, Any] = Settings().description()

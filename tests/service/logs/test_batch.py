@@ -150,7 +150,7 @@ class Run:
         return after, np.vstack(computed), sent
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(
     wire=st.sampled_from(sorted(WIRES)),
     seed=st.integers(0, 2**32 - 1),
