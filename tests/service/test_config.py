@@ -47,7 +47,7 @@ def kind_with(section: str, name: str) -> str | None:
     return next((kind for kind, shape in kinds.items() if name in SHAPES.fields(shape)), None)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.sampled_from(list(KEYS)), ODD)
 def test_no_words_of_pydantic_reach_a_person_whatever_is_set(key: str, value: Any) -> None:
     tree: dict[str, Any] = Settings().description()

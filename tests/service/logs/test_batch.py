@@ -167,7 +167,7 @@ class Run:
             assert (bits(again), resent) == (bits(computed[cut:]), sent[cut:])
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(
     wire=st.sampled_from(sorted(WIRES)),
     seed=st.integers(0, 2**32 - 1),
