@@ -55,7 +55,7 @@ def layout(
 
     from aeroloop.service.viewers.layout import layout as describe
 
-    typer.echo(describe(settings.vehicle, settings.wire.actuators))
+    typer.echo(describe(settings.vehicle, settings.wire.motors))
 
 
 @group.command()

@@ -77,7 +77,7 @@ class Daemon:
         self._gate = CertificateGate(role, configured, begins)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
-            role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators == 3
+            role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators > 2
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None

@@ -67,7 +67,9 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
 
     Raises:
         CalibrationError: A cell is not reached within MAX_ROUNDS.
+        PlantError: The plant is no emulated body.
     """
+    settings.plant.mechanism()
     runs = 0
     published = paper.WIND["continuous"]
     with Pool() as pool:

@@ -31,8 +31,10 @@ class Result(NamedTuple):
 
 
 def with_seed(settings: Settings, seed: int) -> Settings:
-    """The settings with this seed of wind and sensors."""
+    """The settings with this seed of wind and sensors; a plant without ours stays as it is."""
     plant = settings.plant
+    if not plant.emulated:
+        return settings
     drawn = {name: getattr(plant, name).model_copy(update={"seed": seed}) for name in ("wind", "sensors")}
     return settings.model_copy(update={"plant": plant.model_copy(update=drawn)})
 

@@ -65,7 +65,11 @@ def predict(
         seeds: Number of runs per cell; a figure is their mean.
         progress: Called with cells done and cells in all.
         engine: As of `Workers`.
+
+    Raises:
+        PlantError: The plant is no emulated body, so there is no wind on it.
     """
+    settings.plant.mechanism()
     calm = [(out, inp, False) for inp in paper.INPUT_BITS for out in paper.OUTPUT_BITS]
     windy = [(*bits, True) for bits in CASES.values()]
     jobs = [(settings, Cell(*cell, seed)) for cell in (*calm, *windy) for seed in range(seeds)]

@@ -23,7 +23,7 @@ class Traffic(StreamFigures):
     frames_per_s: float
     bits_per_s: float = Field(description="payload bits, padding included")
     changes_per_s: float = Field(description="changes of a component's code, of all components together")
-    component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u₂ u₃")
+    component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u in order")
     mean_interval_ms: float | None = Field(description="from one frame to the next; null for less than two [ms]")
     least_interval_ms: float | None = Field(description="the least of these times [ms]")
     can_frames: int = Field(

@@ -59,7 +59,7 @@ class Group(NamedTuple):
 
 def groups(wire: WireSpec, period: float) -> list[Group]:
     """Every column of the table, in order, by how the frames were quantized and the time between ticks [s]."""
-    motors = [str(i) for i in range(4 - wire.actuators, 4)]
+    motors = list(map(str, wire.motors))
     outermost = {name: getattr(wire, name).quantizer().outermost for name in ("attitude", "rate", "voltage")}
     return [
         _group("tick", "", "tick k of the law", lambda rows: rows.ticks.k, kind="int64"),

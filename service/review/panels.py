@@ -74,7 +74,7 @@ def columns_of(settings: Settings, *, theta: bool = False) -> list[PanelColumn]:
     """
     case, beside = case_of(settings), ("measured", "desired")
     true_V = "true, with θ̃" if theta else "true, without θ̃"
-    rate_errors, inputs = ("ω_e1", "ω_e2", "ω_e3"), ("u₁", "u₂", "u₃")[3 - settings.wire.actuators :]
+    rate_errors, inputs = ("ω_e1", "ω_e2", "ω_e3"), ["u" + "₁₂₃₄₅₆₇₈"[i - 1] for i in settings.wire.motors]
     panels: list[tuple[str, str, Sequence[str], str, Sequence[str]]] = [
         ("angles", "Roll, pitch and yaw", ("roll", "pitch", "yaw"), "°", (*beside, "true")),
         ("attitude", title_of("attitude", "Attitude", case), ("η", "ε₁", "ε₂", "ε₃"), "1", beside),

@@ -31,6 +31,9 @@ from aeroloop.service.testing.hil_log import HilError as HilError
 from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
 
+PLANTS: Final = ("emulator", "can", "can-node", "quanser", "quanser-fake")
+"""Plant ends by name; any other name is of a plant, which the emulator runs."""
+
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
 PATIENCE_S: Final = 30.0
 """Timeout for another process: one starts in about a second here, and CI machines are busy."""
@@ -44,7 +47,8 @@ class Hil:
     Args:
         folder: Folder of the logs.
         lockstep: Whether `run` counts steps instead of seconds.
-        plant: The plant end: a value of `plant.via`, or can-node for an emulated node on a private bus.
+        plant: The plant end: a value of `plant.via`; can-node for an emulated node on a private bus; any other value of
+            `plant.kind`, such as package.module:Class, for the emulator with that plant.
         config: TOML file to start from, unless `start` names another.
     """
 
@@ -52,7 +56,8 @@ class Hil:
         self, folder: Path, *, lockstep: bool = False, plant: str = "emulator", config: Path | None = None
     ) -> None:
         self._folder = folder
-        self._via = plant.replace("can-node", "can")
+        self._kind = None if plant in PLANTS else plant
+        self._via = "emulator" if self._kind else plant.replace("can-node", "can")
         self._private_bus = plant == "can-node"
         self._config = config
         self._lockstep = lockstep
@@ -99,6 +104,7 @@ class Hil:
             "loop.lockstep": self._lockstep,
             "plant.steps_on_request": self._lockstep and self._via == "emulator",
             "plant.via": self._via,
+            **({"plant.kind": self._kind} if self._kind else {}),
         }
         overrides = as_overrides(ours) + as_overrides(settings or {})  # a later one wins
         loaded = load(Path(config) if config else self._config, overrides)

@@ -15,7 +15,6 @@ import pytest
 if TYPE_CHECKING:
     from aeroloop.service.testing.hil import Hil
 
-PLANTS = ("emulator", "can", "can-node", "quanser", "quanser-fake")
 SOFTWARE = ("emulator", "can-node", "quanser-fake")
 """Plant ends without hardware: the defaults of the conformance suite."""
 _LOOP: Final = pytest.StashKey["Hil"]()
@@ -26,9 +25,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("aeroloop", "hardware in the loop, with aeroloop")
     group.addoption(
         "--hil-plant",
-        choices=PLANTS,
-        help="plant end of `hil`: an emulator (default), a node on the configured CAN bus (can-node: an emulated node "
-        "on a private bus), or Quanser's board (or its fake)",
+        metavar="PLANT",
+        help="plant end of `hil`: emulator (default); can, a node on the configured CAN bus; can-node, an emulated node "
+        "on a private bus; quanser, the board, or quanser-fake; or package.module:Class, a plant of your own",
     )
     group.addoption(
         "--hil-lockstep", action="store_true", help="run `hil` in lockstep: repeatable, as fast as the machine allows"
@@ -37,8 +36,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker that the conformance suite uses."""
+    """Register the marker that the conformance suite uses, and refuse a plant that there is not."""
     config.addinivalue_line("markers", "processes: starts real processes, most of them in real time")
+    if plant := config.getoption("--hil-plant"):
+        from aeroloop.plant_emulator.own_plant import class_of
+        from aeroloop.protocol.errors import AeroloopError
+        from aeroloop.service.testing.hil import PLANTS
+
+        try:
+            if plant not in PLANTS:
+                class_of(plant)
+        except AeroloopError as error:
+            raise pytest.UsageError(f"--hil-plant is one of {', '.join(PLANTS)}, or a plant: {error}") from None
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -153,6 +153,8 @@ def _known(settings: Configured, desired: Extremes, body: Premises, within: Reac
 def _motors(settings: Configured) -> Floats:
     """B of the motors present. Raises ValueError if it cannot be inverted. Shape (m, m)."""
     # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
+    if settings.wire.actuators not in (2, 3):
+        raise ValueError(f"the theorem is about two or three motors, and wire.actuators is {settings.wire.actuators}")
     first = 3 - settings.wire.actuators
     B: Floats = np.array(settings.law.allocation)[first:, first:]
     check_invertible(B)

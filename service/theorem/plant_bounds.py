@@ -68,8 +68,9 @@ def plant_bounds(settings: Configured, stated: bool) -> PlantBounds:
         )
     else:
         timely = "the plant waits for every command (loop.lockstep)"
-    if plant.via in ("can", "quanser"):
-        beyond = f"lag, friction and sensors of the machine (plant.via = {plant.via!r})"
+    if plant.via in ("can", "quanser") or not plant.emulated:
+        key = "kind" if plant.via == "emulator" else "via"
+        beyond = f"lag, friction and sensors of the machine (plant.{key} = {getattr(plant, key)!r})"
         held = settings.wire.actuators == 2
         unknown = [] if stated else [f"{beyond} are not known: state --disturbance"]
         return PlantBounds(

@@ -83,6 +83,7 @@ class _Wire:
         self.unpack = {"measurement": spec.measurement.unpack, "command": spec.command.unpack}
         self.attitude: Callable[[float], float] = spec.attitude.quantizer().level
         self.rate: Callable[[float], float] = spec.rate.quantizer().level
+        self.motors = spec.motors
         self.voltage: Callable[[float], float] = voltage.level
         self.outermost = voltage.outermost
 
@@ -184,7 +185,7 @@ class Decoder:
             return []
         _, codes = unpacked
         if name == "command":
-            return [_shown(vehicle, name, views.Voltages.of(codes, wire.voltage, wire.outermost), at_ns)]
+            return [_shown(vehicle, name, views.Voltages.of(codes, wire.motors, wire.voltage, wire.outermost), at_ns)]
         x, y, z = (wire.attitude(code) for code in codes[:3])
         p, q, r = (wire.rate(code) for code in codes[3:])
         known = x + y + z == x + y + z  # not NaN: a valid value

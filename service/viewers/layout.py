@@ -12,12 +12,13 @@ import re
 from importlib.resources import files
 
 
-def layout(vehicle: str, actuators: int) -> str:
-    """The layout as JSON, to be imported as a file; `actuators` is 2 for u₂ and u₃, 3 for all."""
+def layout(vehicle: str, motors: range) -> str:
+    """The layout as JSON, to be imported as a file; `motors` are the numbers of those there are."""
     text = files(__package__).joinpath("layout.json").read_text(encoding="utf-8")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", vehicle):  # in a message path, such a topic is quoted
         text = re.sub(r'"value": "(/VEHICLE/[^.]+)\.', r'"value": "\\"\1\\".', text)
     tree = json.loads(text.replace("VEHICLE", vehicle))
     voltages = tree["configById"]["Plot!voltages"]
-    voltages["paths"] = voltages["paths"][3 - actuators :]
+    first = json.dumps(voltages["paths"][0])
+    voltages["paths"] = [json.loads(first.replace("_1_", f"_{i}_").replace('"u1"', f'"u{i}"')) for i in motors]
     return json.dumps(tree, indent=2, ensure_ascii=False)

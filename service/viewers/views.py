@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import Status, Telemetry
 from aeroloop.protocol.wire.attitude import Quaternion, Vector, angle, to_euler
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 
 ANGLES: Final = "Z–Y–X, body relative to inertial"
 NO_MOTOR: Final = "null: no valid value, or no such motor"
@@ -68,16 +69,27 @@ class Voltages(View, frozen=True):
     voltage_1_v: float | None = Field(description=f"u₁; {NO_MOTOR} [V]")
     voltage_2_v: float | None = Field(description=f"u₂; {NO_MOTOR} [V]")
     voltage_3_v: float | None = Field(description=f"u₃; {NO_MOTOR} [V]")
+    voltage_4_v: float | None = Field(description=f"u₄; {NO_MOTOR} [V]")
+    voltage_5_v: float | None = Field(description=f"u₅; {NO_MOTOR} [V]")
+    voltage_6_v: float | None = Field(description=f"u₆; {NO_MOTOR} [V]")
+    voltage_7_v: float | None = Field(description=f"u₇; {NO_MOTOR} [V]")
+    voltage_8_v: float | None = Field(description=f"u₈; {NO_MOTOR} [V]")
     saturated_1: bool | None = Field(description=f"u₁ is at the quantizer's outermost level; {NO_MOTOR}")
     saturated_2: bool | None = Field(description=f"u₂ is at the quantizer's outermost level; {NO_MOTOR}")
     saturated_3: bool | None = Field(description=f"u₃ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_4: bool | None = Field(description=f"u₄ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_5: bool | None = Field(description=f"u₅ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_6: bool | None = Field(description=f"u₆ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_7: bool | None = Field(description=f"u₇ is at the quantizer's outermost level; {NO_MOTOR}")
+    saturated_8: bool | None = Field(description=f"u₈ is at the quantizer's outermost level; {NO_MOTOR}")
 
     @classmethod
-    def of(cls, codes: Sequence[float], level: Callable[[float], float], outermost: float) -> Self:
-        """Of the codes of u₂ and u₃, or of all three, and the quantizer's levels [V]."""
-        levels = [*[float("nan")] * (3 - len(codes)), *map(level, codes)]
-        volts = [round(u, 4) if u == u else None for u in levels]
-        saturated = [abs(u) >= outermost if u == u else None for u in levels]
+    def of(cls, codes: Sequence[float], motors: range, level: Callable[[float], float], outermost: float) -> Self:
+        """Of a command's codes, their motors' numbers, and the quantizer's levels [V]."""
+        levels = dict(zip(motors, map(level, codes), strict=True))
+        every = [levels.get(number, float("nan")) for number in range(1, MAX_ACTUATORS + 1)]
+        volts = [round(u, 4) if u == u else None for u in every]
+        saturated = [abs(u) >= outermost if u == u else None for u in every]
         return cls.in_order(*volts, *saturated)
 
 

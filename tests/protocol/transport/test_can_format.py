@@ -54,7 +54,8 @@ def test_causes_are_numbered_as_in_the_specification() -> None:
 WIDTHS = st.one_of(st.none(), st.integers(MIN_BITS, MAX_BITS))
 ADVICE = re.compile(
     r"a (?P<frame>\w+) frame has (?P<size>\d+) bytes, and a (?P<bus>classic CAN|CAN FD) frame holds \d+: "
-    r"(?P<fd>set can\.fd = true, or )?wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
+    r"(?P<fd>set can\.fd = true, or )?"
+    r"wire\.(?P<first>\w+)\.bits(?: and wire\.(?P<second>\w+)\.bits)? to (?P<widest>\d+) at the most"
     r"(?P<shorter>, or wire\.counter_bits = 4 with can\.short_counter = true)?$"
 )
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
 from aeroloop.service.viewers.channels import SHAPES
 from aeroloop.service.viewers.layout import layout
@@ -37,7 +38,7 @@ TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
 
 
 def made(vehicle: str = "aero", actuators: int = 2) -> dict[str, Any]:
-    tree: dict[str, Any] = json.loads(layout(vehicle, actuators))
+    tree: dict[str, Any] = json.loads(layout(vehicle, WireSpec(actuators=actuators).motors))
     return tree
 
 
@@ -105,7 +106,8 @@ def test_voltages_are_those_of_the_motors_there_are() -> None:
         return {path.rpartition(".")[2] for path in paths(made("aero", actuators)) if "voltage" in path}
 
     assert volts(2) == {"voltage_2_v", "voltage_3_v"}
-    assert volts(3) == {"voltage_1_v", "voltage_2_v", "voltage_3_v"}
+    for actuators in (1, 3, 8):
+        assert volts(actuators) == {f"voltage_{i + 1}_v" for i in range(actuators)}
 
 
 def test_the_command_prints_the_layout_of_the_vehicle_that_is_named(capfd: pytest.CaptureFixture[str]) -> None:
