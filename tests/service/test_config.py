@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.operator import Points
 from aeroloop.protocol.wording import Shapes, words
 from aeroloop.service.config import ENV_PREFIX, ConfigError, Settings, from_description, load
+from aeroloop.service.control.laws.registry import MODELS
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, replay
 from tests.support.hostile import mutated
@@ -104,6 +105,9 @@ def test_every_key_can_be_set_in_the_environment(key: str, monkeypatch: pytest.M
     if key.startswith("reference."):
         kind = next(kind for kind, shape in KINDS.items() if key.partition(".")[2] in SHAPES.fields(shape))
         monkeypatch.setenv("AEROLOOP_REFERENCE__KIND", kind)
+    if key.startswith("law.") and key != "law.kind":
+        kind = next(kind for kind, model in MODELS.items() if key.partition(".")[2] in model.model_fields)
+        monkeypatch.setenv("AEROLOOP_LAW__KIND", kind)
     monkeypatch.setenv(ENV_PREFIX + key.upper().replace(".", "__"), "[[[{a = 1}]]]")
     with pytest.raises(ConfigError, match=key.split(".")[-1]) as caught:
         load()
