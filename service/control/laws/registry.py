@@ -42,7 +42,7 @@ def _tag(section: Any) -> str:
     return kind if isinstance(kind, str) and kind in BUILT_IN else _OWN
 
 
-_MODELS: Final = {
+MODELS: Final = {
     "adaptive": AdaptiveSettings,
     "nonadaptive": NonadaptiveSettings,
     "pd": PDSettings,
@@ -65,7 +65,7 @@ LawSection = Annotated[
         json_schema_extra={
             "discriminator": {
                 "propertyName": "kind",
-                "mapping": {kind: f"#/$defs/{model.__name__}" for kind, model in _MODELS.items()},
+                "mapping": {kind: f"#/$defs/{model.__name__}" for kind, model in MODELS.items()},
             }
         }
     ),
