@@ -456,7 +456,7 @@ def tune(
         typer.Option(
             min=0,
             max=1,
-            help="Largest part of the ticks with a voltage at its limit; 1.25 × that of the configured gains if left out.",
+            help="Largest part of the ticks with a voltage at its limit; 1.25 × the configured gains' if left out.",
             show_default=False,
         ),
     ] = None,
@@ -464,7 +464,7 @@ def tune(
         float | None,
         typer.Option(
             min=0,
-            help="Most changes of a voltage a second; 1.25 × those of the configured gains if left out.",
+            help="Most changes of a voltage a second; 1.25 × the configured gains' if left out.",
             show_default=False,
         ),
     ] = None,
