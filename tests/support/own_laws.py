@@ -67,5 +67,5 @@ class OffsetInPython(PythonLaw[OffsetSettings]):
 class Stubborn(Offset):
     """Takes its gain from its settings, where no change of gains reaches it."""
 
-    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:  # noqa: ARG002  # it ignores it
         return ca.SX([self.settings.offset - 2] * self.actuators), {}
