@@ -464,7 +464,7 @@ def tune(
         float | None,
         typer.Option(
             min=0,
-            help="Most changes of a voltage a second; 1.25 × those of the configured gains if left out.",
+            help="Most changes of a voltage a second; 1.25 × the configured gains' if left out.",
             show_default=False,
         ),
     ] = None,

@@ -2,9 +2,10 @@
 
 A candidate is the configured gains times factors, searched in their logarithm by differential evolution (R. Storn and
 K. Price, Differential Evolution, Journal of Global Optimization 11, 1997; SciPy's). Its cost is the mean of z_track +
-weight · u_total over the training cases, each a seed and a wind. One that trips or exceeds a limit in any of them costs
-more than any that does not: the worst cost possible, z_track = duration and every motor at its limit, times 1 + by how
-much. Held-out cases, of other seeds and winds, have no part in the search: before and after it they show what it found.
+weight · u_total over the training cases, each a seed and a wind. Candidates are ranked by cost/(1 s + cost), which is
+below 1. One that trips or exceeds a limit in any case ranks behind all others, at 1 + 1 for each run that trips + the
+part of the time that it did not last + the excess over each limit as a part of it. Held-out cases, of other seeds and
+winds, have no part in the search: before and after it they show what it found.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.registry import law_class
 from aeroloop.service.lab.experiment import PATH, paths
 from aeroloop.service.lab.law_margins import PUSHED_S, survives
-from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, largest_voltage, run_cases, with_case, with_law
+from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, run_cases, with_case, with_law
 from aeroloop.service.lab.workers import Workers
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.configured import NoTheoremError, with_theorem
@@ -100,7 +101,6 @@ class Tuning(BaseModel):
     law: str
     weight: float = Field(description="of u_total beside z_track [1/V²]")
     limits: Limits
-    worst_cost: float = Field(description="of a run without control; tripping and exceeding a limit cost more [s]")
     duration_s: float = Field(description="length of an experiment [s]")
     training: list[Case]
     held_out: list[Case] = Field(description="cases that the search has not seen")
@@ -210,7 +210,6 @@ def tune(settings: Settings, plan: Plan, workers: Workers, progress: Progress | 
         law=settings.law.kind,
         weight=plan.weight,
         limits=search.limits,
-        worst_cost=search.worst,
         duration_s=plan.duration_s,
         training=search.training,
         held_out=search.held_out,
@@ -260,8 +259,6 @@ class _Search:
         self.found = dict[tuple[Gain, ...], list[Ran]]()
         self.experiments = 0
         self.without_effect = list[str]()
-        volts = settings.wire.actuators * largest_voltage(settings) ** 2
-        self.worst = plan.duration_s * (1 + plan.weight * volts if isfinite(volts) else 1)
         self.limits = Limits(saturated=plan.max_saturated, changes_per_s=plan.max_chatter)
 
     def run(self) -> None:
@@ -287,7 +284,7 @@ class _Search:
         first = random.standard_normal((population, len(self.dimensions))) * log(plan.reach) / _SPREAD
         first[0] = 0.0
         differential_evolution(
-            self._costs,
+            self._ranks,
             list(zip(low, high, strict=True)),
             init=np.clip(first, low, high),
             maxiter=generations - 1,
@@ -304,10 +301,10 @@ class _Search:
         return max(_LEAST, 4 * dimensions)
 
     def best(self) -> dict[str, Gain]:
-        """The gains of the lowest cost so far. Raises TuneError if every candidate trips."""
+        """The gains of the first rank so far. Raises TuneError if every candidate trips."""
         if not self.found:
             return self.configured
-        gains, rans = min(self.found.items(), key=lambda item: (self.cost(item[1]), item[0]))
+        gains, rans = min(self.found.items(), key=lambda item: (self.rank(item[1]), item[0]))
         if reasons := [ran.reason for ran in rans if ran.reason]:
             raise TuneError(f"no gains were found that do not trip; with the best of them, {reasons[0]}")
         return dict(zip(self.configured, gains, strict=True))
@@ -339,8 +336,8 @@ class _Search:
             found.append(tuned)
         return found[0], found[1]
 
-    def cost(self, rans: Sequence[Ran]) -> float:
-        """The mean cost of runs; beyond `worst` if one of them trips or exceeds a limit [s]."""
+    def rank(self, rans: Sequence[Ran]) -> float:
+        """What is minimised: as the module says, below 1 unless a run trips or exceeds a limit [1]."""
         exceeded = sum(2 - ran.lasted for ran in rans if ran.reason)
         for limit, values in (
             (self.limits.saturated, [ran.saturated for ran in rans]),
@@ -349,8 +346,9 @@ class _Search:
             if limit is not None:
                 exceeded += max(0.0, max(values) - limit) / max(limit, 1e-3)
         if exceeded:
-            return self.worst * (1 + exceeded)
-        return float(np.mean([ran.z_track + self._plan.weight * ran.u_total for ran in rans]))
+            return 1 + exceeded
+        cost = float(np.mean([ran.z_track + self._plan.weight * ran.u_total for ran in rans]))
+        return cost / (1 + cost)
 
     def law(self, gains: dict[str, Gain]) -> LawValues:
         """`[law]` with these gains."""
@@ -370,9 +368,9 @@ class _Search:
         self.without_effect = [one.name for one, same in zip(self.dimensions, still, strict=True) if same]
         self.dimensions = [one for one, same in zip(self.dimensions, still, strict=True) if not same]
 
-    def _costs(self, columns: Floats) -> Floats:
-        """Costs of candidates, as the optimiser asks for them. Shapes (dimensions, n) and (n,)."""
-        return np.array([self.cost(rans) for rans in self._evaluate([self._gains(row) for row in columns.T])])
+    def _ranks(self, columns: Floats) -> Floats:
+        """Ranks of candidates, as the optimiser asks for them. Shapes (dimensions, n) and (n,)."""
+        return np.array([self.rank(rans) for rans in self._evaluate([self._gains(row) for row in columns.T])])
 
     def _evaluate(self, candidates: Sequence[dict[str, Gain]]) -> list[list[Ran]]:
         keys = [tuple(gains.values()) for gains in candidates]

@@ -81,8 +81,8 @@ def _gains(tuning: Tuning) -> Table:
 
 def _notes(tuning: Tuning) -> Iterator[str]:
     yield (
-        f"cost = mean of z_track + {tuning.weight:g} · u_total; a run that trips or exceeds a limit makes it more than "
-        f"{tuning.worst_cost:.4g} s. Error, saturation and changes are the largest of all runs. Training: "
+        f"cost = mean of z_track + {tuning.weight:g} · u_total; gains with which a run trips or exceeds a limit rank "
+        "behind all others. Error, saturation and changes are the largest of all runs. Training: "
         f"{_cases(tuning, held_out=False)}. Held out: {_cases(tuning, held_out=True)}."
     )
     yield (
