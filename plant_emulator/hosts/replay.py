@@ -1,4 +1,4 @@
-"""Replay of an emulated plant: the plant end computed again from its own rows, and compared byte for byte.
+"""Replay of an emulated plant, or of one that is `repeatable`: the plant end computed again from its own rows, and compared byte for byte.
 
 `Emulator.tick` uses no clock and no network: settings, seeds, faults, the frames received at each tick and the
 operations between ticks determine every measurement. A replay starts at the first row of the plant's process, where the
@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.own_plant import class_of
+from aeroloop.plant_emulator.own_plant import PlantError, class_of
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.trace import NEVER, Batch, Operation, Sent
@@ -69,6 +69,7 @@ class PlantReplay:
 
     Raises:
         ValueError: The plant cannot be replayed, with the reason of `why_not`.
+        PlantError: It cannot be made.
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
@@ -96,7 +97,10 @@ class PlantReplay:
         if self._stopped is None and not self._repeated(batch):
             self._stopped = self._cannot_follow(batch)
             if self._stopped is None:
-                self._replay(batch)
+                try:
+                    self._replay(batch)
+                except PlantError as error:
+                    self._stopped = str(error)
         return self._stopped is None
 
     def result(self) -> PlantReplayed:
