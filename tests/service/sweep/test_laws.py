@@ -16,7 +16,7 @@ from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.sweep.axes import digest_of
-from aeroloop.service.sweep.laws import LAWS, Choice, LawsError, compare
+from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
 
 SLOW = load(overrides=["loop.rate_hz=100"])
 RUNAWAY, RAISING = (f"tests.support.failing_laws:{name}" for name in ("Runaway", "Raising"))
