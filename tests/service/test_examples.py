@@ -62,7 +62,17 @@ def test_the_lockstep_test_passes_where_it_is_copied_to(tmp_path: Path) -> None:
 
 PUBLIC = {
     *("AeroloopError", "Certificate", "Controller", "Figures", "Hil", "HysteresisQuantizer", "LogarithmicQuantizer"),
-    *("Measurement", "Plant", "RecordedRun", "Settings", "SignalSpec", "State", "Ticks", "UniformQuantizer", "WireSpec"),
+    *(
+        "Measurement",
+        "Plant",
+        "RecordedRun",
+        "Settings",
+        "SignalSpec",
+        "State",
+        "Ticks",
+        "UniformQuantizer",
+        "WireSpec",
+    ),
     *("ExpressionLaw", "Gain", "Gains3", "LawSettings", "Now", "PositiveGain", "PythonLaw"),
     *("certify", "gravity_torque", "load_settings", "read_run", "run_experiment", "voltages_for"),
 }

@@ -1,4 +1,5 @@
-"""Laws of a user's own that go wrong, named by tests as `tests.support.tuned_laws:Class`."""
+"""Laws with a known optimum, and laws that fail, for searches of gains."""
+
 
 from __future__ import annotations
 
@@ -9,30 +10,8 @@ import casadi as ca
 from pydantic import Field
 
 from aeroloop import ExpressionLaw, LawSettings, Now, PythonLaw
-
-
-class Runaway(ExpressionLaw[LawSettings]):
-    """Pushes where it should pull."""
-
-    Settings = LawSettings
-
-    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        return 200 * now.attitude_error[-self.actuators :] + 0.3, {}
-
-
-class Raising(PythonLaw[LawSettings]):
-    """Fails at its fourth tick."""
-
-    Settings = LawSettings
-
-    def reset(self) -> None:
-        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
-
-    def step(self, now: Now[Any]) -> Any:
-        self.state["ticks"] = now.state["ticks"] + 1
-        if now.state["ticks"] > 2:
-            raise ZeroDivisionError("by nothing")
-        return [0.0] * self.actuators
+from tests.support.failing_laws import Raising as Raising
+from tests.support.failing_laws import Runaway as Runaway
 
 
 class OffsetSettings(LawSettings):
