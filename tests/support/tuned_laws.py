@@ -1,6 +1,5 @@
 """Laws with a known optimum, and laws that fail, for searches of gains."""
 
-
 from __future__ import annotations
 
 from collections.abc import Mapping
