@@ -107,8 +107,9 @@ def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, A
             _put(tree, f"{section}.{option}", _value(text))
         elif variable in known:
             _put(tree, known[variable], _value(text))
-        elif variable.startswith(_variable("law.")):  # of a user's law, whose names have the case they are written in
-            _put(tree, f"law.{name[len(_variable('law.')) :]}", _value(text))
+        elif variable.startswith(_variable("law.")):  # of a user's law: in lower case, or as written if in mixed case
+            own = name[len(_variable("law.")) :]
+            _put(tree, f"law.{own.lower() if own.isupper() else own}", _value(text))
         else:
             found = closest(variable.removeprefix(ENV_PREFIX).replace("__", "."), known.values())
             hint = f"did you mean {_variable(found)}?" if found else "unset it, or see `aeroloop show config`"
