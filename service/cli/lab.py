@@ -470,7 +470,7 @@ def tune(
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Training seeds of wind and sensors.")] = 2,
     winds: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Training winds, as parts of plant.wind.torque; 0 is calm.")
+        str, typer.Option(metavar="A,B", help="Training winds, as parts of plant.wind.torque; 0 is calm.")
     ] = "0,1",
     held_out: Annotated[
         int, typer.Option(min=1, max=100, help="Runs with other seeds and winds, which the search does not see.")
