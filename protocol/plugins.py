@@ -48,7 +48,7 @@ def find(key: str, kind: str, group: str, built_in: Mapping[str, str], base: typ
             raise PluginError(f"{said} is not known: it is one of {known}, or package.module:Class")
         target = installed[kind].value
     point = EntryPoint(kind, target, group)
-    if not (point.module and point.attr):
+    if not EntryPoint.pattern.match(target) or not (point.module and point.attr):
         raise PluginError(f"{said} does not name a class: write package.module:Class")
     found = _loaded(said, point)
     if not (isinstance(found, type) and issubclass(found, base)):

@@ -1,1 +1,1 @@
-"""Other engines as plants: MuJoCo models and FMUs."""
+"""Plants computed by simulation engines that are optional extras."""

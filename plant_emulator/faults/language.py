@@ -28,6 +28,8 @@ from typing import Final, Literal, NamedTuple, TypeAlias, get_args
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS
+
 Kind: TypeAlias = Literal["off", "stuck", "bias", "noise", "delay", "drop", "garble", "duplicate", "reorder"]
 Whole: TypeAlias = Literal["attitude", "rate", "motors", "measurement", "command"]
 
@@ -40,7 +42,6 @@ MAX_RATE: Final = 35.0
 """Largest bias and noise of an angular velocity [rad/s]: 2000 °/s, the full scale of common gyroscopes."""
 MAX_VOLTS: Final = 48.0
 """Largest bias and noise of a voltage [V]: from one end of the Aero's supply of ±24 V to the other."""
-MAX_MOTORS: Final = 3
 
 
 class Signal(NamedTuple):
@@ -69,7 +70,7 @@ SIGNALS: Final[dict[str, Signal]] = {
     "rate": Signal("rate", None, _OF_VALUES),
     **{f"rate.{axis}": Signal("rate", i, _OF_VALUES) for i, axis in enumerate("xyz")},
     "motors": Signal("motors", None, _OF_VALUES),
-    **{f"motor{i + 1}": Signal("motors", i, _OF_VALUES) for i in range(MAX_MOTORS)},
+    **{f"motor{i + 1}": Signal("motors", i, _OF_VALUES) for i in range(MAX_ACTUATORS)},
     "measurement": Signal("measurement", None, _OF_FRAMES),
     "command": Signal("command", None, _OF_FRAMES),
 }

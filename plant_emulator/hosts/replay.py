@@ -1,4 +1,4 @@
-"""Replay of an emulated plant: the plant end computed again from its own rows, and compared byte for byte.
+"""Replay of a plant that is emulated or `repeatable`: its end computed again from its own rows, byte for byte.
 
 `Emulator.tick` uses no clock and no network: settings, seeds, faults, the frames received at each tick and the
 operations between ticks determine every measurement. A replay starts at the first row of the plant's process, where the
@@ -18,9 +18,10 @@ from pydantic import BaseModel, Field
 from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.own_plant import class_of
+from aeroloop.plant_emulator.own_plant import PlantError, class_of
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Refusal
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, Operation, Sent
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -69,6 +70,7 @@ class PlantReplay:
 
     Raises:
         ValueError: The plant cannot be replayed, with the reason of `why_not`.
+        PlantError: It cannot be made.
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
@@ -96,7 +98,10 @@ class PlantReplay:
         if self._stopped is None and not self._repeated(batch):
             self._stopped = self._cannot_follow(batch)
             if self._stopped is None:
-                self._replay(batch)
+                try:
+                    self._replay(batch)
+                except PlantError as error:
+                    self._stopped = str(error)
         return self._stopped is None
 
     def result(self) -> PlantReplayed:
@@ -207,6 +212,8 @@ class PlantReplay:
     def _operate(self, operation: Operation) -> bool:
         """Advance the plant to an operation's tick and apply it. Returns whether that was possible."""
         emulator, endpoint = self._emulator, self._emulator.endpoint
+        if operation.cause is TripCause.PLANT:
+            return True  # it failed within a tick, which has no row, and its process ended
         if operation.tick > endpoint.ticked:
             if endpoint.session is not None:
                 self._stopped = f"rows are missing before tick {operation.tick}, where a session runs"

@@ -43,13 +43,20 @@ _REPORT_BYTES: Final = 8
 _MOST_CHANGED: Final = 2**32 - 1
 
 
-def carried_bytes(size: int) -> int:
-    """Length of the CAN payload that carries this many bytes."""
-    return next(length for length in FD_LENGTHS if length >= size)
-
-
 class CanError(AeroloopError):
     """The bus cannot be used; one line with the reason and what to do."""
+
+
+def carried_bytes(size: int) -> int:
+    """Length of the CAN payload that carries this many bytes.
+
+    Raises:
+        CanError: None does.
+    """
+    for length in FD_LENGTHS:
+        if length >= size:
+            return length
+    raise CanError(f"a frame of {size} bytes does not fit into CAN FD's {FD_LENGTHS[-1]}: give its signals fewer bits")
 
 
 class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):

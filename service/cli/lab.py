@@ -367,7 +367,8 @@ def laws(
     """Compare control laws, tuned alike: error, effort, chatter, bits, and the delay and loss that each survives."""
     settings = loop_of(config, overrides)
     _check_engine(engine)
-    from aeroloop.service.sweep.laws import compare, run_comparison
+    from aeroloop.service.sweep.law_choices import compare
+    from aeroloop.service.sweep.laws import run_comparison
     from aeroloop.service.sweep.sweep import rows_file
     from aeroloop.service.sweep.table import check_table
     from aeroloop.service.terminal.display import count_bar

@@ -46,7 +46,9 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
 
     from aeroloop.protocol.transport.dbc import dbc as describe
 
-    typer.echo(describe(settings.wire, settings.can.node, settings.loop.period_ns), nl=False)
+    with checked():
+        text = describe(settings.wire, settings.can.node, settings.loop.period_ns)
+    typer.echo(text, nl=False)
 
 
 @group.command()

@@ -140,15 +140,16 @@ def through_frames(
         duration_s: Length of the run [s].
         progress: Called once a second of the run with the time reached [s].
         watch: Called at every tick with the frames of both directions.
-        plant: Plant to control; the configuration's if None.
+        plant: Plant to control, which stays open; the configuration's if None.
         controller: Controller to run; the configuration's if None.
 
     Raises:
         LoopEndedError: The plant tripped.
+        PluginError, PlantError: The configured plant is not there, or failed.
         ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2.
     """
     if plant is None:
-        with closing(_plant(settings)) as made:
+        with closing(_plant(settings)) as made:  # 0 V at the end: it may be a machine
             return through_frames(settings, duration_s, progress, watch, plant=made, controller=controller)
     loop, wire = settings.loop, settings.wire
     controller = controller or Controller(wire, settings.law, settings.reference, loop.period)

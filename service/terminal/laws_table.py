@@ -20,7 +20,8 @@ def laws_table(laws: Laws) -> None:
     """Print a comparison of laws."""
     console = Console()
     for title, (header, *rows) in _sections(laws):
-        table = Table(title=Text(title), title_justify="left", title_style="italic", box=None, pad_edge=False)
+        console.print(Text(title, style="italic"), soft_wrap=not console.is_terminal)
+        table = Table(box=None, pad_edge=False)
         for i, name in enumerate(header):
             table.add_column(name, justify="right" if i else "left", min_width=0 if i else 11, no_wrap=not i)
         failed = [row for row in rows if len(row) == 2]

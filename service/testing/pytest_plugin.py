@@ -26,8 +26,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--hil-plant",
         metavar="PLANT",
-        help="plant end of `hil`: emulator (default); can, a node on the configured bus; can-node, an emulated node on "
-        "a private bus; quanser, the board, or quanser-fake; or package.module:Class, a plant of your own",
+        help="plant end of `hil`: emulator (default); can, a node on the configured CAN bus; can-node, an emulated "
+        "node on a private bus; quanser, the board, or quanser-fake; or package.module:Class, a plant of your own",
     )
     group.addoption(
         "--hil-lockstep", action="store_true", help="run `hil` in lockstep: repeatable, as fast as the machine allows"

@@ -25,7 +25,7 @@ from tests.support.made_log import make_log
 SHAPES = Shapes(Settings)
 KEYS = dict(SHAPES.every_key())
 LEAVES = [key for key, shape in KEYS.items() if not SHAPES.fields(shape)]
-KINDS = SHAPES.kinds(KEYS["reference"])
+KINDS = {section: SHAPES.kinds(KEYS[section]) for section in ("reference", "law")}
 
 PYDANTIC = (
     "nput should", "alue error", "alid ", "unable to", "ield required", "xtra input", "ictionary", "tuple", "nstance",
@@ -41,7 +41,13 @@ ODD = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None)
+def kind_with(section: str, name: str) -> str | None:
+    """The first kind of reference or law that has a key; None where kinds do not matter."""
+    kinds = KINDS.get(section, {})
+    return next((kind for kind, shape in kinds.items() if name in SHAPES.fields(shape)), None)
+
+
+@settings(max_examples=120, deadline=None)
 @given(st.sampled_from(list(KEYS)), ODD)
 def test_no_words_of_pydantic_reach_a_person_whatever_is_set(key: str, value: Any) -> None:
     tree: dict[str, Any] = Settings().description()
@@ -49,8 +55,8 @@ def test_no_words_of_pydantic_reach_a_person_whatever_is_set(key: str, value: An
     *sections, name = key.split(".")
     for section in sections:
         branch = branch[section]
-    if sections == ["reference"]:
-        branch["kind"] = next(kind for kind, shape in KINDS.items() if name in SHAPES.fields(shape))
+    if sections and (kind := kind_with(sections[0], name)):
+        branch["kind"] = kind
     branch[name] = value
     try:
         from_description(tree)
@@ -101,9 +107,9 @@ def test_a_wrong_setting_is_named_with_what_it_must_be(override: str, line: str)
 @pytest.mark.parametrize("key", LEAVES)
 def test_every_key_can_be_set_in_the_environment(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """None is refused as unknown; what it must be is not the matter here."""
-    if key.startswith("reference."):
-        kind = next(kind for kind, shape in KINDS.items() if key.partition(".")[2] in SHAPES.fields(shape))
-        monkeypatch.setenv("AEROLOOP_REFERENCE__KIND", kind)
+    section, _, name = key.partition(".")
+    if kind := kind_with(section, name):
+        monkeypatch.setenv(f"AEROLOOP_{section.upper()}__KIND", kind)
     monkeypatch.setenv(ENV_PREFIX + key.upper().replace(".", "__"), "[[[{a = 1}]]]")
     with pytest.raises(ConfigError, match=key.split(".")[-1]) as caught:
         load()
@@ -158,7 +164,8 @@ def test_every_key_that_is_shown_has_its_description_and_bounds_above_it_within_
     assert not any(line.startswith("#") for line in load().toml().splitlines())
     text = "\n".join(line for line in lines)
     for comment, section, key in _commented(lines):
-        shape = KEYS[f"{section}.{key}".removeprefix(".")]
+        of_kind = SHAPES.fields(KINDS["law"]["adaptive"]) if section == "law" else {}
+        shape = of_kind.get(key) or KEYS[f"{section}.{key}".removeprefix(".")]
         assert comment.startswith(" ".join(shape["description"].split())), key
         if "number" in words(shape):
             assert comment.endswith(f"({words(shape)})"), key

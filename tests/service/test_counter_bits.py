@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from aeroloop.service.config import ConfigError, load
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     bits=st.integers(4, 16),
     rate=st.sampled_from([1, 20, 50, 100, 250, 500, 1000, 4000, 10_000]),

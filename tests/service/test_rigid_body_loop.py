@@ -58,7 +58,7 @@ OTHER = load(
 )
 """400° is more than a turn, to and fro; roll and yaw do it in turns of different length, with up to 0.9 rad/s."""
 
-BITS = ("6", "8", "10", "cont")
+BITS = ("6", "10", "cont")
 SECONDS = 60.0
 
 

@@ -26,7 +26,7 @@ def wire_of(
 
 any_width = st.none() | st.integers(2, 16)
 any_counter_bits = st.sampled_from(COUNTER_BITS)
-wires = st.builds(wire_of, any_width, any_width, any_width, st.sampled_from([2, 3]), any_counter_bits)
+wires = st.builds(wire_of, any_width, any_width, any_width, st.integers(1, MAX_ACTUATORS), any_counter_bits)
 
 
 @st.composite

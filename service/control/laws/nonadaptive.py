@@ -23,7 +23,7 @@ class NonadaptiveSettings(LawSettings):
     C1: MatrixGain = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
     C2: MatrixGain = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
     damping_estimate: Vector = Field(
-        default=(0.0, 0.0070, 0.0095), description="θ̂, the damping that is fed forward [N·m·s/rad]"
+        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
     )
 
 

@@ -39,10 +39,10 @@ class OwnLawSettings(LawSettings):
 
 def _tag(section: Any) -> str:
     kind = section.get("kind", "adaptive") if isinstance(section, dict) else getattr(section, "kind", "")
-    return kind if kind in BUILT_IN else _OWN
+    return kind if isinstance(kind, str) and kind in BUILT_IN else _OWN
 
 
-_MODELS: Final = {
+MODELS: Final = {
     "adaptive": AdaptiveSettings,
     "nonadaptive": NonadaptiveSettings,
     "pd": PDSettings,
@@ -65,7 +65,7 @@ LawSection = Annotated[
         json_schema_extra={
             "discriminator": {
                 "propertyName": "kind",
-                "mapping": {kind: f"#/$defs/{model.__name__}" for kind, model in _MODELS.items()},
+                "mapping": {kind: f"#/$defs/{model.__name__}" for kind, model in MODELS.items()},
             }
         }
     ),

@@ -32,10 +32,10 @@ from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings, 
 
 
 class TrackingSettings(LawSettings):
-    """Model of the plant, and when the nearer of the two equilibria is chosen anew."""
+    """Model of the plant, a damping estimate that stays, and when the nearer of two equilibria is chosen anew."""
 
     damping_estimate: Vector = Field(
-        default=(0.0, 0.0070, 0.0095), description="θ̂, the damping that is fed forward [N·m·s/rad]"
+        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
     )
     hysteresis: float = Field(
         default=0.4, ge=0, lt=1, description="the other equilibrium is approached from |η̃| beyond this on [1]"

@@ -244,4 +244,4 @@ class PlantEnd(RuleBasedStateMachine):
 
 
 TestPlantEnd = PlantEnd.TestCase
-TestPlantEnd.settings = settings(max_examples=150, stateful_step_count=40)
+TestPlantEnd.settings = settings(max_examples=80, stateful_step_count=40)

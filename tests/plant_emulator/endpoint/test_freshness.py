@@ -61,7 +61,7 @@ late = st.one_of(st.integers(0, WATCHDOG + 2), st.integers(0, COUNTERS - 1), st.
 """By how many ticks a command is late; None: it is lost. A whole round of the counter cannot be detected."""
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(delays=st.lists(late, min_size=1, max_size=120))
 def test_commands_are_judged_as_by_the_ticks_that_they_answer(delays: list[int | None]) -> None:
     endpoint, model = claimed(), Model()
@@ -82,7 +82,7 @@ def test_commands_are_judged_as_by_the_ticks_that_they_answer(delays: list[int |
         assert endpoint.voltages == (OFF if model.tripped or model.answered < 0 else in_force)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(delay=st.integers(0, 5 * COUNTERS))
 def test_a_stream_that_is_late_for_good_drives_within_the_watchdogs_time_and_never_beyond(delay: int) -> None:
     """Also where its echoes look fresh, because the counter has come round: by then the session is over."""

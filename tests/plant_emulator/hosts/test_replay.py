@@ -160,7 +160,7 @@ def undisturbed() -> tuple[LoopSettings, WireSpec, list[Batch]]:
     return loop, wire, Stage(loop, wire, PLANT, between=claim, answer=answer).run(600).batches
 
 
-@settings(max_examples=25, deadline=None, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_whatever_happened_the_plant_is_computed_again_without_a_difference(seed: int) -> None:
     loop, wire, plant, batches = traced(seed)

@@ -406,7 +406,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
 
 TestForetoldPlantEnd = ForetoldPlantEnd.TestCase
-TestForetoldPlantEnd.settings = settings(max_examples=70, stateful_step_count=40)
+TestForetoldPlantEnd.settings = settings(max_examples=40, stateful_step_count=40)
 
 
 def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive() -> None:

@@ -109,7 +109,7 @@ def test_what_a_stall_misses_is_counted_and_not_made_up_for(fake: FakeTime) -> N
     assert grid.skipped == 9
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(work=st.lists(st.integers(0, PERIOD) | st.integers(0, 20 * PERIOD), min_size=1, max_size=100))
 def test_it_never_bursts_and_every_tick_is_taken_or_counted(fake: FakeTime, work: list[int]) -> None:
     fake.now = START
@@ -153,7 +153,7 @@ HALF_A_BIN = 2 ** (1 / 32) * (1 + 1e-9)
 """The middle of a bin is at most half a bin, 2.2 %, from whatever is in it; 1e-9 for rounding at its edge."""
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.lists(st.integers(1000, 3_600_000_000_000), min_size=1, max_size=60), st.integers(0, 100))
 def test_a_percentile_is_within_half_a_bin(durations_ns: list[int], percent: int) -> None:
     histogram = Histogram()

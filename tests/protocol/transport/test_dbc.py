@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import FaultPhase, FaultReport, Heartbeat
+from aeroloop.protocol.transport.can_format import CanError, FaultPhase, FaultReport, Heartbeat
 from aeroloop.protocol.transport.dbc import dbc
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
@@ -228,6 +228,10 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
 @settings(max_examples=60)
 @given(spec=specs, data=st.data())
 def test_any_codes_of_any_wire_decode(spec: WireSpec, data: st.DataObject) -> None:
+    if spec.command.size > 64:  # eight voltages of 64 bits
+        with pytest.raises(CanError, match="65 bytes does not fit into CAN FD's 64"):
+            frames(spec)
+        return
     for message, layout, of in frames(spec):
         counter = data.draw(st.integers(0, 2**spec.counter_bits - 1))
         assert_decodes(message, layout, of, counter, data.draw(codes_of(layout.widths)))

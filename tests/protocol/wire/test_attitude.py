@@ -268,7 +268,7 @@ def test_a_receiver_without_a_memory_gets_the_attitude(q: Quaternion) -> None:
     assert received[0] >= 0
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.tuples(*[st.floats(-1.2, 1.2)] * 3), quaternions)
 def test_what_is_received_is_a_unit_quaternion_near_the_last(eps: Vector, last: Quaternion) -> None:
     q = received_quaternion(*eps, last=last)

@@ -98,7 +98,7 @@ Direction = Callable[[WireSpec], tuple[FrameFormat, Widths]]
 
 
 @both_frames
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(spec=wires, data=st.data())
 def test_a_frame_is_the_bits_of_the_spec_and_unpacks_to_what_was_packed(
     direction: Direction, spec: WireSpec, data: st.DataObject
@@ -211,7 +211,7 @@ def test_an_infinite_float_is_refused_in_every_place() -> None:
 
 
 @both_frames
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(spec=wires, data=st.data())
 def test_any_bytes_are_refused_or_are_exactly_what_packing_gives(
     direction: Direction, spec: WireSpec, data: st.DataObject

@@ -24,7 +24,7 @@ def hysteretic(draw: st.DrawFn) -> HysteresisQuantizer:
     return HysteresisQuantizer(draw(st.integers(MIN_BITS, MAX_BITS)), limit, deadzone, hysteresis)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.data())
 def test_a_sequence_gets_the_codes_of_exact_arithmetic_with_every_tie_held(data: st.DataObject) -> None:
     bits = data.draw(st.integers(MIN_BITS, 10))
@@ -55,7 +55,7 @@ def test_a_sequence_gets_the_codes_of_exact_arithmetic_with_every_tie_held(data:
         assert quantizer.encode(float(y)) == held
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(hysteretic(), st.lists(within, min_size=1, max_size=50), st.floats(1e-3, 1.0))
 def test_whatever_came_before_the_error_within_the_limit_stays_within_the_bound(
     quantizer: HysteresisQuantizer, walk: list[float], scale: float
@@ -67,7 +67,7 @@ def test_whatever_came_before_the_error_within_the_limit_stays_within_the_bound(
     assert quantizer.saturated == 0
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(hysteretic())
 def test_the_bound_is_the_uniform_one_and_h_and_is_reached(quantizer: HysteresisQuantizer) -> None:
     half, h = quantizer.step / 2, quantizer.hysteresis
@@ -81,7 +81,7 @@ def test_the_bound_is_the_uniform_one_and_h_and_is_reached(quantizer: Hysteresis
     assert abs(quantizer.quantize(reached) - reached) == pytest.approx(expected, abs=2.0**-39 * quantizer.limit)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(hysteretic(), within, st.lists(within, min_size=1, max_size=20))
 def test_noise_of_less_than_h_changes_no_code(quantizer: HysteresisQuantizer, part: float, noise: list[float]) -> None:
     y = part * quantizer.limit
@@ -97,7 +97,7 @@ def test_by_default_a_code_changes_once_the_value_is_over_a_step_from_its_level(
     assert codes == [1, 1, 1, 2, 2, 2, 1]
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(hysteretic(), st.lists(st.floats(-1.5, 1.5), max_size=30))
 def test_what_it_sent_decodes_to_what_it_would_send_again(quantizer: HysteresisQuantizer, walk: list[float]) -> None:
     for part in walk:

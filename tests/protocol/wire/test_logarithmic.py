@@ -61,7 +61,7 @@ def test_edges_and_levels_are_those_of_the_definition_in_decimals(quantizer: Log
     assert quantizer.levels[quantizer.top + 2 :] == [-y for y in reversed(quantizer.levels[1 : quantizer.top + 1])]
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(logarithmic(), st.data())
 def test_a_value_gets_the_level_whose_interval_holds_it_and_a_tie_goes_towards_zero(
     quantizer: LogarithmicQuantizer, data: st.DataObject
@@ -93,7 +93,7 @@ def test_where_the_longest_interval_is_l_by_design_rounding_does_not_choose_m() 
     assert LogarithmicQuantizer(3, 1.0, 0.1, 0.4).growing == 1
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(logarithmic(), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0) | st.floats(0.0, 1e-9))
 def test_it_is_odd_monotone_and_bounded(quantizer: LogarithmicQuantizer, part: float, other: float) -> None:
     low, high = sorted((part * quantizer.limit, (part + other) * quantizer.limit))
@@ -104,7 +104,7 @@ def test_it_is_odd_monotone_and_bounded(quantizer: LogarithmicQuantizer, part: f
             assert abs(quantizer.quantize(y) - y) <= quantizer.bound + 8 * EPS * quantizer.limit
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(logarithmic())
 def test_no_interval_is_longer_than_the_uniform_ones_and_no_fewer_would_grow(quantizer: LogarithmicQuantizer) -> None:
     m, top, alike = quantizer.growing, quantizer.top, 1 + 2.0**-29  # SPEC.md's 2^-30, and rounding

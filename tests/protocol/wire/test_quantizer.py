@@ -100,7 +100,7 @@ def dyadic(draw: st.DrawFn) -> tuple[UniformQuantizer, Exact]:
     return quantizer, Exact(bits, limit, step / 2 if deadzone is None else deadzone)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(cases(), within)
 def test_the_error_within_the_limit_stays_within_the_bound(case: Case, part: float) -> None:
     quantizer, _ = case
@@ -110,7 +110,7 @@ def test_the_error_within_the_limit_stays_within_the_bound(case: Case, part: flo
     assert quantizer.saturated == 0
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(cases())
 def test_the_bound_is_the_larger_of_dead_zone_and_half_a_step_and_is_reached(case: Case) -> None:
     quantizer, deadzone = case
@@ -122,7 +122,7 @@ def test_the_bound_is_the_larger_of_dead_zone_and_half_a_step_and_is_reached(cas
     assert reached >= quantizer.bound - 8 * EPS * quantizer.limit
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(dyadic(), st.data())
 def test_exact_values_get_the_code_and_level_of_exact_arithmetic(
     pair: tuple[UniformQuantizer, Exact], data: st.DataObject
@@ -138,7 +138,7 @@ def test_exact_values_get_the_code_and_level_of_exact_arithmetic(
     assert quantizer.saturated == (abs(y) > twin.limit)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(cases(), within)
 def test_any_value_gets_the_code_of_exact_arithmetic_but_for_the_rounding_of_an_edge(case: Case, part: float) -> None:
     quantizer, deadzone = case
@@ -214,7 +214,7 @@ def test_the_default_dead_zone_gives_the_paper_s_step_and_levels_at_its_multiple
         assert abs(quantizer.decode(k) - k * step) <= 4 * EPS * abs(k * step)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(cases(), st.floats(-2.0, 2.0))
 def test_it_is_odd(case: Case, part: float) -> None:
     quantizer, _ = case
@@ -223,7 +223,7 @@ def test_it_is_odd(case: Case, part: float) -> None:
     assert quantizer.quantize(-y) == -quantizer.quantize(y)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(cases(), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0) | st.floats(0.0, 1e-12))
 def test_it_is_monotone(case: Case, part: float, other: float) -> None:
     quantizer, _ = case
@@ -251,7 +251,7 @@ def test_the_spare_code_is_the_least_one_and_decodes_to_nan(bits: int) -> None:
     assert isnan(quantizer.level(quantizer.invalid))
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(cases(), st.floats(PAST_EDGE, 1e12))
 def test_beyond_the_range_is_the_outermost_level_and_is_counted(case: Case, factor: float) -> None:
     quantizer, _ = case
@@ -262,7 +262,7 @@ def test_beyond_the_range_is_the_outermost_level_and_is_counted(case: Case, fact
         assert quantizer.saturated == n
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(cases())
 def test_the_limit_itself_is_within_the_range(case: Case) -> None:
     quantizer, _ = case

@@ -51,7 +51,10 @@ def refusal(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
         (("demo", "--set", "vehicle=a/b"), "vehicle"),
         (("demo", "--duration", "x"), "--duration must be a number, not 'x' ("),
         (("demo", "--duration", "0"), "--duration must be at least 0.01, not '0' ("),
-        (("op", "set-gains", "--C1", "1", "2", "--json"), "--C1 must be a number, not '--json' ("),
+        (
+            ("op", "set-gains", "--C1", "1", "2", "--json"),
+            "give each gain as --NAME and its numbers, such as --C2 0.2 0.2 0.2",
+        ),
         (("log", "export", "a.mcap", "--to", "foo"), "--to: 'foo' is not one of 'parquet', "),
         (("demo", "--durat", "3"), "did you mean --duration? ("),
         (("log", "review", "a.mcap", "--session"), "see `aeroloop log review --help`"),

@@ -124,7 +124,7 @@ def bounds(start: Angles, target: Plan, braking: float) -> tuple[Array, Array]:
 # Where it goes
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(start=any_states(), reference=tracked, longer_s=seconds(0, 60), braking=st.sampled_from([0.1, 1.0, 5.0]))
 @example(  # at yaw 70°, turning by 12°/s: it went to 115° before it came back
     start=Angles(*(np.array([[0.0, 0.0, x]]) for x in (radians(70), radians(12), 0.0))),
@@ -157,7 +157,7 @@ def test_an_even_turn_stops_within_three_quarters_of_its_rate_squared_by_the_lim
     assert accelerations[braking, 2].min() == pytest.approx(-0.25, rel=1e-4)
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(start=any_states(), reference=tracked, braking=st.sampled_from([0.1, 1.0, 5.0]))
 def test_braking_and_run_up_stay_within_the_limit_of_acceleration_or_the_one_that_they_find(
     start: Angles, reference: Reference, braking: float
@@ -171,7 +171,7 @@ def test_braking_and_run_up_stay_within_the_limit_of_acceleration_or_the_one_tha
     assert np.all(np.abs(accelerations) <= most * (1 + 1e-6))  # 1e6 s round to 1e-10 s
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(history=histories, reference=tracked, longer_s=seconds(0, 60))
 def test_after_any_history_an_approach_keeps_the_limits_of_rate_and_tilt(
     history: list[tuple[Reference, float, float]], reference: Reference, longer_s: float
@@ -205,7 +205,7 @@ def test_near_the_limits_of_rate_and_tilt_it_brakes_harder(pitch: float, rate: f
     assert np.abs(angles).max() <= BENCH.tilt * SAMPLED
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(start=any_states(), reference=tracked, longer_s=seconds(0, 60), t=seconds(0, 20))
 def test_neither_angle_nor_rate_nor_acceleration_jumps(
     start: Angles, reference: Reference, longer_s: float, t: float
@@ -244,7 +244,7 @@ def test_what_is_gone_to_is_reached_in_the_time_given_and_held(start: Angles, ta
 # How long it takes
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(start=any_states(), reference=tracked, more=st.lists(st.integers(0, 10**6), max_size=5))
 def test_the_time_that_is_named_would_do_and_so_does_any_longer_and_a_twentieth_less_would_not(
     start: Angles, reference: Reference, more: list[int]
@@ -324,7 +324,7 @@ def test_a_time_is_rounded_up_to_three_digits(value: float) -> None:
 # Rest
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(history=histories)
 def test_resting_brakes_at_once_and_stays_where_that_ends(history: list[tuple[Reference, float, float]]) -> None:
     followed, t = after(history, BODY)
@@ -358,7 +358,7 @@ def test_a_body_is_approached_from_the_nearest_turn(
 # Set-points of a stream
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(start=holds, target=holds, asked_s=withins, rate=st.integers(1, 40).map(lambda n: n / 10))
 def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_later_than_it_takes(
     start: Hold, target: Hold, asked_s: float, rate: float
@@ -376,7 +376,7 @@ def test_from_rest_a_set_point_is_reached_within_the_limit_as_asked_or_hardly_la
         assert approached(plan, begin, 0.0, approach).fastest() <= rate
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(start=any_states(), target=turns.map(lambda a: Hold(attitude=a)), asked_s=seconds(0.02, 2.0))
 def test_on_the_way_to_a_set_point_no_axis_swings_out(start: Angles, target: Hold, asked_s: float) -> None:
     """Beyond its start or its target, no further than braking within the time asked, or within the limit, would."""

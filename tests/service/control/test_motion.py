@@ -177,7 +177,7 @@ def rounding(around: Sequence[tuple[Array, Array, Array]], t: float, within_s: f
     return 30 * EPS * 15 * size * (5 / T) ** orders + 2 * EPS * (t + T) * 15 * size * (5 / T) ** (orders + 1)
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(first=references, then=references, t=seconds(0, 20), within_s=withins, ease_s=st.just(0.0) | seconds(0.02, 1.0))
 def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
     first: Reference, then: Reference, t: float, within_s: float, ease_s: float
@@ -203,7 +203,7 @@ def test_angle_rate_and_acceleration_are_the_same_on_both_sides_of_a_join(
             assert np.abs(before[order] - after[order]).max() <= tolerance[order]
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(
     first=references,
     changes=st.lists(st.tuples(references, seconds(0, 3), withins), min_size=1, max_size=4),
@@ -225,7 +225,7 @@ def test_what_the_loop_reads_does_not_jump_however_often_the_mind_is_changed(
             assert np.abs(left - right).max() <= tolerance
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(first=references, then=references, t=seconds(0.1, 10), within_s=withins)
 def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_acceleration(
     first: Reference, then: Reference, t: float, within_s: float
@@ -268,7 +268,7 @@ def test_across_a_join_the_attitude_moves_as_the_velocity_says_and_that_as_the_a
 # Arriving
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(first=references, target=holds, t=seconds(0, 10), within_s=withins)
 def test_going_somewhere_ends_there_exactly_and_at_rest(
     first: Reference, target: Hold, t: float, within_s: float
@@ -284,7 +284,7 @@ def test_going_somewhere_ends_there_exactly_and_at_rest(
     assert followed.at(1e4)[0] == pytest.approx(quaternion(np.radians(target.attitude)), abs=8 * EPS)
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(first=references, points=some_points(), t=seconds(0, 10), within_s=withins)
 def test_points_are_passed_each_at_its_time_from_rest_to_rest(
     first: Reference, points: Points, t: float, within_s: float
@@ -323,7 +323,7 @@ def test_between_points_neither_rate_nor_acceleration_jumps(points: Points) -> N
 # The loop's function
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(
     first=references,
     changes=st.lists(st.tuples(references, seconds(0.05, 3), withins), max_size=3),
@@ -425,7 +425,7 @@ polynomial (the least Σ|w| of weights w that give every quartic's value there f
 direction that is fastest at any time is such a quartic."""
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(first=references, target=holds, t=seconds(0, 5), within_s=seconds(0.2, 5.0))
 def test_the_fastest_of_the_samples_is_the_fastest(first: Reference, target: Hold, t: float, within_s: float) -> None:
     """Without roll, where Σ rate² is all; from any state, so from any acceleration."""

@@ -134,7 +134,7 @@ def frames(wire: WireSpec, random: Random, count: int) -> list[bytes]:
     return made
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(wire=wires, reference=st.sampled_from(REFERENCES), seed=st.integers(0, 2**32 - 1))
 def test_a_tick_has_the_bits_of_its_parts_one_after_the_other(wire: WireSpec, reference: Reference, seed: int) -> None:
     """Also after its state has been through JSON, at any tick."""

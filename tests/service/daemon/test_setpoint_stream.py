@@ -33,7 +33,7 @@ def test_a_set_point_that_is_too_far_takes_longer_and_is_never_faster_than_the_l
     assert 0.9 < fastest <= 1.0
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @example(sent=[(1.0, 0), (2.0, 0), (-3.0, 10), (4.0, 10)])
 @given(sent=st.lists(st.tuples(st.floats(-4, 4), st.sampled_from([0, 0, 1, 10, 50])), min_size=1, max_size=8))
 def test_of_set_points_between_two_ticks_the_newest_counts_and_is_taken_up_on_the_way_to_the_last(
@@ -143,7 +143,7 @@ def test_a_new_stream_is_at_rest_until_its_own_first_set_point(streaming: Loop) 
 far = st.tuples(st.just(0.0), st.integers(-65, 65).map(float), st.integers(-180, 180).map(float))
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     sent=st.lists(st.tuples(far, st.integers(1, 400)), min_size=2, max_size=10),
     within_s=st.sampled_from([0.02, 0.2, 1.0]),

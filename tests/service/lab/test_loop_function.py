@@ -109,7 +109,7 @@ def assert_the_same(settings: Settings, loop: Loop | None = None, ticks: int = T
 
 
 @given(CONFIGURATIONS)
-@examples(max_examples=20)
+@examples(max_examples=12)
 def test_frames_and_figures_are_those_of_the_loop_through_frames(chosen: dict[str, Any]) -> None:
     try:
         settings = configured(chosen)

@@ -22,7 +22,7 @@ from aeroloop.service.terminal import tune_table
 from tests.support.in_this_process import InThisProcess
 
 SLOW = load(overrides=["loop.rate_hz=100"])
-OWN = "tests.support.own_laws:"
+OWN = "tests.support.tuned_laws:"
 AT_REST = [
     "loop.rate_hz=100", "plant.kind=rigid_body", "plant.ideal=true", "wire.actuators=3", "reference.kind=hold",
     "law.centre_of_mass=[0, 0, 0]", "plant.rigid_body.centre_of_mass=[0, 0, 0]", 'wire.voltage.bits="cont"',

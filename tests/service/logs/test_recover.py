@@ -164,7 +164,7 @@ def test_one_flipped_bit_in_a_description_costs_no_log_and_changes_no_figure(des
     at = [i for i in range(len(data)) if data.startswith(b'{"protocol":2', i)]
     assert len(at) == 4  # uncompressed, of two roles, at both ends
     chunk = data.index(b"zstd")
-    spots = [place - 120 + rng.randrange(3000) for place in at for _ in range(4)]
+    spots = [place - 120 + rng.randrange(3000) for place in at for _ in range(2)]
     spots += [at[0] - d for d in (2, 4, 60, 100)]
     if "first" in described.name:  # the first chunk has nothing but descriptions
         spots += [chunk + 12 + 9 * i for i in range(4)]
@@ -175,8 +175,8 @@ def test_one_flipped_bit_in_a_description_costs_no_log_and_changes_no_figure(des
         damaged[spot] ^= 1 << rng.randrange(8)
         bent.write_bytes(damaged)
         assert recover(bent, out).lost, spot
-        for path in (bent, out):
-            figures = review(path)
+        damaged_one, recovered = review(bent), review(out)
+        for figures in (damaged_one, recovered):
             assert (figures.z_track, figures.u_total) == (clean.z_track, clean.u_total), spot
-        assert review(bent).damages, spot
+        assert damaged_one.damages, spot
         out.unlink()

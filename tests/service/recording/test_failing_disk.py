@@ -49,7 +49,7 @@ def test_a_full_disk_loses_nothing_wherever_it_was_full(
     decoded, whole = decoded_count([tmp_path / "whole.mcap"]), (tmp_path / "whole.mcap").stat().st_size
     header = _header_size(tmp_path / "whole.mcap")
     refused = 0
-    for room in range(header, whole, (whole - header) // 61):
+    for room in range(header, whole, (whole - header) // 31):
         recording = record(f"{room}.mcap", room)
         assert recording.waiting == []
         path = tmp_path / f"{room}.mcap"
@@ -61,7 +61,7 @@ def test_a_full_disk_loses_nothing_wherever_it_was_full(
             assert [bad for _, bad in recording.reported] == [True, False]
             assert os.strerror(errno.ENOSPC) in recording.reported[0][0]
             assert recording.reported[1][0] == f"recording again to {path}"
-    assert refused > 20
+    assert refused > 10
     assert not list(tmp_path.glob("*-0*.mcap")), "all went into one file each"
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from aeroloop.protocol.transport import publication
 from aeroloop.protocol.transport.publication import CachedPublisher, Delivery
 from aeroloop.service.recording.backlog import MOST_BYTES, MOST_MESSAGES, Backlog
 from aeroloop.service.recording.subscriptions import Subscriptions
@@ -52,8 +53,9 @@ def test_messages_published_while_a_link_is_set_up_do_not_hide_what_was_publishe
 
 
 def test_numbers_that_no_cache_has_are_lost_on_the_network_and_those_that_a_full_ring_dropped_in_the_queue(
-    gathering: Gathering,
+    gathering: Gathering, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(publication, "JOIN_S", 1.0)  # the bare publisher has no cache to answer
     subscriptions = Subscriptions(gathering.join(), waiting=10)
     session = gathering.join()
     cached = CachedPublisher(session, EVENT, per_s=10)

@@ -224,7 +224,9 @@ def block(first: int, count: int) -> Ticks:
     one = np.ones(count)
     times = k, k, one, one, one
     state = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))  # θ̂, and the sign
-    return Ticks(k, *times, upright, upright, *[zeros] * 6, np.full((count, 9), 0.3), state, state)
+    return Ticks(
+        k, *times, upright, upright, zeros, zeros, zeros, zeros, zeros, zeros, np.full((count, 9), 0.3), state, state
+    )
 
 
 def trial(*changes: Change) -> TheoremCheck:

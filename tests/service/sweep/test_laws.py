@@ -16,10 +16,10 @@ from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.sweep.axes import digest_of
-from aeroloop.service.sweep.laws import LAWS, Choice, LawsError, compare
+from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
 
 SLOW = load(overrides=["loop.rate_hz=100"])
-RUNAWAY, RAISING = (f"tests.support.own_laws:{name}" for name in ("Runaway", "Raising"))
+RUNAWAY, RAISING = (f"tests.support.failing_laws:{name}" for name in ("Runaway", "Raising"))
 
 
 def compared(settings: Settings, **given: Any) -> dict[Choice, Settings]:
@@ -85,11 +85,12 @@ def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_
     figures = run_experiment(load_over(SLOW, ["law.kind=pd"]), 3.0)
     for name in ("z_track", "u_total", "max_error_deg", "second_half_error_deg", "command_changes_per_s"):
         assert pd[name] == pytest.approx(getattr(figures, name), rel=1e-4)  # the rule's gains have five digits
-    assert 0 < pd["bits_per_s"] < figures.measurement.bits_per_s + figures.command.bits_per_s
+    always = sum(direction.bits_per_s or 0 for direction in (figures.measurement, figures.command))
+    assert 0 < pd["bits_per_s"] < always
     assert (pd["path"], found["path"]) == ("compiled", "compiled, frames")
     assert runaway["z_track"] is None
     assert "the loop ended after" in runaway["reason"]
-    assert "ZeroDivisionError: by nothing (own_laws.py, line" in raising["reason"]
+    assert "ZeroDivisionError: by nothing (failing_laws.py, line" in raising["reason"]
     margins = {margin["law"]: margin for margin in found["margins"]}
     assert margins["pd"]["delay_ms"] > 0
     assert margins[RUNAWAY]["delay_ms"] is margins[RAISING]["lost_frames"] is None
@@ -122,7 +123,7 @@ def test_a_changed_law_of_ones_own_is_another_configuration(tmp_path: Path, monk
     file = tmp_path / "changing_law.py"
     digests = []
     for gain in (1, 2):
-        file.write_text(f"from tests.support.own_laws import Runaway\nclass Mine(Runaway):\n    gain = {gain}\n")
+        file.write_text(f"from tests.support.failing_laws import Runaway\nclass Mine(Runaway):\n    gain = {gain}\n")
         description = load_over(SLOW, ["law.kind=changing_law:Mine"]).description()
         digests.append(digest_of(description, 1.0))
     assert digests[0] != digests[1]

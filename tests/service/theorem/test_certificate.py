@@ -272,7 +272,7 @@ def test_no_attitude_errs_by_more_than_k_eps_says_and_some_by_nearly_as_much(bit
 def test_the_extremes_of_a_reference_are_those_of_what_the_law_is_given(reference: Reference) -> None:
     bounds, plan, function = extremes(reference), Plan.of(reference), Compiled(reference_function())
     most = np.zeros(6)
-    times, step = np.linspace(0, 6.5 if isinstance(reference, Points) else 140, 20_000, retstep=True)
+    times, step = np.linspace(0, 6.5 if isinstance(reference, Points) else 140, 5000, retstep=True)
     last: np.ndarray[Any, Any] | None = None
     for t in times.tolist():
         i = plan.piece(t)

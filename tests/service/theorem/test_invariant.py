@@ -272,7 +272,7 @@ def test_no_state_of_a_body_with_a_held_roll_is_disturbed_by_more_than_its_bound
 
     most1 = most2 = 0.0
     judged = 0
-    for k in range(1200):
+    for k in range(600):
         if k % 100 == 0:
             theta = _in_ball(rng, p.k_theta)
             damping = (theta[0], theta[1], theta[2])

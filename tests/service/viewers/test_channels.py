@@ -10,6 +10,7 @@ from aeroloop.protocol.messages.models import Description, Event, Loss, Truth
 from aeroloop.protocol.messages.operator import Message, Setpoint
 from aeroloop.protocol.wire.attitude import Quaternion, distance, sent_vector, to_euler
 from aeroloop.service.config import load
+from aeroloop.service.viewers import views
 from aeroloop.service.viewers.channels import Decoder
 from tests.support.decoded import (
     ATTITUDE,
@@ -70,7 +71,7 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
 ) -> None:
     volts = WIRE.voltage.quantizer()
     (command,) = configured().frame(address("command"), frame(WIRE.command, [volts, volts], [sent, -3.0]), NOW)
-    assert said(command) == {
+    assert said(command) == dict.fromkeys(views.Voltages.model_fields) | {
         "voltage_1_v": None,
         "voltage_2_v": shown if shown is None else pytest.approx(shown, abs=1e-4),
         "voltage_3_v": pytest.approx(volts.quantize(-3.0), abs=1e-4),
@@ -80,11 +81,15 @@ def test_a_command_is_shown_in_volts_by_the_motors_own_numbers_with_saturation_o
     }
 
 
-def test_a_body_with_three_motors_and_no_quantizer_shows_all_three() -> None:
-    decoder = configured(None, "wire.actuators=3", "wire.voltage.bits=cont")
-    wire = load(None, ["wire.actuators=3", "wire.voltage.bits=cont"]).wire
-    (shown,) = decoder.frame(address("command"), wire.command.pack(0, [1.5, -24.0, 0.0]), NOW)
-    assert list(said(shown).values()) == [1.5, -24.0, 0.0, False, True, False]
+@pytest.mark.parametrize("actuators", [1, 3, 8])
+def test_any_number_of_motors_without_a_quantizer_is_shown_and_no_more(actuators: int) -> None:
+    overrides = [f"wire.actuators={actuators}", "wire.voltage.bits=cont"]
+    volts = [1.5, -24.0, 0.0, 1.0, 2.0, 3.0, 4.0, 24.0][:actuators]
+    (shown,) = configured(None, *overrides).frame(
+        address("command"), load(None, overrides).wire.command.pack(0, volts), NOW
+    )
+    absent = [None] * (8 - actuators)
+    assert list(said(shown).values()) == [*volts, *absent, *(abs(u) == 24.0 for u in volts), *absent]
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -1,0 +1,151 @@
+"""A plant of one's own behind the loop: any number of motors, replay, and what happens when it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, sin
+from typing import Any
+
+import pytest
+
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.hosts.replay import PlantReplay, why_not
+from aeroloop.plant_emulator.own_plant import OwnPlant, PlantError
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from tests.support.own_plants import Turntable
+from tests.support.plant_stage import Stage
+
+HERE = "tests.support.own_plants"
+TICKS = 60
+
+
+def stage_of(kind: str, wire: WireSpec, own: dict[str, Any], faults: list[str], *, lockstep: bool) -> Stage:
+    """An emulator with a plant of one's own, whose every measurement is answered at once with rising and falling u."""
+    loop = LoopSettings(lockstep=lockstep, realtime="off", trace_s=0.01)
+    count = iter(range(TICKS * 10))
+
+    def answer(stage: Stage, frame: bytes) -> None:
+        counter = wire.measurement.counter(frame)
+        assert counter is not None
+        codes = [round(20 * sin(next(count) / 9 + i)) for i in range(wire.actuators)]
+        stage.wires.deliver(wire.command.pack(counter, codes), stage.endpoint.ticked)
+
+    def between(stage: Stage) -> None:
+        if stage.endpoint.session is None and stage.endpoint.ticked < 0:  # once
+            stage.claim()
+
+    plant = PlantSettings(kind=f"{HERE}:{kind}", own=own, faults=faults)
+    return Stage(loop, wire, plant, between=between, answer=answer)
+
+
+def inner_of(stage: Stage) -> Turntable:
+    emulator = stage.driver
+    assert isinstance(emulator, Emulator)
+    own = emulator._faulty.plant
+    assert isinstance(own, OwnPlant)
+    assert isinstance(own._plant, Turntable)
+    return own._plant
+
+
+@pytest.mark.parametrize(("kind", "actuators"), [("Turntable", 1), ("Octoturntable", 8)])
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_one_motor_or_eight_are_driven_and_replayed_byte_for_byte(kind: str, actuators: int, lockstep: bool) -> None:
+    wire = WireSpec(actuators=actuators)
+    faults = [f"motor{actuators}:stuck@0.02..0.05", "rate.z:noise=0.05@0.03", "attitude:bias=0.1@0.02..0.06"]
+    stage = stage_of(kind, wire, {"inertia": 0.01}, faults, lockstep=lockstep).run(TICKS)
+    assert stage.endpoint.accepted > TICKS / 2
+    emulator = stage.driver
+    assert isinstance(emulator, Emulator)
+    truth = emulator.truth()
+    assert truth is not None
+    assert len(truth.voltages) == actuators
+    assert sum(fault.changed for fault in emulator.fault_statuses()) > 0
+    replay = PlantReplay(stage.loop, wire, PlantSettings(kind=f"{HERE}:{kind}", own={"inertia": 0.01}, faults=faults))
+    for batch in stage.batches:
+        assert batch.header.actuators == actuators
+        assert batch.columns["voltages"].shape[1:] == (actuators,)
+        replay.feed(batch)
+    found = replay.result()
+    assert (found.differ, found.stopped) == (0, None)
+    assert found.ticks > TICKS / 2
+
+
+@pytest.mark.parametrize("method", ["actuate", "advance", "measure"])
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_a_plant_that_fails_trips_is_closed_at_0_v_and_ends_the_loop(method: str, lockstep: bool) -> None:
+    stage = stage_of("Turntable", WireSpec(actuators=1), {"fails_in": method, "fails_after": 30}, [], lockstep=lockstep)
+    with pytest.raises(PlantError, match=f"Turntable failed in {method}"):
+        stage.run(TICKS)
+    assert (stage.endpoint.state, stage.endpoint.trip) == (PlantState.TRIPPED, TripCause.PLANT)
+    (tripped,) = [notice for notice in stage.endpoint.notices if notice.kind == "tripped"]
+    assert f"Turntable failed in {method}(): RuntimeError: the table broke in {method} (own_plants.py" in tripped.text
+    assert tripped.session == "s1"
+    assert (inner_of(stage).closed, inner_of(stage).volts) == (1, (0.0,))
+
+
+def test_a_failed_plant_is_replayed_up_to_its_failure() -> None:
+    own = {"fails_in": "measure", "fails_after": 30}
+    stage = stage_of("Turntable", WireSpec(actuators=1), own, [], lockstep=False)
+    with pytest.raises(PlantError):
+        stage.run(TICKS)
+    results = []
+    for given in (own, own | {"fails_after": 9}):
+        replay = PlantReplay(stage.loop, stage.wire, PlantSettings(kind=f"{HERE}:Turntable", own=given))
+        for batch in stage.batches:
+            replay.feed(batch)
+        results.append(replay.result())
+    assert (results[0].differ, results[0].stopped) == (0, None)
+    assert "Turntable failed in measure()" in (results[1].stopped or "")
+
+
+def test_nan_trips_by_the_limit_of_invalid_values() -> None:
+    stage = stage_of("Turntable", WireSpec(actuators=1), {"gives": "nan"}, [], lockstep=False).run(100)
+    assert stage.endpoint.trip is TripCause.SENSORS
+
+
+@pytest.mark.parametrize(
+    ("kind", "wire", "faults", "line"),
+    [
+        ("Octoturntable", WireSpec(), [], "wire.actuators is 2, but the plant has 8 actuators"),
+        ("Turntable", WireSpec(actuators=1), ["motor2:off"], "the plant has no motor2, but motor1"),
+    ],
+)
+def test_a_plant_that_does_not_fit_is_refused_and_closed(
+    kind: str, wire: WireSpec, faults: list[str], line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[str] = []
+    monkeypatch.setattr(Turntable, "close", lambda self: closed.append(type(self).__name__))
+    with pytest.raises(ValueError, match=line):
+        stage_of(kind, wire, {}, faults, lockstep=False)
+    assert closed == [kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [("Hardware", "Hardware (plant.kind) does not state that it is `repeatable`"), ("Gone", "has no Gone")],
+)
+def test_a_machine_is_not_moved_by_a_replay(kind: str, why: str) -> None:
+    plant = PlantSettings(kind=f"{HERE}:{kind}")
+    assert why in (why_not(plant) or "")
+    assert why_not(PlantSettings(kind=f"{HERE}:Turntable")) is None
+    with pytest.raises(ValueError, match=r"plant\.kind"):
+        PlantReplay(LoopSettings(), WireSpec(), plant)
+
+
+def test_a_plant_that_paces_the_loop_raises_the_tick_by_what_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Turntable, "paces", True)
+    advance: Callable[[Turntable], None] = Turntable.advance
+
+    def late(self: Turntable) -> None:
+        advance(self)
+        self.passed = 3 if self._ticks == 10 else 1
+
+    monkeypatch.setattr(Turntable, "advance", late)
+    stage = stage_of("Turntable", WireSpec(actuators=1), {}, [], lockstep=False)
+    stage.run(TICKS)
+    assert stage.skipped == 2
+    assert inner_of(stage)._angle != 0
+    assert cos(inner_of(stage)._angle) < 1

@@ -1,0 +1,185 @@
+"""A user's law in the controller: as expressions and in Python, with its state and gains, and where it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isnan
+from pathlib import Path
+from random import Random
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.config import Settings, load
+from aeroloop.service.control.controller import Controller, ControllerSnapshot
+from aeroloop.service.lab.experiment import experiment, through_frames
+from tests.service.control.test_tick import frames
+from tests.service.logs.test_batch import TICKS, WIRES, Run
+from tests.support import own_laws
+from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON, Failure
+
+PERIOD = 0.002
+CONTINUOUS = WireSpec(actuators=3).with_bits(None, None)
+
+
+def configured(kind: str, *overrides: str) -> Settings:
+    return load(overrides=[f"law.kind={kind}", *overrides])
+
+
+def controller(kind: str, *overrides: str, wire: WireSpec = CONTINUOUS) -> Controller:
+    return Controller(wire, configured(kind, *overrides).law, Sinusoid(), PERIOD)
+
+
+def still(wire: WireSpec, k: int) -> bytes:
+    """The measurement of tick k: at rest and level."""
+    codes = [signal.quantizer().encode(0.0) for signal in (wire.attitude, wire.rate) for _ in range(3)]
+    return wire.measurement.pack(k % wire.measurement.counters, codes)
+
+
+@pytest.mark.parametrize("kind", [EXPRESSIONS, PYTHON])
+def test_a_law_gets_what_is_received_and_gives_what_is_sent(kind: str) -> None:
+    """A body that has yawed, by hand: e = (cos, 0, 0, sin) of half the angle, and the rate is that of the body."""
+    one = Controller(CONTINUOUS, configured(kind, "law.kp=10", "law.ki=4").law, Hold(attitude=(0.0, 0.0, 0.0)), PERIOD)
+    half, rate = 0.1, (0.01, -0.02, 0.03)
+    codes = [*(CONTINUOUS.attitude.quantizer().encode(x) for x in (0.0, 0.0, np.sin(half)))]
+    codes += [CONTINUOUS.rate.quantizer().encode(x) for x in rate]
+    sums = 0.0
+    for k in range(5):
+        frame = one.tick(CONTINUOUS.measurement.pack(k, codes), k)
+        sums += PERIOD * np.sin(half)
+        expected = -5.0 * rate[0], -6.0 * rate[1], -10 * np.sin(half) - 7.0 * rate[2] - 4 * sums
+        assert one.voltages == pytest.approx(expected, rel=1e-14)  # a dozen operations
+        assert frame is not None
+        read = CONTINUOUS.command.unpack(frame)
+        assert read is not None
+        assert (read[0], list(read[1])) == (k, one.voltages)
+    assert one.law_state == {"sum": (0.0, 0.0, pytest.approx(sums)), "sign": (1.0,)}
+
+
+@settings(max_examples=15)
+@given(
+    bits=st.sampled_from([None, 6, 12]),
+    actuators=st.sampled_from([2, 3]),
+    pair=st.sampled_from([(EXPRESSIONS, PYTHON), (f"{HERE}:Bare", f"{HERE}:BarePython")]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_law_in_python_has_the_bytes_of_the_same_law_of_expressions(
+    bits: int | None, actuators: int, pair: tuple[str, str], seed: int
+) -> None:
+    """Also with gains that change, and where its state goes through JSON into another controller."""
+    random = Random(seed)
+    wire = WireSpec(actuators=actuators, voltage=SignalSpec(bits=bits, limit=24.0))
+    both = [controller(kind, wire=wire) for kind in pair]
+    for k, frame in enumerate(frames(wire, random, 80)):
+        if random.random() < 0.1 and both[0].gains.named:
+            given = Gains(kp=random.uniform(0, 20)) if random.random() < 0.5 else Gains(kd=(1.0, 2.0, 3.0), ki=0.5)
+            for one in both:
+                one.set_gains(given)
+        if random.random() < 0.1:
+            state = ControllerSnapshot.model_validate_json(both[0].state.model_dump_json())
+            fresh = controller(pair[1], wire=wire)
+            fresh.set_gains(both[0].gains)
+            fresh.restore(state)
+            both[1] = fresh
+        expressed, plain = (one.tick(frame, k) for one in both)
+        assert expressed == plain
+        assert both[0].state == both[1].state
+        assert both[0].gains == both[1].gains
+
+
+def test_a_state_that_is_not_the_laws_is_not_taken() -> None:
+    one = controller(EXPRESSIONS)
+    one.restore(ControllerSnapshot(law={"sum": (1.0,), "sign": (-1.0,), "damping_estimate": (1.0, 2.0, 3.0)}))
+    assert one.law_state == {"sum": (0.0, 0.0, 0.0), "sign": (-1.0,)}
+
+
+# What reads logs
+
+
+class OwnRun(Run):
+    """Of a user's law, with changes of its gains."""
+
+    def __init__(self, kind: str, wire: str, seed: int) -> None:
+        super().__init__(wire, seed, f"law.kind={kind}")
+
+    def gains(self, rng: np.random.Generator) -> Gains:
+        if not self.controller(Controller, None).gains.named:
+            return Gains()
+        return Gains(kp=rng.uniform(0, 20), kd=rng.uniform(0, 9, 3).tolist() if rng.random() < 0.5 else None)
+
+
+@settings(max_examples=12)
+@given(
+    kind=st.sampled_from([EXPRESSIONS, PYTHON, f"{HERE}:Bare", f"{HERE}:BarePython"]),
+    wire=st.sampled_from(sorted(WIRES)),
+    seed=st.integers(0, 2**32 - 1),
+    cuts=st.lists(st.integers(0, TICKS), max_size=3).map(sorted),
+    restored=st.lists(st.booleans(), min_size=3, max_size=3),
+)
+def test_blocks_have_the_bits_of_the_loop_with_any_law(
+    kind: str, wire: str, seed: int, cuts: list[int], restored: list[bool]
+) -> None:
+    OwnRun(kind, wire, seed).check(cuts, restored)
+
+
+# Experiments
+
+
+@pytest.mark.parametrize("kind", [EXPRESSIONS, f"{HERE}:Bare"])
+def test_an_experiment_with_expressions_is_compiled_and_has_the_figures_of_the_frames(kind: str) -> None:
+    own = configured(kind)
+    found = experiment(own, 3.0)
+    assert found.path == "compiled"
+    commands: list[bytes] = []
+    assert found.figures == through_frames(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
+    assert found.course is not None
+    assert [tuple(row) for row in found.course.commanded.tolist()] == [_codes(own, frame) for frame in commands]
+    assert np.abs(found.course.voltages).max() > 1
+
+
+def _codes(own: Settings, frame: bytes) -> Sequence[float]:
+    read = own.wire.command.unpack(frame)
+    assert read is not None
+    return tuple(read[1])
+
+
+def test_an_experiment_with_python_goes_through_frames_and_has_the_same_figures() -> None:
+    found = experiment(configured(PYTHON), 1.0)
+    assert (found.path, found.course) == ("frames", None)
+    assert found.figures == experiment(configured(EXPRESSIONS), 1.0).figures
+
+
+# Laws that fail
+
+WHY = {
+    "raises": "law tests.support.own_laws:Failing: RuntimeError: the estimator diverged (own_laws.py, line {line})",
+    "gives NaN": "law tests.support.own_laws:Failing gave no number",
+    "gives one voltage": "it gives 1 voltages for 3 actuators",
+    "another shape": "its state after a tick is not that of `reset`: ticks",
+    "another name": "its state after a tick is not that of `reset`: ticks",
+    "gives no number": "ValueError: could not convert string to float: 'much'",
+}
+
+
+@pytest.mark.parametrize("failure", get_args(Failure))
+def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failure: Failure) -> None:
+    lines = Path(own_laws.__file__).read_text().splitlines()
+    line = 1 + next(i for i, text in enumerate(lines) if "raise RuntimeError" in text)
+    one = controller(f"{HERE}:Failing", f"law.failure={failure}")
+    for k in range(6):
+        frame = one.tick(still(CONTINUOUS, k), k)
+        assert frame is not None
+        read = CONTINUOUS.command.unpack(frame)
+        assert read is not None
+        assert read[0] == k
+        # What raises has not counted the tick, so it is there again.
+        assert [isnan(u) for u in read[1]] == [k == 3 if failure == "gives NaN" else k >= 3] * 3
+        assert (one.fault is not None) == (k >= 3)
+    assert one.fault is not None
+    assert WHY[failure].format(line=line) in one.fault
+    assert len(one.fault.splitlines()) == 1

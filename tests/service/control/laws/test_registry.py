@@ -1,0 +1,143 @@
+"""Which law a configuration names: found, its settings checked, its gains bounded; and what is said where it is not."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from aeroloop.protocol import plugins
+from aeroloop.protocol.messages.operator import Gains
+from aeroloop.protocol.plugins import PluginError
+from aeroloop.service.config import load
+from aeroloop.service.control.controller import Controller
+from aeroloop.service.control.laws.adaptive import Adaptive
+from aeroloop.service.control.laws.registry import LawError, gains_of, law_of, own_settings, with_gains
+from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON, Expressions
+
+
+def law(kind: str, *overrides: str) -> Any:
+    settings = load(overrides=[f"law.kind={kind}", *overrides])
+    return law_of(settings.law, 0.002, settings.wire.actuators)
+
+
+def refused(kind: str, *overrides: str) -> str:
+    """The one line that a user gets."""
+    with pytest.raises((LawError, PluginError)) as error:
+        law(kind, *overrides)
+    (line,) = str(error.value).splitlines()
+    return line
+
+
+def test_a_users_law_has_its_own_settings_checked_by_its_own_model() -> None:
+    found = law(EXPRESSIONS, "law.kp=7", "law.mass=2")
+    assert type(found) is Expressions
+    assert (found.settings.kp, found.settings.kd, found.settings.mass) == (7.0, (5.0, 6.0, 7.0), 2.0)
+    assert gains_of(found.settings) == Gains(kp=7, kd=(5, 6, 7), ki=3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "why"),
+    [
+        (["law.kpp=1"], "did you mean law.kp"),
+        (["law.kp=-1"], "law.kp"),
+        (["law.kp=20.5"], "law.kp"),
+        (["law.kd=[1, 2]"], "law.kd"),
+        (["law.C1=[1, 1, 1]"], "law.C1"),
+    ],
+)
+def test_settings_that_are_not_the_laws_are_named_with_their_key(overrides: list[str], why: str) -> None:
+    assert why in refused(EXPRESSIONS, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("adaptve", "law.kind = 'adaptve' is not known: it is one of adaptive, "),
+        (f"{HERE}:Pd", f"{HERE} has no Pd; its classes are"),
+        (f"{HERE}:NoLaw", "does not derive from aeroloop.Law"),
+        (f"{HERE}:not_even_a_class", "does not derive from aeroloop.Law"),
+        (f"{HERE}:NoSettings", "has no Settings that derive from aeroloop.LawSettings"),
+        (f"{HERE}:", "does not name a class"),
+        (":PD", "does not name a class"),
+        ("tests.support.their_laws:PD", "there is no module tests.support.their_laws here"),
+        ("their_lab.laws:PD", "there is no module their_lab.laws here; install it, or add its folder to PYTHONPATH"),
+        (f"{HERE}:Picky", f"law {HERE}:Picky: ValueError: flies with eight motors only (own_laws.py, line "),
+    ],
+)
+def test_a_law_that_is_not_there_or_is_none_is_refused_in_one_line(kind: str, why: str) -> None:
+    assert why in refused(kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("WrongWidth", "it gives 1 voltages for 2 actuators"),
+        ("WrongState", "its state after a tick is not that of `initial`: sum"),
+    ],
+)
+def test_expressions_of_another_shape_are_refused_before_the_first_tick(kind: str, why: str) -> None:
+    settings = load(overrides=[f"law.kind={HERE}:{kind}"])
+    with pytest.raises(LawError) as error:
+        Controller(settings.wire, settings.law, settings.reference, 0.002)
+    assert f"law {HERE}:{kind}: ValueError: {why}" in str(error.value)
+
+
+def test_gains_are_bounded_by_the_law_and_it_has_no_others() -> None:
+    section = load(overrides=[f"law.kind={PYTHON}"]).law
+    assert gains_of(with_gains(section, Gains(kp=0, kd=None))) == Gains(kp=0, kd=(5, 6, 7), ki=3)
+    for gains, why in (
+        (Gains(kq=1), "has no gain kq; it has kp, kd, ki"),
+        (Gains(mass=1), "has no gain mass"),
+        (Gains(kp=21), "law.kp"),
+        (Gains(kp=(1, 1)), "law.kp"),
+        (Gains(kd=1), "law.kd"),
+        (Gains(kd=(1, 1, -1)), "law.kd"),
+    ):
+        with pytest.raises(LawError, match=why):
+            with_gains(section, gains)
+    with pytest.raises(LawError, match="none that may change while it runs"):
+        with_gains(load(overrides=[f"law.kind={HERE}:Bare"]).law, Gains(kp=1))
+    paper = load().law
+    for name, diagonal in (("C1", (0.3, 0.0, 0.3)), ("C2", (0.3, 0.3, -1e-9)), ("Gamma", (20.001, 1.0, 1.0))):
+        with pytest.raises(LawError, match=f"law.{name}.*every element must be positive and at most 20"):
+            with_gains(paper, Gains.model_validate({name: diagonal}))
+
+
+# Where classes are found
+
+
+def test_an_entry_point_of_the_group_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def installed(*, group: str) -> list[EntryPoint]:
+        return [EntryPoint("ours", EXPRESSIONS, group)] if group == "aeroloop.laws" else []
+
+    monkeypatch.setattr(plugins, "entry_points", installed)
+    assert type(law("ours")) is Expressions
+    assert ", ours, " in refused("theirs")
+    assert type(law("adaptive")) is Adaptive
+    assert own_settings(load(overrides=["law.kind=ours"]).law).kind == "ours"
+
+
+SOURCE = """from aeroloop.service.control.laws.interface import LawSettings, PythonLaw
+class Lab(PythonLaw[LawSettings]):
+    Settings = LawSettings
+    def reset(self): self.state = {}
+    def step(self, now): return [0.0, 0.0]
+"""
+
+
+def test_a_module_of_the_current_folder_is_found_and_its_faults_are_in_its_own_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [path for path in __import__("sys").path if path])
+    (tmp_path / "lab_lab.py").write_text(SOURCE)
+    assert type(law("lab_lab:Lab")).__name__ == "Lab"
+    (tmp_path / "lab_raises.py").write_text("\n\nraise OSError('no licence')\n")
+    assert "its module raised OSError: no licence (lab_raises.py, line 3)" in refused("lab_raises:Lab")
+    (tmp_path / "lab_syntax.py").write_text("x = (\n")
+    assert "SyntaxError: '(' was never closed (lab_syntax.py, line 1)" in refused("lab_syntax:Lab")
+    (tmp_path / "lab_needs.py").write_text("import lab_not_installed\n")
+    assert "needs the module lab_not_installed, which is not installed here" in refused("lab_needs:Lab")
