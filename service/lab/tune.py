@@ -117,6 +117,7 @@ class Tuning(BaseModel):
     interrupted: bool
     path: str = Field(description=PATH)
     worse: str | None = Field(description="in what the held-out set is worse than before; null where it is not")
+    exceeded: list[str] = Field(description="limits that the gains after exceed in the held-out set")
 
 
 class Plan(NamedTuple):
@@ -225,6 +226,11 @@ def tune(settings: Settings, plan: Plan, workers: Workers, progress: Progress | 
         interrupted=interrupted,
         path=paths(ran.path for rans in search.found.values() for ran in rans),
         worse=_worse(before.held_out, after.held_out),
+        exceeded=[
+            name
+            for name, limit in search.limits
+            if limit is not None and (getattr(after.held_out, name) or 0.0) > limit
+        ],
     )
 
 

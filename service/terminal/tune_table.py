@@ -80,6 +80,8 @@ def _gains(tuning: Tuning) -> Table:
 
 
 def _notes(tuning: Tuning) -> Iterator[str]:
+    if exceeded := tuning.exceeded:
+        yield f"The gains after exceed a limit in the held-out set: {', '.join(exceeded)}."
     yield (
         f"cost = mean of z_track + {tuning.weight:g} · u_total; gains with which a run trips or exceeds a limit rank "
         "behind all others. Error, saturation and changes are the largest of all runs. Training: "

@@ -91,6 +91,7 @@ def test_a_search_ends_at_the_bounds_of_the_settings_and_at_the_limits_of_its_co
     assert limited.gains["offset"] == pytest.approx(2.5, rel=1e-2)
     assert limited.training.changes_per_s is not None
     assert limited.training.changes_per_s <= 250
+    assert limited.training.changes_per_s == limited.held_out.changes_per_s
     assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * tune.MORE
 
 
@@ -264,7 +265,7 @@ def test_gains_that_are_worse_in_what_is_held_out_are_named_so_and_exit_1(
 ) -> None:
     def runs(_config: str, law: LawValues, cases: Sequence[Case], _duration_s: float) -> list[Ran]:
         """Seed 0 likes 3, and the others do not."""
-        return [optimum(law["offset"] if case.seed == 0 else 3.4 - law["offset"]) for case in cases]
+        return [optimum(law["offset"] if case.seed == 0 else 3.4 - law["offset"]) for case in cases]  # 0.5: 2.9
 
     monkeypatch.setattr(tune, "run_cases", runs)
     monkeypatch.setattr(tune, "survives", lambda *_: None)
@@ -274,6 +275,21 @@ def test_gains_that_are_worse_in_what_is_held_out_are_named_so_and_exit_1(
     assert printed([*AT_REST, f"law.kind={OWN}Offset"], *words) == 1
     assert "Not to be used: in the held-out set the cost rises from 0.011 to " in capsys.readouterr().out
     assert out.read_text().startswith("# Not to be used")
+
+
+def test_a_limit_that_is_exceeded_in_what_is_held_out_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def runs(_config: str, law: LawValues, cases: Sequence[Case], _duration_s: float) -> list[Ran]:
+        ran = optimum(law["offset"])
+        return [ran._replace(changes_per_s=(1 + case.seed) * ran.changes_per_s) for case in cases]
+
+    monkeypatch.setattr(tune, "run_cases", runs)
+    monkeypatch.setattr(tune, "survives", lambda *_: None)
+    result = found(own("Offset"), FEW._replace(max_chatter=500.0))
+    assert (result.exceeded, result.worse) == (["changes_per_s"], None)
+    tune_table.tune_table(result)
+    assert "exceed a limit in the held-out set: changes_per_s" in capsys.readouterr().out
 
 
 def test_without_scipy_one_line_names_the_extra(
