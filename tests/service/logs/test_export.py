@@ -334,7 +334,11 @@ def test_without_a_name_the_new_file_has_the_logs(log: Path, capfd: pytest.Captu
 @pytest.mark.parametrize(("actuators", "numbers"), [(1, "1"), (2, "23"), (3, "123"), (8, "12345678")])
 def test_the_table_and_the_review_have_a_column_for_each_motor_by_its_number(actuators: int, numbers: str) -> None:
     wire = WireSpec(actuators=actuators)
-    names = {column.name for group in groups(wire, 0.002, law_of(AdaptiveSettings(), 0.002, actuators)) for column in group.columns}
+    names = {
+        column.name
+        for group in groups(wire, 0.002, law_of(AdaptiveSettings(), 0.002, actuators))
+        for column in group.columns
+    }
     assert {name for name in names if name.startswith("voltage_")} == {f"voltage_{i}_V" for i in numbers}
     drawn = [column.label for column in columns_of(load().model_copy(update={"wire": wire})) if column.group == "input"]
     assert drawn == [f"u{'₁₂₃₄₅₆₇₈'[int(i) - 1]}" for i in numbers]
