@@ -18,16 +18,25 @@ ROOT = Path(__file__).parent.parent
 
 
 def python_blocks() -> list[str]:
-    """Python in the README: the experiment in three lines, and the test with `hil`."""
+    """Python in the README: the experiment in three lines, a law, and the test with `hil`."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     return [block.split("```")[0] for block in text.split("```python\n")[1:]]
 
 
 def test_the_python_example_prints_what_the_experiment_gives(capfd: pytest.CaptureFixture[str]) -> None:
-    (example, _) = python_blocks()
+    (example, _, _) = python_blocks()
     exec(compile(example, "README.md", "exec"), {})  # noqa: S102  # our own text
     settings = load(overrides=["wire.voltage.bits=8"])
     assert capfd.readouterr().out == f"{run_experiment(settings, 10).z_track}\n"
+
+
+def test_the_law_in_the_readme_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (_, law, _) = python_blocks()
+    (tmp_path / "my_laws.py").write_text(law)
+    monkeypatch.syspath_prepend(tmp_path)
+    figures = run_experiment(load(overrides=["law.kind=my_laws:Mine"]), 10)
+    assert figures.max_error_deg is not None
+    assert figures.max_error_deg < 10
 
 
 def test_the_table_of_the_bench_has_every_item() -> None:
@@ -37,7 +46,7 @@ def test_the_table_of_the_bench_has_every_item() -> None:
 
 @pytest.mark.processes
 def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None:
-    (_, example) = python_blocks()
+    (_, _, example) = python_blocks()
     (tmp_path / "test_example.py").write_text(example)
     command = [sys.executable, "-m", "pytest", "-q", "test_example.py", "--hil-lockstep"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
@@ -46,7 +55,8 @@ def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_example_configuration_makes_a_loop_that_tracks(path: Path) -> None:
+def test_every_example_configuration_makes_a_loop_that_tracks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)  # own_plant.py stands beside its configuration
     settings = load(path)
     if settings.plant.kind == "mujoco":
         pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
