@@ -46,7 +46,8 @@ def test_the_hil_example_runs_as_it_stands_in_the_readme(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_example_configuration_makes_a_loop_that_tracks(path: Path) -> None:
+def test_every_example_configuration_makes_a_loop_that_tracks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)  # as the current folder is for the command
     settings = load(path)
     if settings.plant.kind == "mujoco":
         pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
