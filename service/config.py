@@ -15,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, Validati
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
-from aeroloop.protocol.transport.can_format import CanError, CanSettings, carried_bytes
+from aeroloop.protocol.transport.can_format import CanSettings
 from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
@@ -112,16 +112,6 @@ class Settings(VehicleAddress):
             f"wire.counter_bits = {wire.counter_bits} counts {wire.freshness_ns(period_ns) * 1e-6:g} ms, less than "
             f"twice {name}, which is {patience_s * 1e3:g} ms: {', or '.join(ways)}"
         )
-
-    @model_validator(mode="after")
-    def _frames_fit_the_bus(self) -> Settings:
-        if self.plant.via == "can":
-            try:
-                for frame in (self.wire.measurement, self.wire.command):
-                    carried_bytes(frame.size)
-            except CanError as error:
-                raise ValueError(str(error)) from None
-        return self
 
     def description(self) -> dict[str, Any]:
         """The effective configuration, for a role's description."""

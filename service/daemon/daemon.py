@@ -408,7 +408,7 @@ class Daemon:
                 role=self._role.role,
                 state=self._machine.state,
                 session=self._claims.session,
-                cause=self._gate.blocks,
+                cause=self._lost if self._machine.state is State.FAULTED else self._gate.blocks,
                 uptime_s=self._role.uptime_s,
                 ticks=self._ticks,
                 rate_hz=(self._ticks - self._status_ticks) / (now - self._status_time),

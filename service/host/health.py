@@ -55,7 +55,8 @@ def _of_role(vehicle: str, role: str, status: Status) -> Iterator[Trouble]:
     if status.state == PlantState.TRIPPED:
         yield Trouble("tripped", vehicle, role, f"{name} tripped: {status.cause}; `aeroloop op arm` arms it")
     if status.state == ControllerState.FAULTED:
-        yield Trouble("faulted", vehicle, role, f"{name} faulted; `aeroloop op arm` lets it claim again")
+        why = f": {status.cause}" if status.cause else ""
+        yield Trouble("faulted", vehicle, role, f"{name} faulted{why}; `aeroloop op arm` lets it claim again")
     if status.state == NOT_RECORDING:
         yield Trouble("not recording", vehicle, role, f"{name} records nothing: {status.cause}")
     period = status.timing.recent_period if status.timing else None

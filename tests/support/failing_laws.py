@@ -31,4 +31,19 @@ class Raising(PythonLaw[LawSettings]):
         self.state["ticks"] = now.state["ticks"] + 1
         if now.state["ticks"] > 2:
             raise ZeroDivisionError("by nothing")
-        return [0.0] * self.actuators
+        return [1.0] * self.actuators
+
+
+class Hanging(PythonLaw[LawSettings]):
+    """Never ends its fourth tick."""
+
+    Settings = LawSettings
+
+    def reset(self) -> None:
+        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
+
+    def step(self, now: Now[Any]) -> Any:
+        self.state["ticks"] = now.state["ticks"] + 1
+        while now.state["ticks"] > 2:
+            pass
+        return [1.0] * self.actuators

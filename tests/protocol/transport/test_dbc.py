@@ -229,7 +229,7 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
 @given(spec=specs, data=st.data())
 def test_any_codes_of_any_wire_decode(spec: WireSpec, data: st.DataObject) -> None:
     if spec.command.size > 64:  # eight voltages of 64 bits
-        with pytest.raises(CanError, match="65 bytes does not fit into CAN FD's 64"):
+        with pytest.raises(CanError, match=r"a frame of 6\d bytes does not fit into CAN FD's 64"):
             frames(spec)
         return
     for message, layout, of in frames(spec):
