@@ -168,11 +168,16 @@ def certify(
                 draw_margins(found, part)
         return
     from aeroloop.service.lab.attack import largest_norm
-    from aeroloop.service.terminal.certificate_table import certificate_table
-    from aeroloop.service.theorem.certificate import certify
+    from aeroloop.service.terminal.certificate_table import certificate_table, own_certificate
+    from aeroloop.service.theorem.any_law import OwnCertificate, certify_any
 
     with guarded():
-        result = certify(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
+        result = certify_any(settings, disturbance=disturbance, attitude_error_deg=attitude_error, late_s=late)
+    if isinstance(result, OwnCertificate):
+        if runs:
+            fail("--attack searches for runs against the paper's theorem, not against a certificate of your own", 2)
+        show(result, json, own_certificate)
+        raise typer.Exit(0 if result.holds else 1)
     if runs:
         largest = largest_norm(_attacked(settings, runs, disturbance=disturbance or 0.0, json=json))
         result = result.model_copy(update={"largest_found": largest})

@@ -17,16 +17,15 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from pydantic import BaseModel
-
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import EventKind
 from aeroloop.protocol.messages.operator import Gains, Reference
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.service.config import Settings
-from aeroloop.service.control.laws.registry import law_class, with_gains
-from aeroloop.service.theorem.certificate import Certificate, certify
-from aeroloop.service.theorem.configured import NoTheoremError, with_theorem
+from aeroloop.service.control.laws.registry import with_gains
+from aeroloop.service.theorem.any_law import OwnCertificate, certify_any
+from aeroloop.service.theorem.certificate import Certificate
+from aeroloop.service.theorem.configured import NoTheoremError
 from aeroloop.service.theorem.extremes import BoundlessError
 
 KEPT: Final = 8
@@ -40,13 +39,6 @@ GIVE_WAY_S: Final = 1e-4
 
 class UncertifiedError(AeroloopError):
     """A change after which the theorem would not hold, where it must; one line with the reason and the remedies."""
-
-
-class OwnCertificate(BaseModel, extra="allow"):
-    """What a user's law says is proven; see `Law.certify`."""
-
-    holds: bool
-    verdict: str
 
 
 class Verdict(NamedTuple):
@@ -105,7 +97,7 @@ class CertificateGate:
         try:
             with _giving_way():
                 changed = self._settings.model_copy(update={"law": law, "reference": reference})
-                verdict = Verdict.of(_certify(changed, seek_remedies=self.required))
+                verdict = Verdict.of(certify_any(changed, seek_remedies=self.required))
         except NoTheoremError as error:
             verdict = Verdict(None, str(error))
         except BoundlessError as error:
@@ -192,11 +184,3 @@ def _giving_way() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(interval)
-
-
-def _certify(settings: Settings, *, seek_remedies: bool) -> Certificate | OwnCertificate:
-    """Raises NoTheoremError where the law has none, BoundlessError where the reference has no bounds."""
-    own = law_class(settings.law).certify(settings)
-    if own is None:
-        return certify(with_theorem(settings), seek_remedies=seek_remedies)
-    return OwnCertificate.model_validate(own)

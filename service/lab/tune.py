@@ -29,8 +29,8 @@ from aeroloop.service.lab.experiment import PATH, paths
 from aeroloop.service.lab.law_margins import PUSHED_S, survives
 from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, run_cases, with_case, with_law
 from aeroloop.service.lab.workers import Workers
-from aeroloop.service.theorem.certificate import certify
-from aeroloop.service.theorem.configured import NoTheoremError, with_theorem
+from aeroloop.service.theorem.any_law import certify_any
+from aeroloop.service.theorem.configured import NoTheoremError
 from aeroloop.service.theorem.extremes import BoundlessError
 
 DURATION_S: Final = 10.0
@@ -491,10 +491,7 @@ def _worse(before: Summary, after: Summary) -> str | None:
 
 def verdict(settings: Settings) -> str:
     """The verdict of the configuration's certificate, or why its law has none."""
-    own = law_class(settings.law).certify(settings)
-    if own is not None:
-        return str(own.get("verdict"))
     try:
-        return certify(with_theorem(settings), seek_remedies=False).verdict
+        return certify_any(settings, seek_remedies=False).verdict
     except (NoTheoremError, BoundlessError) as error:
         return str(error)

@@ -10,6 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from aeroloop.service.terminal.console import Console
+from aeroloop.service.terminal.display import labelled
+from aeroloop.service.theorem.any_law import OwnCertificate
 from aeroloop.service.theorem.certificate import Certificate
 
 DECIDING: Final = (
@@ -38,6 +40,16 @@ def certificate_table(certificate: Certificate, *, verbose: bool = False) -> Non
     console.print(_terms(certificate, None if verbose else DECIDING))
     if not verbose:
         console.print(Text(f"\n--verbose prints all {len(certificate.terms)} terms, with their equations."))
+
+
+def own_certificate(certificate: OwnCertificate) -> None:
+    """Print what a user's law says is proven."""
+    console, table = Console(), labelled()
+    console.print(Text(certificate.verdict, style="bold green" if certificate.holds else "bold red"))
+    for name, value in (certificate.model_extra or {}).items():
+        table.add_row(name, Text(str(value)))
+    if table.row_count:
+        console.print(table)
 
 
 def _bounds(certificate: Certificate) -> Table:
