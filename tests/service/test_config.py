@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 from aeroloop.protocol.messages.operator import Points
 from aeroloop.protocol.wording import Shapes, words
 from aeroloop.service.config import ENV_PREFIX, ConfigError, Settings, from_description, load
+from aeroloop.service.config_sources import BODY
+from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.logs.replay import EndReplay, replay
 from tests.support.hostile import mutated
@@ -233,3 +235,12 @@ def test_a_mutated_configuration_is_loaded_or_refused_in_one_line(
     except ConfigError as error:
         said = str(error)
     assert len(said.splitlines()) <= 1
+
+
+def test_another_law_keeps_the_body_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text("[law]\nmass = 2.0\nC1 = [0.5, 0.5, 0.5]\n")
+    law = load(file, ["law.kind=pd"]).law
+    assert (law.kind, law.mass, law.inertia) == ("pd", 2.0, load().law.inertia)
+    assert not hasattr(law, "C1")
+    assert set(BODY) == set(LawSettings.model_fields) - {"kind"}

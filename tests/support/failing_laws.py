@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -46,4 +47,19 @@ class Hanging(PythonLaw[LawSettings]):
         self.state["ticks"] = now.state["ticks"] + 1
         while now.state["ticks"] > 2:
             pass
+        return [1.0] * self.actuators
+
+
+class Slow(PythonLaw[LawSettings]):
+    """Takes 0.3 s for its fourth tick."""
+
+    Settings = LawSettings
+
+    def reset(self) -> None:
+        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
+
+    def step(self, now: Now[Any]) -> Any:
+        self.state["ticks"] = now.state["ticks"] + 1
+        if now.state["ticks"] == 3:
+            time.sleep(0.3)
         return [1.0] * self.actuators

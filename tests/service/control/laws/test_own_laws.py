@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from math import isnan
 from pathlib import Path
@@ -18,6 +19,7 @@ from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
 from aeroloop.service.lab.experiment import experiment, through_frames
+from aeroloop.service.logs.batch import BatchController
 from tests.service.control.test_tick import frames
 from tests.service.logs.test_batch import TICKS, WIRES, Run
 from tests.support import own_laws
@@ -183,3 +185,22 @@ def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failu
     assert one.fault is not None
     assert WHY[failure].format(line=line) in one.fault
     assert len(one.fault.splitlines()) == 1
+
+
+def test_ticks_that_were_not_computed_do_not_run_a_law_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law that hung once hangs whenever it is run: a reader of its log needs the errors, and no voltages."""
+    settings = load(overrides=[f"law.kind={PYTHON}"])
+    given = settings.wire, settings.law, settings.reference, settings.loop.period
+    loop, beside = BatchController(*given), BatchController(*given)
+    k, codes = np.arange(5), np.full((5, 6), 3.0)
+    whole = loop.compute_all(k, codes, deque())
+
+    def hang(*_: object) -> None:
+        raise AssertionError("the law was run")
+
+    monkeypatch.setattr(own_laws.Python, "step", hang)
+    beside.follow(BatchController(*given))
+    found = beside.compute_all(k, codes, deque())
+    assert np.isnan(found.voltages).all()
+    for name in ("attitude", "desired", "rate", "attitude_error", "rate_error"):
+        assert (getattr(found, name) == getattr(whole, name)).all()
