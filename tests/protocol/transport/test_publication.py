@@ -133,7 +133,10 @@ def sixth(network: Gathering, session: zenoh.Session) -> tuple[CachedPublisher, 
     eventually("the link", lambda: bool(list(session.info.peers_zid())))
     time.sleep(0.2)  # for the declaration to cross it
     publisher.put(payload(5))
-    return publisher, publication.read_sample(subscriber.recv())
+    # The fifth may be on its way while the subscriber is declared: a link that is set up carries what waits for it.
+    while (received := publication.read_sample(subscriber.recv())).sequence < 5:
+        pass
+    return publisher, received
 
 
 def test_a_cache_that_is_not_yet_known_is_queried_again_and_what_is_received_meanwhile_follows(
