@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,8 +21,8 @@ class Runaway(ExpressionLaw[LawSettings]):
         return 200 * now.attitude_error[-self.actuators :] + 0.3, {}
 
 
-class Raising(PythonLaw[LawSettings]):
-    """Fails at its fourth tick."""
+class FourthTick(PythonLaw[LawSettings]):
+    """Gives 1 V, and calls `fail` at its fourth tick and every later one."""
 
     Settings = LawSettings
 
@@ -31,35 +32,30 @@ class Raising(PythonLaw[LawSettings]):
     def step(self, now: Now[Any]) -> Any:
         self.state["ticks"] = now.state["ticks"] + 1
         if now.state["ticks"] > 2:
-            raise ZeroDivisionError("by nothing")
+            self.fail()
         return [1.0] * self.actuators
 
+    @abstractmethod
+    def fail(self) -> None: ...
 
-class Hanging(PythonLaw[LawSettings]):
-    """Never ends its fourth tick."""
 
-    Settings = LawSettings
+class Raising(FourthTick):
+    """Fails."""
 
-    def reset(self) -> None:
-        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
+    def fail(self) -> None:
+        raise ZeroDivisionError("by nothing")
 
-    def step(self, now: Now[Any]) -> Any:
-        self.state["ticks"] = now.state["ticks"] + 1
-        while now.state["ticks"] > 2:
+
+class Hanging(FourthTick):
+    """Never ends."""
+
+    def fail(self) -> None:
+        while True:
             pass
-        return [1.0] * self.actuators
 
 
-class Slow(PythonLaw[LawSettings]):
-    """Takes 0.3 s for its fourth tick."""
+class Slow(FourthTick):
+    """Takes 0.3 s."""
 
-    Settings = LawSettings
-
-    def reset(self) -> None:
-        self.state = {"ticks": 0.0}  # type: ignore[dict-item]  # a number, as a user may write it
-
-    def step(self, now: Now[Any]) -> Any:
-        self.state["ticks"] = now.state["ticks"] + 1
-        if now.state["ticks"] == 3:
-            time.sleep(0.3)
-        return [1.0] * self.actuators
+    def fail(self) -> None:
+        time.sleep(0.3)
