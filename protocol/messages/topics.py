@@ -138,7 +138,7 @@ FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries =
 """Topics of frames."""
 
 _Actions = tuple[Action, ...]
-_CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer", "hold"), ("subscribe", "query", "watch")
+_CACHED: Final[tuple[_Actions, _Actions]] = ("publish", "answer"), ("subscribe", "query")
 ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {
     "frame": (("publish",), ("subscribe",)),
     "json": _CACHED,
@@ -146,8 +146,9 @@ ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {
     "query": (("query",), ("answer",)),
     "token": (("hold",), ("watch",)),
 }
-"""What senders and what receivers do, by what a topic carries. A cache has a token and answers queries."""
+"""What senders and what receivers do, by what a topic carries. A cache answers queries."""
 
+_CACHE: Final = "/@cache"
 _CHUNKS: Final = {"session": "(?P<session>[^/]+)", "role": "(?P<role>[^/]+)"}
 _PATTERNS: Final = [
     (topic, re.compile(f"{ROOT}/(?P<vehicle>{NAME})/{topic.key.format(**_CHUNKS)}")) for topic in TOPICS.values()
@@ -166,6 +167,16 @@ class Address(NamedTuple):
 def key(name: str, vehicle: str, *, session: str = "*", role: str = "*") -> str:
     """The key of a topic of one vehicle; what is left out becomes a wildcard. Raises KeyError for an unknown topic."""
     return f"{ROOT}/{vehicle}/{TOPICS[name].key.format(session=session, role=role)}"
+
+
+def cache_key(key: str) -> str:
+    """The key below a topic's key on which its cache is queried. No wildcard includes a chunk with an @."""
+    return key + _CACHE
+
+
+def cached_key(key: str) -> str:
+    """The key of the topic whose cache is queried on a key."""
+    return key.removesuffix(_CACHE)
 
 
 def read_key(text: str) -> Address | None:

@@ -32,7 +32,7 @@ from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.datagrams import Datagrams
 from aeroloop.protocol.transport.network import VISIT_S, join, unlinked, visit
 from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.publication import ATTACHMENT_BYTES, CachedPublisher
+from aeroloop.protocol.transport.publication import ADDED_BYTES, CachedPublisher
 from aeroloop.protocol.transport.refusal import RefusalWatch
 from aeroloop.protocol.transport.router import route
 from aeroloop.protocol.transport.security import TLS, Identity
@@ -310,7 +310,7 @@ class Role:
 
     def publish_bytes(self, topic: str, payload: bytes) -> None:
         """Publish on one of the table's topics of JSON or traces; what exceeds the topic's limit is not published."""
-        limit = topics.TOPICS[topic].limit - ATTACHMENT_BYTES
+        limit = topics.TOPICS[topic].limit - ADDED_BYTES
         if len(payload) > limit:
             self.warn(topic, "fault", f"a {topic} of {len(payload)} bytes is not published: at most {limit} may be")
             return

@@ -28,14 +28,12 @@ _MESSAGES: Final[dict[Action, tuple[str, ...]]] = {
     "watch": ("liveliness_query", "declare_liveliness_subscriber"),
 }
 """Zenoh's messages by action. `delete` is nobody's."""
-_CACHE: Final = "/@adv/**"
-"""Below a topic's key: its cache's queries, token and heartbeats. No wildcard includes a chunk with an @."""
 _EVERYTHING: Final = {
     "id": "everything",
     "messages": ["delete", *(message for messages in _MESSAGES.values() for message in messages)],
     "flows": ["ingress", "egress"],
     "permission": "allow",
-    "key_exprs": ["**", "**" + _CACHE],
+    "key_exprs": ["**", topics.cache_key("**")],
 }
 
 
@@ -104,7 +102,7 @@ def _keys(rows: list[Topic], vehicle: str, role: str = "*") -> list[str]:
         key = topics.key(topic.name, vehicle, role=role)
         keys.append(key)
         if topic.recorded:
-            keys.append(key + _CACHE)
+            keys.append(topics.cache_key(key))
         elif topic.carries == "token" and role != "*":
             keys.append(f"{key}-$*")
     return keys

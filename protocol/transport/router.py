@@ -7,9 +7,8 @@ routers. A stock `zenohd` does the same with the printed configuration.
 from __future__ import annotations
 
 import json
-import os
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 import zenoh
 
@@ -18,6 +17,12 @@ from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSe
 from aeroloop.protocol.transport.places import is_own
 from aeroloop.protocol.transport.security import Identity
 from aeroloop.protocol.transport.session_tree import open_tree, reason, session_tree
+
+THREADS: Final = (
+    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
+    "app: (worker_threads: 4))"
+)
+"""A router's, as ZENOH_RUNTIME. A thread that passes on an answer to a client behind a narrow link waits for it."""
 
 
 def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
@@ -30,7 +35,7 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
     warn_of_plain(protected(settings, identity))
     tree = router_tree(settings, identity)
     try:
-        return open_tree(tree)
+        return open_tree(tree, THREADS)
     except zenoh.ZError as error:
         places = ", ".join(tree["listen"]["endpoints"]) or "nothing"
         raise NetworkError(
@@ -59,6 +64,6 @@ def zenohd_config(settings: NetworkSettings, identity: Identity) -> str:
     """The configuration as JSON5, for a stock `zenohd` of the same version. Raises as `protected`."""
     return (
         f"// Router of aeroloop, for zenohd {version('eclipse-zenoh')}:\n"
-        f"// ZENOH_RUNTIME='{os.environ['ZENOH_RUNTIME']}' zenohd --config FILE\n"
+        f"// ZENOH_RUNTIME='{THREADS}' zenohd --config FILE\n"
         f"{json.dumps(router_tree(settings, identity), indent=2)}\n"
     )

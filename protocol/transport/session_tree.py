@@ -15,6 +15,7 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.access import access_control
 from aeroloop.protocol.transport.network_settings import Protected
+from aeroloop.protocol.transport.publication import PAGE_BYTES
 from aeroloop.protocol.transport.security import tls_tree
 
 Mode = Literal["peer", "client", "router"]
@@ -39,15 +40,12 @@ PATIENT_LEASE_MS: Final = 10_000
 RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
-# A thread of Zenoh that sends to a peer behind a narrow link may block. By default a pool has one or two, which
-# then carry no frames either: a recorder behind 64 kbit/s cost the session 7 times of 14, with these threads 0 of 6.
-# One pool for all tasks would save a fifth of the loop's latency, but after such a link later joins cost sessions.
-# Read once, at the first session of the process; `tests/benchmarks/third_parties.py` measures it.
-os.environ.setdefault(
-    "ZENOH_RUNTIME",
-    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
-    "app: (worker_threads: 4))",
+ONE_THREAD: Final = (
+    "(app: (worker_threads: 1), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))"
 )
+"""All of Zenoh in one thread, as ZENOH_RUNTIME. Each further one adds a wake-up to a frame's way, together two fifths
+of the loop's latency. Nothing may block it, so threads of Python answer queries; `tests/benchmarks/third_parties.py`
+measures it."""
 
 
 def session_tree(
@@ -61,7 +59,10 @@ def session_tree(
     """Zenoh's configuration of a session that listens at some endpoints and connects to others."""
     settings, certificate, vehicles = network
     lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS) if settings.mixed else settings.lease_ms
-    answered = {name: each for name, each in topics.TOPICS.items() if each.answered}
+    table = topics.TOPICS.values()
+    caches = {topics.cache_key(topics.key(each.name, "*")): each for each in table if each.recorded}
+    limits = [(topics.key(each.name, "*"), each.limit, each.request) for each in table]
+    limits += [(key, max(each.limit, 2 * PAGE_BYTES), topics.MESSAGE_BYTES) for key, each in caches.items()]
     tree: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -74,14 +75,14 @@ def session_tree(
         # Before it is queued, parsed or stored: what waits in memory is bounded for every publisher.
         "low_pass_filter": [
             {
-                "id": f"{topic.name} {messages[0]}",
+                "id": f"{key} {messages[0]}",
                 "flows": ["ingress"],
                 "messages": messages,
-                "key_exprs": [topics.key(topic.name, "*")],
+                "key_exprs": [key],
                 "size_limit": most,
             }
-            for topic in topics.TOPICS.values()
-            for messages, most in ((["put", "reply"], topic.limit), (["query"], topic.request))
+            for key, answer, request in limits
+            for messages, most in ((["put", "reply"], answer), (["query"], request))
         ],
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": settings.gossip}},
         "transport": {
@@ -102,7 +103,8 @@ def session_tree(
     }
     if mode != "client":  # a client's one link carries the queries of all: its router limits each of them
         # By link, whatever a message says of its sender: only a new link, with its handshake, is a new peer.
-        rules = [{"key_expr": topics.key(name, "*"), "freq": each.per_s} for name, each in answered.items()]
+        queried = {topics.key(each.name, "*"): each for each in table if each.answered} | caches
+        rules = [{"key_expr": key, "freq": each.per_s} for key, each in queried.items()]
         tree["downsampling"] = [{"id": "queries", "flows": ["ingress"], "messages": ["query"], "rules": rules}]
     if certificate is not None:
         tree["transport"]["link"]["tls"] = tls_tree(certificate)
@@ -112,8 +114,12 @@ def session_tree(
     return tree
 
 
-def open_tree(tree: dict[str, Any]) -> zenoh.Session:
-    """Open a session with a configuration of Zenoh. Raises zenoh.ZError."""
+def open_tree(tree: dict[str, Any], threads: str = ONE_THREAD) -> zenoh.Session:
+    """Open a session with a configuration of Zenoh. Raises zenoh.ZError.
+
+    `threads` are Zenoh's, for all sessions of the process, unless one was opened or ZENOH_RUNTIME was set before.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", threads)
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
     session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
     return session

@@ -72,6 +72,9 @@ class _WholeChunks:
         self._file.close()
 
 
+_32_BITS: Final = 0xFFFF_FFFF
+
+
 class LogFile:
     """An MCAP file that is being written to a new path. Raises OSError if it exists already or cannot be created."""
 
@@ -106,7 +109,7 @@ class LogFile:
         """
         channel = self._channel(received.key, None)
         published_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
-        self._add(channel, at_ns, published_ns, received.payload, received.sequence)
+        self._add(channel, at_ns, published_ns, received.payload, received.number & _32_BITS)
         for one in decoded:
             self._add(self._channel(one.topic, one.shape), one.at_ns, one.at_ns, one.data, 0)
 

@@ -106,9 +106,8 @@ class Recorder:
         finally:
             self._settle()
             self.log.try_again()
-            for _ in range(2):  # the second publishes losses of publishers without a known key in the first
-                self._take_all()
-                self._publish_losses()
+            self._take_all()
+            self._publish_losses()
             self._publish_status()
             self._take_all()
             self.log.close(len(self._backlog))

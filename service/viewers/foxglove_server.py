@@ -24,7 +24,8 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.publication import Delivery, RecoveringSubscriber, read_sample
+from aeroloop.protocol.transport.publication import Delivery, read_sample
+from aeroloop.protocol.transport.recovery import RecoveringSubscriber
 from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoder, topic_of
 from aeroloop.service.viewers.schemas import Decoded, Shape
 

@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import zenoh
 from zenoh.handlers import Callback, FifoChannel, RingChannel
 
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import Action
 from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
 
@@ -62,7 +63,7 @@ def with_marker(access: dict[str, Any], *, egress_open: bool = False) -> dict[st
     rights = {"messages": MESSAGES, "permission": "allow"}
     more = [{"id": MARKER, "flows": ["ingress", "egress"], "key_exprs": [MARKER], **rights}]
     if egress_open:
-        more.append({"id": "sent", "flows": ["egress"], "key_exprs": ["**", "**/@adv/**"], **rights})
+        more.append({"id": "sent", "flows": ["egress"], "key_exprs": ["**", topics.cache_key("**")], **rights})
     return access | {
         "rules": [*access["rules"], *more],
         "subjects": [*access["subjects"], {"id": "anyone"}],

@@ -168,7 +168,7 @@ def decoded_count(paths: list[Path]) -> int:
 def numbered(messages: list[Arrived]) -> list[tuple[str, int, int, int, bytes]]:
     """Messages as they must stand in the log: by their publishers' numbers, in order of their log times."""
     found = [
-        (received.key, received.sequence, at_ns, received.published_ns or at_ns, received.payload)
+        (received.key, received.number, at_ns, received.published_ns or at_ns, received.payload)
         for received, at_ns in messages
     ]
     return sorted(found, key=lambda one: one[2])

@@ -18,7 +18,7 @@ from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import OccupiedError, Role
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.publication import RecoveringSubscriber
+from aeroloop.protocol.transport.recovery import RecoveringSubscriber
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually

@@ -13,7 +13,8 @@ import pytest
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
 from aeroloop.protocol.transport.access import access_control
-from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
+from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.protocol.transport.recovery import RecoveringSubscriber
 from tests.support.certificates import DAY, Authority
 from tests.support.certified_link import attempt, linked, open_session, with_marker
 from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
@@ -24,7 +25,7 @@ KEYS: Final = [
     for topic in TOPICS.values()
     for vehicle in ("aero", "bero")
     for role in (ROLES if "{role}" in topic.key else ("",))
-    for cache in (("", "/@adv/pub/a1/2/_") if topic.recorded else ("",))
+    for cache in (("", topics.cache_key("")) if topic.recorded else ("",))
 ]
 """Of one vehicle with rules and one without; with the key of a cache below each that is published from one."""
 VERBS: Final = {topics.key(topic.name, "aero") for topic in TOPICS.values() if topic.carries == "query"}
@@ -49,7 +50,7 @@ def allowed(role: RoleName, action: Action) -> set[str]:
     """Keys on which the table allows an action, written anew: what acts names its vehicle and its own role."""
     found = set()
     for key in KEYS:
-        address = topics.read_key(key.partition("/@adv")[0])
+        address = topics.read_key(topics.cached_key(key))
         assert address is not None
         acts = action in topics.ACTIONS[address.topic.carries][0]
         if address.vehicle == "aero" and may(role, action, address.topic):

@@ -17,7 +17,8 @@ from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.network import join, visit
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
-from aeroloop.protocol.transport.publication import CachedPublisher, RecoveringSubscriber
+from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.protocol.transport.recovery import RecoveringSubscriber
 from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
 from aeroloop.protocol.transport.security import Identity
 from aeroloop.service.host.operator import gather, stop

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -369,7 +370,7 @@ def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gatheri
     declared = gathering.join().declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
     eventually("the match", lambda: bool(declared.matching_status.matching))  # type: ignore[attr-defined]
     for number in (0, 1, 2, 3, 1000):
-        declared.put(number.to_bytes(4, "big"), source_info=zenoh.SourceInfo(declared.id, number))
+        declared.put(number.to_bytes(4, "big"), attachment=struct.pack("<qQQ", START_NS, 4711, number))
     running.end()
     assert running.numbers() == [0, 1, 2, 3, 1000]
     assert running.losses() == [(KEY, 996, "network")]

@@ -1,0 +1,332 @@
+"""Recovery: in order, each message once, and nothing lost that a cache still holds, whatever the network does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aeroloop.protocol.transport import recovery
+from aeroloop.protocol.transport.publication import (
+    PAGE_BYTES,
+    PAGE_MESSAGES,
+    PUBLISHERS,
+    Cache,
+    CachedPublisher,
+    Delivery,
+    Page,
+    read_page,
+    read_request,
+    request,
+)
+from aeroloop.protocol.transport.recovery import ByteRing, Missed, RecoveringSubscriber, Recovery
+from tests.support.zenoh_network import Gathering, eventually
+
+KEY = "aeroloop/aero/trace/plant"
+ANY = "aeroloop/*/trace/*"
+OURS = 4711
+
+
+def page(cache: Cache, wanted: int) -> Page:
+    read = read_page(cache.page(wanted))
+    assert read is not None
+    return read
+
+
+def message(number: int, publisher: int = OURS) -> Delivery:
+    return Delivery(KEY, b"%d" % number, number, number, publisher)
+
+
+def taken(recovery: Recovery) -> list[int]:
+    numbers = [each.number for each in recovery.ready]
+    assert [each.payload for each in recovery.ready] == [b"%d" % number for number in numbers]
+    recovery.ready.clear()
+    return numbers
+
+
+@given(
+    kept=st.integers(1, 40),
+    before=st.integers(0, 30),
+    sent=st.lists(st.sampled_from(["received", "lost", "late", "page"]), max_size=60),
+    wait=st.integers(1, 4),
+)
+def test_what_a_cache_holds_is_delivered_once_and_in_order_and_the_rest_is_counted(
+    kept: int, before: int, sent: list[str], wait: int
+) -> None:
+    cache, recovery = Cache(OURS, kept), Recovery()
+    for number in range(before):
+        cache.put(number, b"%d" % number)
+    first: int | None = None
+    found, late = list[int](), list[int]()
+    for now, event in enumerate(sent):
+        if event == "page":
+            read = page(cache, recovery.wanted().get(OURS, 0))
+            first = read.first if first is None else first
+            recovery.read(KEY, read, now)
+        else:
+            number = cache.put(cache.count, b"%d" % cache.count)
+            if event == "late":
+                late.append(number)
+            elif event == "received":
+                recovery.receive(message(number), now)
+                first = 0 if first is None and number == 0 else first
+        if late and now % wait == 0:
+            recovery.receive(message(number := late.pop(0)), now)
+            first = 0 if first is None and number == 0 else first
+        found += taken(recovery)
+    while recovery.lacks:
+        read = page(cache, recovery.wanted()[OURS])
+        first = read.first if first is None else first
+        recovery.read(KEY, read, 1e3)
+        found += taken(recovery)
+    assert found == sorted(set(found))
+    missed = sum(each.missing for each in recovery.missed)
+    if found:
+        assert first is not None
+        assert first <= found[0]
+        assert missed == found[-1] + 1 - first - len(found)
+        assert all(each < cache.count - kept or each < first for each in set(range(found[-1])) - set(found))
+
+
+def test_what_no_cache_answers_for_is_left_after_a_while_and_counted() -> None:
+    recovery = Recovery()
+    for number in (7, 8, 40):  # the first that is received, whatever its number
+        recovery.receive(message(number), now=1.0)
+    recovery.give_up(now=10.9)
+    assert taken(recovery) == []
+    assert recovery.lacks
+    recovery.give_up(now=11.1)
+    assert taken(recovery) == [7, 8]
+    recovery.give_up(now=20.9)
+    assert taken(recovery) == []
+    recovery.give_up(now=21.2)
+    assert taken(recovery) == [40]
+    assert list(recovery.missed) == [Missed(KEY, 31)]
+    assert not recovery.lacks
+
+
+def test_nobody_speaks_for_the_publisher_of_another_key() -> None:
+    recovery = Recovery()
+    recovery.receive(message(0), now=0.0)
+    recovery.receive(message(5)._replace(key="other"), now=0.0)
+    recovery.read("other", Page(OURS, 1_000_000, 1_000_000, []), now=0.0)
+    recovery.receive(message(1), now=0.0)
+    assert [each.number for each in recovery.ready if each.key == KEY] == [0, 1]
+
+
+def test_what_is_held_back_is_bounded_and_what_finds_no_room_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recovery, "HELD", 5)
+    cache, ours = Cache(OURS, 100), Recovery()
+    for number in range(50):
+        cache.put(number, b"%d" % number)
+        if number:
+            ours.receive(message(number), now=0.0)
+    assert ours._held == 5
+    ours.read(KEY, page(cache, 0), now=0.0)
+    assert taken(ours) == list(range(50))
+    assert not ours.lacks
+    assert (ours._held, ours._held_bytes) == (0, 0)
+
+
+def test_publishers_that_are_known_are_bounded_and_the_longest_silent_is_forgotten() -> None:
+    recovery = Recovery()
+    for publisher in range(PUBLISHERS + 1):
+        recovery.receive(message(0, publisher), now=publisher)
+    assert set(recovery.wanted()) == set(range(1, PUBLISHERS + 1))
+    assert read_request(request(recovery.wanted())) == recovery.wanted()
+
+
+@given(st.binary(max_size=200))
+def test_bad_bytes_are_refused_whole(data: bytes) -> None:
+    """As a page, and as a request."""
+    read = read_page(data)
+    if read is not None:
+        assert len(data) == 24 + sum(12 + len(payload) for _, payload in read.messages)
+        assert read.first + len(read.messages) <= read.end
+    wanted = read_request(data)
+    assert (wanted is None) == bool(len(data) % 16)
+
+
+def test_a_page_cut_anywhere_is_none_or_shorter() -> None:
+    cache = Cache(OURS, 10)
+    for number in range(3):
+        cache.put(number, bytes(number))
+    whole = cache.page(0)
+    read = [read_page(whole[:cut]) for cut in range(len(whole) + 1)]
+    assert [len(each.messages) for each in read if each] == [0, 1, 2, 3]
+
+
+@given(sizes=st.lists(st.integers(0, 30_000), max_size=20), wanted=st.integers(0, 25))
+def test_a_page_is_bounded_and_pages_after_each_other_are_the_cache(sizes: list[int], wanted: int) -> None:
+    cache = Cache(OURS, 100)
+    for size in sizes:
+        cache.put(7, bytes(size))
+    found, begun = list[int](), min(wanted, len(sizes))
+    while begun + len(found) < len(sizes):
+        read = page(cache, begun + len(found))
+        assert (read.publisher, read.first, read.end) == (OURS, begun + len(found), len(sizes))
+        lengths = [len(payload) for _, payload in read.messages]
+        assert sum(lengths[:-1]) < PAGE_BYTES
+        assert lengths
+        found += lengths
+    assert found == sizes[begun:]
+
+
+def test_a_page_has_so_many_messages_at_most() -> None:
+    cache = Cache(OURS, 10 * PAGE_MESSAGES)
+    for _ in range(3 * PAGE_MESSAGES):
+        cache.put(0, b"")
+    assert len(page(cache, 0).messages) == PAGE_MESSAGES
+
+
+def test_a_cache_that_is_written_while_it_is_read_gives_no_page_with_a_gap() -> None:
+    cache = Cache(OURS, 4)
+    for number in range(4):
+        cache.put(number, b"%d" % number)
+
+    class Kept(list[Any]):
+        def __getitem__(self, index: Any) -> Any:
+            found = super().__getitem__(index)
+            if index == 1 and cache.count < 7:  # after it was read, and before 2 and 3 are
+                for number in range(4, 7):
+                    cache.put(number, b"%d" % number)
+            return found
+
+    cache._kept = Kept(cache._kept)
+    read = page(cache, 0)
+    assert [payload for _, payload in read.messages] == [b"%d" % (read.first + i) for i in range(len(read.messages))]
+    assert read.messages[-1][1] == b"3"
+
+
+# ── between two sessions ──
+
+
+@pytest.fixture
+def network() -> Iterator[Gathering]:
+    with Gathering() as gathering:
+        yield gathering
+
+
+def payload(i: int) -> bytes:
+    return f"{i:06}".encode() + bytes(2000)
+
+
+def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Delivery]:
+    """What is received until there is so much of it."""
+    found: list[Delivery] = []
+
+    def received() -> bool:
+        found.extend(subscriber.take())
+        return len(found) >= wanted
+
+    eventually("receiving", received)
+    time.sleep(0.05)  # a duplicate would follow at once
+    found.extend(subscriber.take())
+    return found
+
+
+def assert_complete(received: list[Delivery], count: int) -> None:
+    assert [int(each.payload[:6]) for each in received] == list(range(count))
+    assert [each.number for each in received] == list(range(count))
+    assert {each.key for each in received} == {KEY}
+    assert len({each.publisher for each in received}) == 1
+
+
+def test_a_subscriber_that_comes_late_or_again_gets_everything_in_order_and_once(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(), KEY, per_s=10)
+    before_ns = time.time_ns()
+    for i in range(300):
+        publisher.put(payload(i))
+    for _ in range(2):
+        session = network.join()
+        received = collect(RecoveringSubscriber(session, ANY), 300)
+        assert_complete(received, 300)
+        stamps = [each.published_ns or 0 for each in received]
+        assert before_ns <= stamps[0]
+        assert stamps == sorted(stamps)
+        session.close()
+
+
+def test_a_cache_keeps_what_it_is_made_for_and_no_more(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(), KEY, per_s=2)
+    for i in range(1000):
+        publisher.put(payload(i))
+    received = collect(RecoveringSubscriber(network.join(), ANY), 130)
+    assert [each.number for each in received] == list(range(870, 1000))  # 65 s of 2 a second
+
+
+@pytest.mark.parametrize("waiting_bytes", [None, 30_000], ids=["in number", "in bytes"])
+def test_what_finds_no_room_to_wait_is_recovered(network: Gathering, waiting_bytes: int | None) -> None:
+    publisher = CachedPublisher(network.join(), KEY, per_s=1)
+    subscriber = RecoveringSubscriber(network.join(), ANY, waiting=10, waiting_bytes=waiting_bytes)
+    for i in range(3):
+        publisher.put(payload(i))
+    found = collect(subscriber, 3)
+    for i in range(3, 40):  # the ring of the subscriber holds ten
+        publisher.put(payload(i))
+    time.sleep(0.2)  # nothing is taken meanwhile, so the ring overflows
+    assert_complete(found + collect(subscriber, 37), 40)
+
+
+def test_a_plain_publisher_is_received_too_and_carries_no_time(network: Gathering) -> None:
+    session = network.join()
+    subscriber = RecoveringSubscriber(network.join(), ANY)
+    found: list[Delivery] = []
+
+    def received() -> bool:
+        session.put(KEY, b"plain")
+        found.extend(subscriber.take())
+        return bool(found)
+
+    eventually("receiving", received)
+    assert found[0] == Delivery(KEY, b"plain", 0, None, None)
+
+
+def test_a_slow_reader_of_pages_holds_up_no_thread_of_zenoh_s(network: Gathering) -> None:
+    """A page waits in a thread of Python; frames and messages go on meanwhile."""
+    session, reading = network.join(), network.join()
+    publisher = CachedPublisher(session, KEY, per_s=100)
+    for i in range(100):
+        publisher.put(payload(i))
+    asked: list[str] = []
+    released = SimpleNamespace(now=False)
+    whole = publisher._cache.page
+
+    def slow(wanted: int) -> bytes:
+        asked.append("page")
+        eventually("the release", lambda: released.now)
+        return whole(wanted)
+
+    publisher._cache.page = slow  # type: ignore[method-assign]
+    subscriber = RecoveringSubscriber(reading, ANY)
+    session.declare_queryable("t/word", lambda query: query.reply("t/word", b"") if query else None)
+
+    def queried() -> bool:
+        list(subscriber.take())
+        return bool(asked)
+
+    eventually("the query", queried)
+    eventually("an answer meanwhile", lambda: any(reply.ok for reply in reading.get("t/word", timeout=1.0)))
+    released.now = True
+    assert_complete(collect(subscriber, 100), 100)
+    assert isinstance(session, zenoh.Session)
+
+
+@given(sizes=st.lists(st.integers(0, 40), max_size=30), most=st.integers(1, 8), most_bytes=st.integers(40, 100))
+def test_a_byte_ring_keeps_the_newest_that_fit_in_order(sizes: list[int], most: int, most_bytes: int) -> None:
+    ring = ByteRing(most, most_bytes)
+    samples: list[Any] = [SimpleNamespace(payload=bytes(size), number=number) for number, size in enumerate(sizes)]
+    for sample in samples:
+        ring.put(sample)
+    kept = list(iter(ring.try_recv, None))
+    fit = 0
+    while fit < min(most, len(sizes)) and sum(sizes[len(sizes) - fit - 1 :]) <= most_bytes:
+        fit += 1
+    assert kept == samples[len(sizes) - fit :]
+    assert ring.try_recv() is None
