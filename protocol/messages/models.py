@@ -246,6 +246,6 @@ class Loss(Message):
     key: str
     count: int = Field(ge=1, description="how many are missing")
     reason: Literal["network", "queue", "disk"] = Field(
-        description="network: published, and neither received nor recovered; queue: received faster than they could be "
-        "written; disk: the log could not be written"
+        description="network: published, and neither received nor recovered; disk: the log could not be written; "
+        "queue, in older logs: received faster than they could be written"
     )

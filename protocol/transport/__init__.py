@@ -1,1 +1,1 @@
-"""Links over Zenoh and CAN, the network session, and publication from a cache."""
+"""Links over Zenoh and CAN, the network session, and publication with recovery."""

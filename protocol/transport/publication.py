@@ -113,6 +113,11 @@ def read_request(data: bytes) -> dict[int, int] | None:
     return dict(_WANTED.iter_unpack(data))
 
 
+def attachment(clock_ns: int, publisher: int, number: int) -> bytes:
+    """What goes with a message: time of publication [ns since 1970], publisher, number."""
+    return _ATTACHMENT.pack(clock_ns, publisher, number)
+
+
 class CachedPublisher:
     """Publishes on one key, from any thread, and answers queries of its cache. The session outlives the publisher.
 
@@ -146,7 +151,7 @@ class CachedPublisher:
         with self._putting:
             clock_ns = time.time_ns()
             number = self._cache.put(clock_ns, payload)
-            self._publisher.put(payload, attachment=_ATTACHMENT.pack(clock_ns, self._id, number))
+            self._publisher.put(payload, attachment=attachment(clock_ns, self._id, number))
 
     def _answer(self, query: zenoh.Query) -> None:
         with query, suppress(zenoh.ZError):  # closed meanwhile
@@ -175,8 +180,8 @@ class Delivery(NamedTuple):
 
 def read_sample(sample: zenoh.Sample) -> Delivery:
     """Convert a sample of a cached publisher, or of any other."""
-    key, payload, attachment = str(sample.key_expr), sample.payload.to_bytes(), sample.attachment
-    if attachment is None or len(data := attachment.to_bytes()) != _ATTACHMENT.size:
+    key, payload, attached = str(sample.key_expr), sample.payload.to_bytes(), sample.attachment
+    if attached is None or len(data := attached.to_bytes()) != _ATTACHMENT.size:
         return Delivery(key, payload, 0, None, None)
     clock_ns, publisher, number = _ATTACHMENT.unpack(data)
     return Delivery(key, payload, number, clock_ns, publisher)

@@ -32,12 +32,8 @@ AWAY_S = 2.0
 
 
 @pytest.fixture
-def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosts]:
-    """Hosts with an emulator and a controller, and a third one that records and watches; the plant is driven.
-
-    Zenoh has its default of threads, which a lingering socket stalls.
-    """
-    monkeypatch.setenv("ZENOH_RUNTIME", "(rx: (worker_threads: 2))")
+def hosts(tmp_path: Path) -> Iterator[Hosts]:
+    """Hosts with an emulator and a controller, and a third one that records and watches; the plant is driven."""
     try:
         with Hosts(["plant", "controller", "third"], tmp_path) as hosts:
             hosts.aeroloop("plant", "emulator", overrides=PATIENT)

@@ -17,6 +17,7 @@ from aeroloop.protocol.messages.models import PROTOCOL_VERSION
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
 from aeroloop.protocol.messages.topics import TOPICS, Topic
 from aeroloop.protocol.transport.can_format import FaultPhase, FaultReport, fault_check
+from aeroloop.protocol.transport.publication import Cache, attachment, read_page, read_request, request
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
@@ -29,6 +30,7 @@ KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes |
 FRAMES: Final = "| frame | counter bits | bits of ε, ω / u | actuators | counter | codes | hex |"
 SENT: Final = "| heartbeat_s | period in ms | counter bits | codes | ticks that send | their counters |"
 REPORTS: Final = "| fault | place | phase | tick | check | changed | report |"
+PUBLISHED: Final = "| what | wanted | hex |"
 REFUSED: Final = "| frame | counter bits | bits of ε, ω / u | actuators | hex | why |"
 
 Row = tuple[str, ...]
@@ -63,6 +65,7 @@ FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
 REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
 SENT_ROWS: Final = rows(SENT, "Golden vectors")
 REPORT_ROWS: Final = rows(REPORTS, "On a CAN bus")
+PUBLISHED_ROWS: Final = rows(PUBLISHED, "Topics")
 
 
 def number(text: str) -> int:
@@ -100,6 +103,7 @@ def as_bits(text: str) -> int | str:
         pytest.param(REFUSED_ROWS, 4, id="refused"),
         pytest.param(SENT_ROWS, 8, id="sent"),
         pytest.param(REPORT_ROWS, 3, id="fault reports"),
+        pytest.param(PUBLISHED_ROWS, 5, id="published"),
     ],
 )
 def test_the_golden_vectors_are_there(found: list[Row], least: int) -> None:
@@ -181,6 +185,27 @@ def test_a_fault_report_has_the_bytes_of_its_golden_vector(row: Row) -> None:
     assert report.phase.name.lower() == name.replace(" ", "_")
     assert report.pack() == bytes.fromhex(packed)
     assert FaultReport.unpack(report.pack()) == report
+
+
+@pytest.mark.parametrize("row", PUBLISHED_ROWS, ids=lambda row: " ".join(row[:2]))
+def test_queries_pages_and_attachments_are_their_golden_vectors(row: Row) -> None:
+    what, number, data = row[0], int(row[1]), bytes.fromhex(row[2])
+    publisher, clock_ns = 0x0123456789ABCDEF, 1_800_000_000_000_000_000
+    payloads = [b"one", b"two", b"", b"four"]
+    cache = Cache(publisher, 3)
+    for after, payload in enumerate(payloads):
+        cache.put(clock_ns + after, payload)
+    if what == "query":
+        assert request({publisher: number}) == data
+        assert read_request(data) == {publisher: number}
+    elif what == "attachment":
+        assert attachment(clock_ns + number, publisher, number) == data
+    else:
+        assert what == "page"
+        assert cache.page(number) == data
+        first = min(max(number, 1), 4)
+        messages = [(clock_ns + each, payloads[each]) for each in range(first, 4)]
+        assert read_page(data) == (publisher, first, 4, messages)
 
 
 def longest(topic: Topic) -> int:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import os
-import struct
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +20,7 @@ from aeroloop.protocol.messages.models import Loss, Status
 from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.publication import CachedPublisher
+from aeroloop.protocol.transport.publication import CachedPublisher, attachment
 from aeroloop.service.config import load
 from aeroloop.service.logs.mcap_file import CHANGE_METADATA, DESCRIPTION_METADATA
 from aeroloop.service.recording import backlog, rolling
@@ -370,7 +369,7 @@ def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gatheri
     declared = gathering.join().declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
     eventually("the match", lambda: bool(declared.matching_status.matching))  # type: ignore[attr-defined]
     for number in (0, 1, 2, 3, 1000):
-        declared.put(number.to_bytes(4, "big"), attachment=struct.pack("<qQQ", START_NS, 4711, number))
+        declared.put(number.to_bytes(4, "big"), attachment=attachment(START_NS, 4711, number))
     running.end()
     assert running.numbers() == [0, 1, 2, 3, 1000]
     assert running.losses() == [(KEY, 996, "network")]
