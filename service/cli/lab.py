@@ -500,7 +500,8 @@ def tune(
     """Search the gains of a law for the least error and effort; exit 1 if they are worse in runs not searched."""
     settings = loop_of(config, overrides)
     _check_engine(engine)
-    from aeroloop.service.lab.tune import Plan, parse_winds, toml_of, tune
+    from aeroloop.service.lab.tune import toml_of, tune
+    from aeroloop.service.lab.tune_search import Plan, parse_winds
     from aeroloop.service.lab.workers import Workers
     from aeroloop.service.logs.outputs import check_output
     from aeroloop.service.terminal.display import count_bar
