@@ -18,7 +18,7 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.lab.experiment import experiment, through_frames
+from aeroloop.service.lab.experiment import experiment, run_experiment
 from aeroloop.service.logs.batch import BatchController
 from tests.service.control.test_tick import frames
 from tests.service.logs.test_batch import TICKS, WIRES, Run
@@ -139,7 +139,7 @@ def test_an_experiment_with_expressions_is_compiled_and_has_the_figures_of_the_f
     found = experiment(own, 3.0)
     assert found.path == "compiled"
     commands: list[bytes] = []
-    assert found.figures == through_frames(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
+    assert found.figures == run_experiment(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
     assert found.course is not None
     assert [tuple(row) for row in found.course.commanded.tolist()] == [_codes(own, frame) for frame in commands]
     assert np.abs(found.course.voltages).max() > 1
