@@ -6,19 +6,20 @@ making and checking matrices. Through `Function.buffer()` it reads and writes pr
 
 A log reader has many ticks at once. `in_columns` turns a function of scalars into the same function of columns, a row a
 tick: each of its instructions then runs over a whole column within CasADi, at a tenth of the cost. `along_rows` is for
-recursions from tick to tick. Both run the function's own instructions in the function's own order, so the results are
-equal bit for bit.
+recursions from tick to tick: only what depends on the state runs row by row. Both run the function's own instructions,
+so the results are equal bit for bit.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from math import prod
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from aeroloop.protocol.lazy import casadi as ca
+from aeroloop.protocol.wire.expressions import as_written
 
 Buffer: TypeAlias = "memoryview[float]"
 """A row of doubles, written and read by index. Matrices are in CasADi's order, column by column."""
@@ -110,26 +111,12 @@ def in_columns(function: ca.Function, rows: int) -> ca.Function:
     """
     names = function.name_in(), function.name_out()
     given = [ca.MX.sym(name, rows, function.numel_in(name)) for name in names[0]]
-    columns = [ca.horzsplit(matrix) for matrix in given]
-    found: list[list[ca.MX]] = [[ca.MX()] * function.numel_out(name) for name in names[1]]
-    work: dict[int, ca.MX] = {}
-    for i in range(function.n_instructions()):
-        operation, of, to = function.instruction_id(i), function.instruction_input(i), function.instruction_output(i)
-        if operation == ca.OP_INPUT:
-            work[to[0]] = columns[of[0]][of[1]]
-        elif operation == ca.OP_OUTPUT:
-            found[to[0]][to[1]] = work[of[0]]
-        elif operation == ca.OP_CONST:
-            work[to[0]] = ca.MX(function.instruction_constant(i))
-        elif len(of) == 1:
-            work[to[0]] = ca.MX.unary(operation, work[of[0]])
-        else:
-            work[to[0]] = ca.MX.binary(operation, work[of[0]], work[of[1]])
+    found = _evaluated(function, [ca.horzsplit(matrix) for matrix in given], _applied)
     return ca.Function(f"{function.name()}_columns", given, [ca.horzcat(*each) for each in found], *names)
 
 
 def along_rows(step: ca.Function, first: ca.MX, *columns: ca.MX) -> ca.MX:
-    """States of a recursion over rows.
+    """States of a recursion over rows. What does not depend on the state is computed in columns.
 
     Args:
         step: (state, inputs…) ↦ next state; made of SX.
@@ -139,8 +126,53 @@ def along_rows(step: ca.Function, first: ca.MX, *columns: ca.MX) -> ca.MX:
     Returns:
         The state after each row. Shape (rows, n).
     """
-    inputs = [ca.SX.sym(step.name_in(i), step.numel_in(i), UNROLLED if i else 1) for i in range(step.n_in())]
-    states = step.mapaccum(UNROLLED)(*inputs)
-    some = ca.Function("steps", inputs, [states[:, -1], states])
-    _, after = some.mapaccum(columns[0].shape[0] // UNROLLED)(first, *(column.T for column in columns))
-    return after.T
+    state = ca.SX.sym("state", step.numel_in(0))
+    used, symbols = list[ca.MX](), dict[int, ca.SX]()  # columns that the recursion takes up
+
+    def within(value: Any) -> ca.SX:
+        if isinstance(value, ca.SX):
+            return value
+        if value.is_constant():
+            return ca.SX(float(value))
+        if id(value) not in symbols:
+            used.append(value)
+            symbols[id(value)] = ca.SX.sym("used")
+        return symbols[id(value)]
+
+    def applied(operation: int, *of: Any) -> Any:
+        if any(isinstance(value, ca.SX) for value in of):
+            of = tuple(map(within, of))
+        return _applied(operation, *of)
+
+    with as_written():
+        given: list[Sequence[Any]] = [ca.vertsplit(state), *(ca.horzsplit(column) for column in columns)]
+        after = ca.vertcat(*map(within, _evaluated(step, given, applied)[0]))
+        recursion = ca.Function("recursion", [state, ca.vertcat(*symbols.values())], [after])
+        many = ca.SX.sym("many", len(used), UNROLLED)
+        states = recursion.mapaccum(UNROLLED)(state, many)
+        some = ca.Function("steps", [state, many], [states[:, -1], states])
+        _, rows = some.mapaccum(columns[0].shape[0] // UNROLLED)(first, ca.horzcat(*used).T)
+    return rows.T
+
+
+def _applied(operation: int, *of: Any) -> Any:
+    """A CasADi operation on one or two values, all of them SX or all MX."""
+    kind = type(of[0])
+    return kind.unary(operation, *of) if len(of) == 1 else kind.binary(operation, *of)
+
+
+def _evaluated(function: ca.Function, given: Sequence[Sequence[Any]], apply: Callable[..., Any]) -> list[list[Any]]:
+    """The elements of a function's outputs, instruction by instruction, from those of its inputs; constants are MX."""
+    found: list[list[Any]] = [[None] * function.numel_out(name) for name in function.name_out()]
+    work: dict[int, Any] = {}
+    for i in range(function.n_instructions()):
+        operation, of, to = function.instruction_id(i), function.instruction_input(i), function.instruction_output(i)
+        if operation == ca.OP_INPUT:
+            work[to[0]] = given[of[0]][of[1]]
+        elif operation == ca.OP_OUTPUT:
+            found[to[0]][to[1]] = work[of[0]]
+        elif operation == ca.OP_CONST:
+            work[to[0]] = ca.MX(function.instruction_constant(i))
+        else:
+            work[to[0]] = apply(operation, *(work[place] for place in of))
+    return found

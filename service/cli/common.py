@@ -251,3 +251,30 @@ def show(result: Result, json: bool, table: Callable[[Result], None]) -> None:
         typer.echo(result.model_dump_json(indent=2))
     else:
         table(result)
+
+
+def check_engine(engine: str) -> None:
+    """Exit with 2 unless an engine can be used."""
+    from aeroloop.service.lab import workers
+
+    with checked():
+        workers.check_engine(engine)
+
+
+def check_figure(figure: Path | None, config: Path | None, force: bool) -> None:
+    """Check where a figure is to be drawn, if one is. Raises as `check_path` and `check_output` do."""
+    if figure is not None:
+        from aeroloop.service.logs.outputs import check_output
+        from aeroloop.service.report.figure_style import check_path
+
+        check_path(figure)
+        check_output(figure, [config], force=force)
+
+
+@contextmanager
+def new_file(path: Path, config: Path | None, force: bool) -> Iterator[Path]:
+    """A path to write to, once the table is printed: a full disk must not cost the table."""
+    from aeroloop.service.logs.outputs import writing
+
+    with guarded(), writing(path, [config], force=force) as part:
+        yield part

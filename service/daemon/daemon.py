@@ -29,6 +29,7 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import LawSettings, PythonLaw
 from aeroloop.service.control.laws.registry import gains_of
+from aeroloop.service.daemon import operator_requests
 from aeroloop.service.daemon.certificate_gate import CertificateGate
 from aeroloop.service.daemon.claim import ClaimClient, SessionLostError
 from aeroloop.service.daemon.law_watch import LawWatch
@@ -80,7 +81,14 @@ class Daemon:
         self._gate = CertificateGate(role, configured, gains_of(law), begins)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
-            role, law, reference, settings, self._trace, self._gate, rolls=wire.actuators > 2
+            role,
+            law,
+            reference,
+            settings,
+            self._trace,
+            self._gate,
+            rolls=wire.actuators > 2,
+            why_none=self._why_none,
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
@@ -110,7 +118,7 @@ class Daemon:
         role, loop = self._role, self._loop
         role.declare("telemetry", self._settings.telemetry_rate_hz)
         role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
-        self._changes.serve()
+        operator_requests.serve(role, self._changes)
         role.serve("stand_down", Request, lambda _: self._stand_down)
         role.serve("recall", Request, lambda _: self._recall)
         role.serve("show", Request, lambda _: lambda: self._changes.record)
@@ -345,10 +353,17 @@ class Daemon:
 
     # ── an operator's requests, taken between ticks ──
 
+    def _why_none(self) -> str:
+        """Why no session runs, and what to do."""
+        name, vehicle, state = self._role.name, self._role.vehicle, self._machine.state
+        if state in (State.FAULTED, State.HOLDING):
+            return f"{name} is {state}: {self._lost}; `aeroloop op arm` lets it claim {vehicle} again"
+        return f"{name} does not have {vehicle}"
+
     def _stand_down(self) -> Answer:
         name, vehicle = self._role.name, self._role.vehicle
         if self._claims.session is None:
-            return Answer(done=False, text=f"{name} does not have {vehicle}")
+            return Answer(done=False, text=self._why_none())
         self._machine.fire(Trigger.STAND_DOWN)
         self._lost = "released by an operator"
         text = f"{self._lost}: {name} holds until `aeroloop op arm`"
@@ -415,7 +430,7 @@ class Daemon:
                 skipped=self._skipped,
                 received=self._received,
                 sent=self._sent,
-                refused=self._refused + self._controller.refused + self._changes.refused,
+                refused=self._refused + self._controller.refused + self._changes.setpoints.refused,
                 stale=self._stale,
                 saturated=self._saturated + self._controller.saturated,
                 age_us=summary(self._age.recent()),

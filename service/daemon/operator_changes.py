@@ -1,33 +1,25 @@
-"""Operator changes: gains and reference that an operator sets while the controller runs.
+"""Operator changes: gains and reference of the running controller, and what sets them.
 
-Requests arrive in Zenoh's threads. Slow checks run there; what touches the controller is queued for the loop, which
-takes it between two ticks. Every change is in the trace with the tick from which it holds, so that a log can be
-computed again. `controller.after_restart` decides what a session begins with; the plant gets a record of both, for the
-controller after this one.
+An operator's request, a stream's set-point, a reloaded configuration or the start of a session. What touches the
+controller runs in the loop, between two ticks. Every change is in the trace with the tick from which it holds, so that
+a log can be computed again. `controller.after_restart` decides what a session begins with; the plant gets a record of
+both, for the controller after this one.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from math import degrees, pi, radians
 from typing import Any, Final
 
-from zenoh.handlers import RingChannel
-
-from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import SessionRecord, Source
 from aeroloop.protocol.messages.operator import (
-    Answer,
     Change,
     Gains,
     Hold,
     Points,
     Reference,
-    Setpoint,
     Stream,
-    Track,
     in_words,
 )
 from aeroloop.protocol.messages.states import TripCause
@@ -41,10 +33,9 @@ from aeroloop.service.control.laws.registry import LawError, gains_of, with_gain
 from aeroloop.service.control.reference import FollowError, Limits, Plan
 from aeroloop.service.daemon.certificate_gate import CertificateGate, UncertifiedError
 from aeroloop.service.daemon.session_start import found, remaining
+from aeroloop.service.daemon.setpoint_stream import SetpointStream
 from aeroloop.service.settings import ControllerSettings
 
-SETPOINTS: Final = 4
-"""Set-points of a stream that are read before a tick; of more, the newest."""
 START_S: Final = 1.0
 """Least time to reach a reference that no operator gave a time for, at a session's start or a reload [s]."""
 
@@ -74,11 +65,12 @@ class OperatorChanges:
         trace: Where changes are recorded.
         gate: Certificates; None requires and publishes none.
         rolls: Whether the vehicle can roll.
+        why_none: Says why no session runs and what to do, where none does.
 
     Attributes:
         record: Gains and reference now, of the next session if none runs; a new object with every change, not with
             every set-point of a stream.
-        refused: Malformed set-points so far.
+        setpoints: What an operator streams.
     """
 
     record: SessionRecord
@@ -93,8 +85,11 @@ class OperatorChanges:
         gate: CertificateGate | None = None,
         *,
         rolls: bool,
+        why_none: Callable[[], str],
     ) -> None:
         self._role = role
+        self._why_none = why_none
+        self.setpoints = SetpointStream(role)
         self._trace = trace
         self._gate = gate
         self._rolls = rolls
@@ -107,13 +102,11 @@ class OperatorChanges:
         self._k = 0
         self._started_near = True
         self._stream = reference if isinstance(reference, Stream) else None
-        self._last_setpoint_s = 0.0
         self._gains_from: Source = "configured"
         self._reference_from: Source = "configured"
         self._within_s = 0.0
         self._since_tick = 0
         self._last: SessionRecord | None = None  # this controller's own last session
-        self.refused = 0
         self.configure(settings)
         self._note()
 
@@ -131,13 +124,6 @@ class OperatorChanges:
                 self._hold()
             elif self._reference_from == "held":
                 self._begin_with(self.configured, "configured")
-
-    def serve(self) -> None:
-        """Serve operators' queries and set-points."""
-        role = self._role
-        role.serve("set_gains", Gains, self._prepare_gains)
-        role.serve("track", Track, self._prepare_reference)
-        self._setpoints = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
 
     def prospect(self, law: LawSettings, reference: Reference) -> tuple[Gains, Reference]:
         """The gains and the reference after `adopt`, without adopting."""
@@ -173,13 +159,14 @@ class OperatorChanges:
     def begin(self, controller: Controller, session: str, last: SessionRecord | None = None) -> None:
         """Begin a session as configured; `last` is the plant's record. A stream starts at its last set-point."""
         self._controller, self._session = controller, session
+        self.setpoints.session = session
         self._k = self._since_tick = 0
         if self._settings.after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self._gains)
         controller.motion.follow(Plan.of(self._reference), 0.0)
         self._started_near = False
-        self._forget_setpoints()
+        self.setpoints.discard()
         self._trace.changes.append(Change(session=session, tick=0, gains=self._gains, reference=self._reference))
         self._note()
         self.certify()
@@ -268,34 +255,7 @@ class OperatorChanges:
         self._note()
         self._role.event("changed", text, self._session, self._k)
 
-    # ── requests: prepared in any thread, applied between two ticks ──
-
-    def _prepare_gains(self, gains: Gains) -> Callable[[], Answer]:
-        """Check new gains. Raises FollowError or UncertifiedError where they are refused."""
-        self.admit(gains=gains)
-
-        def apply() -> Answer:
-            self.admit(gains=gains)  # cached, unless more has changed since
-            answer = self.set_gains(gains)
-            self.certify()
-            return answer
-
-        return apply
-
-    def _prepare_reference(self, track: Track) -> Callable[[], Answer]:
-        """Plan and check a new reference. Raises FollowError or UncertifiedError where it is refused."""
-        source: Source = "operator" if track.reference is not None else "configured"
-        reference = track.reference or self.configured
-        plan = self.plan(reference)
-        self.admit(reference=reference)
-
-        def apply() -> Answer:
-            self.admit(reference=reference)
-            answer = self.follow(reference, plan, track.within_s, source)
-            self.certify()
-            return answer
-
-        return apply
+    # ── changes: admitted in any thread, applied between two ticks ──
 
     def admit(self, gains: Gains | None = None, reference: Reference | None = None) -> None:
         """Check a change against the certificate, where one is required; what is None stays as it is.
@@ -324,8 +284,8 @@ class OperatorChanges:
         """The reference to certify: the stream itself, not its last set-point; of what is held no angle matters."""
         return self._stream or (Hold() if self._reference_from == "held" else self._reference)
 
-    def set_gains(self, gains: Gains, source: Source = "operator") -> Answer:
-        """Use other gains from this tick on."""
+    def set_gains(self, gains: Gains, source: Source = "operator") -> str:
+        """Use other gains from this tick on. Returns them in words; empty if there are none."""
         controller = self._running()
         controller.set_gains(gains)
         self._gains, self._gains_from = controller.gains, source
@@ -333,7 +293,7 @@ class OperatorChanges:
         self._note()
         text = ", ".join(f"{name} = {list(value)}" for name, value in gains.named.items())
         self._role.event("changed", f"gains set: {text or 'nothing'}", self._session, self._k)
-        return Answer(done=True, text=f"{self._role.vehicle}: {text or 'no gain was given, so none has changed'}")
+        return text
 
     def plan(self, reference: Reference) -> Plan:
         """Plan a reference and check it against the limits, which takes time. Raises FollowError beyond them."""
@@ -343,10 +303,11 @@ class OperatorChanges:
 
     def follow(
         self, reference: Reference, plan: Plan, within_s: float | None = None, source: Source = "operator"
-    ) -> Answer:
+    ) -> str:
         """Follow a planned reference from this tick on, reached in `within_s`; None for as long as it takes.
 
-        Coming to rest takes as long as braking does. Raises FollowError if `within_s` is too short.
+        Coming to rest takes as long as braking does. Returns in words what is done. Raises FollowError if `within_s` is
+        too short.
         """
         motion, target, t = self._running().motion, plan, self._time
         held = reference
@@ -360,54 +321,27 @@ class OperatorChanges:
         self._reference, self._reference_from = held, source
         self._within_s, self._since_tick = approach.within_s, self._k
         self._stream = reference if isinstance(reference, Stream) else None
-        self._forget_setpoints()
-        self._last_setpoint_s = time.monotonic()
+        self.setpoints.begin()
         self._record(reference=held, **approach._asdict())
         self._note()
         text = f"{_action_text(reference)} within {approach.within_s:g} s"
         self._role.event("changed", text, self._session, self._k)
-        return Answer(done=True, text=f"{self._role.vehicle} {text}")
-
-    def _forget_setpoints(self) -> None:
-        """Those received before now are of the previous stream or session."""
-        while self._setpoints.try_recv() is not None:
-            pass
-
-    def _newest_setpoint(self) -> tuple[Hold, Plan] | None:
-        """The newest set-point received since the last tick that is not refused."""
-        newest = None
-        for _ in range(SETPOINTS):
-            if (sample := self._setpoints.try_recv()) is None:
-                break
-            try:
-                hold = Hold(attitude=intake.read(Setpoint, sample.payload.to_bytes()).attitude)
-                newest = hold, self.plan(hold)
-            except (intake.IntakeError, FollowError) as error:
-                self._refuse(error)
-        return newest
+        return text
 
     def _follow_stream(self, stream: Stream) -> None:
-        now, newest = time.monotonic(), self._newest_setpoint()
+        newest = self.setpoints.newest(stream, self._limits, self._k)
         if newest is None:
-            if self._last_setpoint_s and now - self._last_setpoint_s > stream.timeout_s:
-                self._last_setpoint_s = 0.0
-                text = f"no set-point for {stream.timeout_s:g} s: holds the last one"
-                self._role.event("lost", text, self._session, self._k)
             return
-        (hold, plan), self._last_setpoint_s = newest, now
+        hold, plan = newest
         motion, t = self._running().motion, self._time
         try:
             approach = motion.to_set_point(plan, t, stream.within_s, self._limits)
         except FollowError as error:
-            self._refuse(error)
+            self.setpoints.refuse(error)
             return
         motion.follow(plan, t, approach)
         self._reference = hold
         self._record(reference=hold, **approach._asdict())
-
-    def _refuse(self, error: AeroloopError) -> None:
-        self.refused += 1
-        self._role.warn("set-point", "fault", f"set-point refused: {error}", self._session)
 
     @property
     def _time(self) -> float:
@@ -415,7 +349,7 @@ class OperatorChanges:
 
     def _running(self) -> Controller:
         if self._controller is None:
-            raise FollowError(f"{self._role.name} does not have {self._role.vehicle}, so there is nothing to change")
+            raise FollowError(f"nothing to change: {self._why_none()}")
         return self._controller
 
     def _record(self, **change: Any) -> None:

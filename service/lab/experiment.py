@@ -53,7 +53,7 @@ def experiment(
     progress: Callable[[float], None] | None = None,
     watch: Watch | None = None,
 ) -> Experiment:
-    """Run the closed loop as one function if that is possible, else `through_frames`, which then calls `watch`."""
+    """Run the closed loop as one function if that is possible, else through frames; only then is `watch` called."""
     loop, wire, ticks = settings.loop, settings.wire, settings.loop.ticks(duration_s)
     report_every = loop.ticks(1.0)
     reported = 0
@@ -69,7 +69,7 @@ def experiment(
     if ticks and of_expressions and settings.plant.actuators == wire.actuators and not settings.plant.faults:
         course = loop_of(settings).run(settings, ticks, report)
     if course is None:
-        return Experiment(through_frames(settings, duration_s, progress, watch), "frames")
+        return Experiment(_through_frames(settings, duration_s, progress, watch), "frames")
     score = Score(wire, loop.period, settings.plant.watchdog_s)
     score.errors(np.arange(ticks), course.errors)
     score.commands(np.arange(ticks), course.voltages)
@@ -115,25 +115,7 @@ def run_experiment(
     plant: Plant | None = None,
     controller: Controller | None = None,
 ) -> Figures:
-    """Run the closed loop and return its figures: by the faster path, if there is nothing to watch or to replace.
-
-    Arguments and errors as `through_frames`.
-    """
-    if watch is None and plant is None and controller is None:
-        return experiment(settings, duration_s, progress).figures
-    return through_frames(settings, duration_s, progress, watch, plant=plant, controller=controller)
-
-
-def through_frames(
-    settings: Settings,
-    duration_s: float,
-    progress: Callable[[float], None] | None = None,
-    watch: Watch | None = None,
-    *,
-    plant: Plant | None = None,
-    controller: Controller | None = None,
-) -> Figures:
-    """Run the closed loop for `duration_s` of the law's time, frame by frame, and return its figures.
+    """Run the closed loop for `duration_s` of the law's time: through frames, if there is anything to watch or replace.
 
     Args:
         settings: The configuration.
@@ -148,9 +130,22 @@ def through_frames(
         PluginError, PlantError: The configured plant is not there, or failed.
         ValueError: The ends do not fit each other, such as a law for 3 motors and a plant with 2.
     """
+    if watch is None and plant is None and controller is None:
+        return experiment(settings, duration_s, progress).figures
+    return _through_frames(settings, duration_s, progress, watch, plant, controller)
+
+
+def _through_frames(
+    settings: Settings,
+    duration_s: float,
+    progress: Callable[[float], None] | None,
+    watch: Watch | None,
+    plant: Plant | None = None,
+    controller: Controller | None = None,
+) -> Figures:
     if plant is None:
         with closing(_plant(settings)) as made:  # 0 V at the end: it may be a machine
-            return through_frames(settings, duration_s, progress, watch, plant=made, controller=controller)
+            return _through_frames(settings, duration_s, progress, watch, made, controller)
     loop, wire = settings.loop, settings.wire
     controller = controller or Controller(wire, settings.law, settings.reference, loop.period)
     guard = settings.plant.guard(loop.period_ns, wire.voltage.quantizer().outermost)

@@ -12,7 +12,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.attitude import angle
 from aeroloop.service.config import Settings, with_law_settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.lab.experiment import through_frames
+from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.lab.margins import OLDEST_S, Late, least
 
 PUSHED_S: Final = 10.0
@@ -47,7 +47,7 @@ def largest_error_deg(settings: Settings, delay: int, lost: int) -> float:
             errors.append(angle(*controller.attitude_error))
 
     try:
-        through_frames(settings, PUSHED_S, watch=watch, plant=plant, controller=controller)
+        run_experiment(settings, PUSHED_S, watch=watch, plant=plant, controller=controller)
     except (AeroloopError, ValueError):
         return inf
     return degrees(max(errors))

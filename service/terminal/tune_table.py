@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 from rich.table import Table
 from rich.text import Text
 
-from aeroloop.service.lab.tune import Gain, Summary, Tuning
+from aeroloop.service.lab.tune import Tuning
+from aeroloop.service.lab.tune_costs import Summary
+from aeroloop.service.lab.tune_search import Gain
 from aeroloop.service.terminal.console import Console
 
 

@@ -112,7 +112,8 @@ def test_a_released_vehicle_is_another_controllers_until_the_first_is_recalled(h
     status = json.loads(done(hil, "status", "--json"))
     assert status["aero"]["plant"]["state"] == "idle"
     assert status["aero"]["controller"]["state"] == "holding"
-    assert "does not have" in refused(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
+    why = "is holding: released by an operator; `aeroloop op arm` lets it claim aero again"
+    assert why in refused(hil, "set-gains", "--C2", "0.2", "0.2", "0.2")
     done(hil, "arm")
     hil.eventually("driving", lambda: hil.state("controller") == "running" and hil.state("plant") == "driven")
     done(hil, "stop")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -108,6 +109,8 @@ def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, kind:
     hil.eventually("the plant is not driven", lambda: hil.state("plant") in ("tripped", "idle"))
     if kind == "Raising":
         hil.eventually("the status says why", lambda: (hil.status("controller").cause or "").startswith(fault))
+        with pytest.raises(HilError, match=rf"is faulted: {re.escape(fault)}.*; `aeroloop op arm` lets it"):
+            hil.set_gains(stiffness=[1.0, 1.0, 1.0])
     assert hil.processes.stop("controller") == (1 if kind == "Hanging" else 0)
     truths = [truth for _, truth in hil.log.messages("truth") if isinstance(truth, Truth)]
     assert not any(truths[-1].voltages)

@@ -4,12 +4,103 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal
 
 import casadi as ca
+import numpy as np
+from pydantic import Field
 
 from aeroloop import ExpressionLaw, LawSettings, Now, PythonLaw
+from aeroloop.service.control.laws.interface import Floats
+
+FAILING: Final = "tests.support.failing_laws"
+
+Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape", "another name", "gives no number"]
+
+
+class FailingSettings(LawSettings):
+    """What shall go wrong."""
+
+    failure: Failure = Field(default="raises", description="what goes wrong")
+    at: int = Field(default=3, description="at which tick")
+
+
+class Failing(PythonLaw[FailingSettings]):
+    """Counts its ticks, and fails at one of them."""
+
+    Settings = FailingSettings
+
+    def reset(self) -> None:
+        self.state = {"ticks": np.zeros(1)}
+
+    def step(self, now: Now[Floats]) -> Any:
+        del now
+        k = int(self.state["ticks"][0])
+        self.state["ticks"] += 1
+        if k != self.settings.at:
+            return [1.0] * self.actuators
+        match self.settings.failure:
+            case "raises":
+                raise RuntimeError("the estimator\ndiverged")
+            case "gives NaN":
+                return [1.0] + [np.nan] * (self.actuators - 1)
+            case "gives one voltage":
+                return [1.0]
+            case "another shape":
+                self.state["ticks"] = np.zeros(2)
+            case "another name":
+                self.state = {"tocks": np.zeros(1)}
+            case "gives no number":
+                return ["much"] * self.actuators
+        return [1.0] * self.actuators
+
+
+class WrongWidth(ExpressionLaw[LawSettings]):
+    """One voltage, whatever the number of motors."""
+
+    Settings = LawSettings
+
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        return now.rate_error[0], {}
+
+
+class WrongState(ExpressionLaw[LawSettings]):
+    """A state that is not as long as its first one."""
+
+    Settings = LawSettings
+
+    def initial(self) -> Mapping[str, Sequence[float]]:
+        return {"sum": (0.0, 0.0)}
+
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        return now.rate_error[3 - self.actuators :], {"sum": now.rate_error}
+
+
+class Picky(PythonLaw[LawSettings]):
+    """Cannot be made."""
+
+    Settings = LawSettings
+
+    def __init__(self, settings: LawSettings, period: float, actuators: int) -> None:
+        super().__init__(settings, period, actuators)
+        raise ValueError("flies with eight motors only")
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, now: Now[Floats]) -> Floats:
+        return now.rate
+
+
+class NoSettings(PythonLaw[LawSettings]):
+    """Has no model of its settings."""
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, now: Now[Floats]) -> Floats:
+        return now.rate
 
 
 class Runaway(ExpressionLaw[LawSettings]):
@@ -59,3 +150,10 @@ class Slow(FourthTick):
 
     def fail(self) -> None:
         time.sleep(0.3)
+
+
+class NoLaw:
+    """Derives from no law."""
+
+
+not_even_a_class = 3

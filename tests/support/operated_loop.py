@@ -28,9 +28,10 @@ from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.registry import gains_of
-from aeroloop.service.daemon import operator_changes
+from aeroloop.service.daemon import operator_requests, setpoint_stream
 from aeroloop.service.daemon.certificate_gate import CertificateGate
-from aeroloop.service.daemon.operator_changes import SETPOINTS, OperatorChanges
+from aeroloop.service.daemon.operator_changes import OperatorChanges
+from aeroloop.service.daemon.setpoint_stream import SETPOINTS
 from aeroloop.service.settings import ControllerSettings
 
 PERIOD = 0.002
@@ -116,7 +117,7 @@ class FakeTime:
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.now = 1000.0
-        for module in (throttle, role, operator_changes):
+        for module in (throttle, role, setpoint_stream):
             patch.setattr(module, "time", self)
 
     def monotonic(self) -> float:
@@ -149,9 +150,16 @@ class Loop:
         self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), gains_of(LAW), reference)
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
         self.live = OperatorChanges(
-            self.role, LAW, reference, settings, self.trace, self.gate if certified else None, rolls=rolls
+            self.role,
+            LAW,
+            reference,
+            settings,
+            self.trace,
+            self.gate if certified else None,
+            rolls=rolls,
+            why_none=lambda: "controller-7 does not have aero",
         )
-        self.live.serve()
+        operator_requests.serve(self.role, self.live)
         self.controller = self.fresh()
         self.k, self.session = 0, ""
         self.log: dict[str, list[tuple[int, bytes, bytes | None]]] = {}

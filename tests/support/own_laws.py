@@ -1,26 +1,20 @@
-"""Laws as a user writes them: the same PD law with a sum of errors as expressions and in Python, and laws that fail.
+"""Laws as a user writes them, as expressions and in Python; tests name them `tests.support.own_laws:Class`.
 
-All give one voltage for each of the last body axes, so they fit two motors and three.
+All give one voltage for each of the last body axes, so they fit two motors and three: a PD law with a sum of errors,
+one without gain and state, and one with a known optimum, for searches of gains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final
 
 import casadi as ca
 import numpy as np
 from pydantic import Field
 
-from aeroloop.service.control.laws.interface import (
-    ExpressionLaw,
-    Floats,
-    Gain,
-    Gains3,
-    LawSettings,
-    Now,
-    PythonLaw,
-)
+from aeroloop import ExpressionLaw, LawSettings, Now, PythonLaw
+from aeroloop.service.control.laws.interface import Floats, Gain, Gains3
 
 HERE: Final = "tests.support.own_laws"
 EXPRESSIONS, PYTHON = f"{HERE}:Expressions", f"{HERE}:Python"
@@ -72,24 +66,20 @@ class Python(PythonLaw[PDSettings]):
         return u
 
 
-class BareSettings(LawSettings):
-    """Nothing of its own."""
-
-
-class Bare(ExpressionLaw[BareSettings]):
+class Bare(ExpressionLaw[LawSettings]):
     """No gain that may change, and no state."""
 
-    Settings = BareSettings
+    Settings = LawSettings
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
         first = 3 - self.actuators
         return -15 * now.attitude_error[first + 1 :] - 6 * now.rate_error[first:], {}
 
 
-class BarePython(PythonLaw[BareSettings]):
+class BarePython(PythonLaw[LawSettings]):
     """Likewise."""
 
-    Settings = BareSettings
+    Settings = LawSettings
 
     def reset(self) -> None:
         pass
@@ -100,95 +90,37 @@ class BarePython(PythonLaw[BareSettings]):
         return u
 
 
-Failure = Literal["raises", "gives NaN", "gives one voltage", "another shape", "another name", "gives no number"]
+class OffsetSettings(LawSettings):
+    """One gain."""
+
+    offset: Annotated[float, Field(gt=0, le=5)] = 0.5
 
 
-class FailingSettings(LawSettings):
-    """What shall go wrong."""
+class Offset(ExpressionLaw[OffsetSettings]):
+    """Gives every motor the same voltage, 0 with a gain of 2: on a body at rest the one optimum."""
 
-    failure: Failure = Field(default="raises", description="what goes wrong")
-    at: int = Field(default=3, description="at which tick")
-
-
-class Failing(PythonLaw[FailingSettings]):
-    """Counts its ticks, and fails at one of them."""
-
-    Settings = FailingSettings
-
-    def reset(self) -> None:
-        self.state = {"ticks": np.zeros(1)}
-
-    def step(self, now: Now[Floats]) -> Any:
-        del now
-        k = int(self.state["ticks"][0])
-        self.state["ticks"] += 1
-        if k != self.settings.at:
-            return [1.0] * self.actuators
-        match self.settings.failure:
-            case "raises":
-                raise RuntimeError("the estimator\ndiverged")
-            case "gives NaN":
-                return [1.0] + [np.nan] * (self.actuators - 1)
-            case "gives one voltage":
-                return [1.0]
-            case "another shape":
-                self.state["ticks"] = np.zeros(2)
-            case "another name":
-                self.state = {"tocks": np.zeros(1)}
-            case "gives no number":
-                return ["much"] * self.actuators
-        return [1.0] * self.actuators
-
-
-class WrongWidth(ExpressionLaw[BareSettings]):
-    """One voltage, whatever the number of motors."""
-
-    Settings = BareSettings
+    Settings = OffsetSettings
+    gains = ("offset",)
 
     def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        return now.rate_error[0], {}
+        return ca.repmat(now.gains["offset"] - 2, self.actuators, 1), {}
 
 
-class WrongState(ExpressionLaw[BareSettings]):
-    """A state that is not as long as its first one."""
+class OffsetInPython(PythonLaw[OffsetSettings]):
+    """The same, tick by tick."""
 
-    Settings = BareSettings
-
-    def initial(self) -> Mapping[str, Sequence[float]]:
-        return {"sum": (0.0, 0.0)}
-
-    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
-        return now.rate_error[3 - self.actuators :], {"sum": now.rate_error}
-
-
-class Picky(PythonLaw[BareSettings]):
-    """Cannot be made."""
-
-    Settings = BareSettings
-
-    def __init__(self, settings: BareSettings, period: float, actuators: int) -> None:
-        super().__init__(settings, period, actuators)
-        raise ValueError("flies with eight motors only")
+    Settings = OffsetSettings
+    gains = ("offset",)
 
     def reset(self) -> None:
-        pass
+        self.state = {}
 
-    def step(self, now: Now[Floats]) -> Floats:
-        return now.rate
-
-
-class NoSettings(PythonLaw[LawSettings]):
-    """Has no model of its settings."""
-
-    def reset(self) -> None:
-        pass
-
-    def step(self, now: Now[Floats]) -> Floats:
-        return now.rate
+    def step(self, now: Now[Any]) -> Any:
+        return [now.gains["offset"][0] - 2] * self.actuators
 
 
-class NoLaw:
-    """Derives from no law."""
+class Stubborn(Offset):
+    """Takes its gain from its settings, where no change of gains reaches it."""
 
-
-not_even_a_class = 3
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:  # noqa: ARG002  # it ignores it
+        return ca.SX([self.settings.offset - 2] * self.actuators), {}

@@ -27,7 +27,7 @@ from aeroloop.protocol.messages.operator import Sinusoid
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.config import Settings, load
-from aeroloop.service.lab.experiment import through_frames
+from aeroloop.service.lab.experiment import run_experiment
 from tests.support.numpy_twin import Array
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
@@ -141,7 +141,7 @@ def test_the_aero_follows_ours_along_the_papers_experiment(
     twin = MujocoSettings(model=AERO if coulomb else SMOOTH, rotor=RotorSettings())
 
     ours = Recorded(settings.plant.build(PERIOD))
-    figures = through_frames(settings, DURATION, plant=ours)
+    figures = run_experiment(settings, DURATION, plant=ours)
 
     same_voltages = Recorded(MujocoPlant(twin, PERIOD))
     for voltages in ours.voltages:
@@ -150,7 +150,7 @@ def test_the_aero_follows_ours_along_the_papers_experiment(
     assert _apart(ours.states, same_voltages.states) < held_deg
 
     same_law = Recorded(MujocoPlant(twin, PERIOD))
-    other_figures = through_frames(settings, DURATION, plant=same_law)
+    other_figures = run_experiment(settings, DURATION, plant=same_law)
     assert _apart(ours.states, same_law.states) < closed_deg
     within = 0.02 if coulomb else 1e-4
     assert other_figures.z_track == pytest.approx(figures.z_track, rel=within)
@@ -198,7 +198,7 @@ def test_a_top_on_a_ball_joint_is_our_free_body() -> None:
 def test_a_free_body_flies_through_full_turns() -> None:
     """Roll by one turn and yaw by two at once; half a turn of the error would be the wrong way round."""
     plant = Recorded(MujocoPlant(QUADROTOR, PERIOD))
-    figures = through_frames(FLIGHT, 20.0, plant=plant)
+    figures = run_experiment(FLIGHT, 20.0, plant=plant)
     assert figures.max_error_deg is not None
     assert figures.max_error_deg < 6  # at the start: the reference begins at full speed
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.protocol.wire.symbolic import INTEGER, UNROLLED, Compiled, along_rows, buffer, in_columns, integers, parts
 
 ROWS = UNROLLED
@@ -51,9 +52,21 @@ def test_columns_have_the_bits_of_each_row(operation: str, seed: int, values: li
             assert equal_bits(np.asarray(many.outputs[name]).reshape(-1, ROWS)[:, row], single.outputs[name])
 
 
-def test_a_recursion_along_rows_is_that_of_step_after_step() -> None:
+RECURSIONS = {
+    "state and inputs": lambda x, v, w: ca.vertcat(ca.sin(x[1]) * ca.sqrt(v[0] * v[0] + w) + w, x[0] / 3 - v[1]),
+    "state alone": lambda x, v, w: ca.vertcat(x[0] + 1, ca.cos(x[1])),  # noqa: ARG005
+    "inputs alone": lambda x, v, w: ca.vertcat(v[0] / w, 3 * v[1]),  # noqa: ARG005
+    "constants": lambda x, v, w: ca.vertcat(ca.fmin(1, x[0] + 0.1), 1.5),  # noqa: ARG005
+    "no simplification": lambda x, v, w: ca.vertcat(0.1 * (0.3 * (x[0] + v[0])), x[1] + 0.1 * (0.3 * w)),
+}
+
+
+@pytest.mark.parametrize("recursion", RECURSIONS)
+def test_a_recursion_along_rows_is_that_of_step_after_step(recursion: str) -> None:
+    """Whatever of it depends on the state, which alone goes from row to row."""
     state, v, w = ca.SX.sym("state", 2), ca.SX.sym("v", 2), ca.SX.sym("w")
-    following = ca.vertcat(ca.sin(state[1]) * v[0] + w, state[0] / 3 - v[1])
+    with as_written():
+        following = RECURSIONS[recursion](state, v, w)
     step = ca.Function("step", [state, v, w], [following], ["state", "v", "w"], ["next"])
     rows = 3 * UNROLLED
     first, vs, ws = ca.MX.sym("first", 2), ca.MX.sym("vs", rows, 2), ca.MX.sym("ws", rows)

@@ -75,7 +75,7 @@ def test_a_set_point_that_is_refused_is_counted_and_changes_nothing(streaming: L
     streaming.stream(3.0)
     streaming.raw(payload)
     streaming.run(0.3)
-    assert streaming.live.refused == 1
+    assert streaming.live.setpoints.refused == 1
     assert [len(text.splitlines()) for text in streaming.events("fault")] == [1]
     assert len(streaming.changes()) == len(before) + 1  # the good one that came before it
     assert streaming.yaw() == pytest.approx(3.0, abs=1e-12)
@@ -87,7 +87,7 @@ def test_refused_set_points_are_reported_at_most_once_in_ten_seconds(streaming: 
         streaming.raw(b"junk")
         streaming.tick()
         time.now += 0.25
-    assert streaming.live.refused == 100
+    assert streaming.live.setpoints.refused == 100
     assert len(streaming.events("fault")) == 3  # at 0 s, 10 s and 20 s
     assert "39 more like it" in streaming.events("fault")[1]
 
@@ -117,7 +117,7 @@ def test_set_points_without_a_stream_reference_are_ignored(loop: Loop, time: Fak
     loop.raw(b"junk")
     time.now += 5.0
     loop.run(0.3)
-    assert (loop.live.refused, loop.yaw(), len(loop.changes())) == (0, 0.0, 1)
+    assert (loop.live.setpoints.refused, loop.yaw(), len(loop.changes())) == (0, 0.0, 1)
     assert loop.events("lost") == loop.events("fault") == []
 
 

@@ -18,7 +18,7 @@ from aeroloop.service.config import ConfigError, Settings, as_overrides, load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import c_code, experiment, loop_function
 from aeroloop.service.lab.bare_loop import bare_loop
-from aeroloop.service.lab.experiment import LoopEndedError, experiment_figures, through_frames
+from aeroloop.service.lab.experiment import LoopEndedError, experiment_figures, run_experiment
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
 from aeroloop.service.lab.traffic import frames_of, sent_ticks
 
@@ -87,7 +87,7 @@ def configured(chosen: dict[str, Any]) -> Settings:
 def through(settings: Settings, ticks: int = TICKS) -> tuple[Figures, list[tuple[bytes, bytes]]]:
     """Figures and frames of the loop through frames."""
     frames: list[tuple[bytes, bytes]] = []
-    figures = through_frames(settings, ticks * settings.loop.period, watch=lambda _k, *both: frames.append(both))
+    figures = run_experiment(settings, ticks * settings.loop.period, watch=lambda _k, *both: frames.append(both))
     return figures, frames
 
 
@@ -194,7 +194,7 @@ def test_one_function_serves_all_cells_that_differ_in_bits_seeds_and_wind() -> N
 def test_a_run_that_trips_ends_as_through_frames_with_its_reason(overrides: list[str]) -> None:
     settings = load(overrides=overrides)
     with pytest.raises(LoopEndedError) as known:
-        through_frames(settings, 4.0)
+        run_experiment(settings, 4.0, watch=lambda *_: None)
     assert loop_of(settings).run(settings, settings.loop.ticks(4.0)) is None
     with pytest.raises(LoopEndedError) as found:
         experiment.experiment(settings, 4.0)
@@ -205,7 +205,7 @@ def test_a_value_within_a_rounding_of_a_limit_is_left_to_the_frames() -> None:
     speeds = []
     settings = load(overrides=["plant.sensors.rate=gyro"])
     plant = settings.plant.build(settings.loop.period)
-    through_frames(settings, 1.0, watch=lambda *_: speeds.append(np.linalg.norm(plant.measure().rate)), plant=plant)
+    run_experiment(settings, 1.0, watch=lambda *_: speeds.append(np.linalg.norm(plant.measure().rate)), plant=plant)
     limits = settings.plant.limits
     for excess, path in ((1e-12, "frames"), (1e-6, "compiled")):
         near = limits.model_copy(update={"max_rate": max(speeds) * (1 + excess)})
@@ -216,7 +216,7 @@ def test_a_value_within_a_rounding_of_a_limit_is_left_to_the_frames() -> None:
 def test_a_fault_runs_frame_by_frame_and_the_figures_say_so() -> None:
     faulty = load(overrides=['plant.faults=["rate:bias=0.1@0.1"]'])
     found = experiment_figures(faulty, 0.3)
-    assert (found.path, found.z_track) == ("frames", through_frames(faulty, 0.3).z_track)
+    assert (found.path, found.z_track) == ("frames", run_experiment(faulty, 0.3, watch=lambda *_: None).z_track)
     assert experiment_figures(load(), 0.3).path == "compiled"
 
 

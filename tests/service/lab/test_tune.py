@@ -14,15 +14,18 @@ import pytest
 
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import Settings, load, load_over, with_law_settings
-from aeroloop.service.lab import law_margins, loop_function, tune, tune_runs, workers
+from aeroloop.service.lab import law_margins, loop_function, tune, tune_costs, tune_runs, tune_search, workers
 from aeroloop.service.lab.loop_function import Loop
-from aeroloop.service.lab.tune import Plan, TuneError, Tuning
+from aeroloop.service.lab.tune import Tuning
+from aeroloop.service.lab.tune_costs import Limits, rank
 from aeroloop.service.lab.tune_runs import Case, LawValues, Ran, run_case, with_case
+from aeroloop.service.lab.tune_search import Plan, Search, TuneError
 from aeroloop.service.terminal import tune_table
+from tests.support.failing_laws import FAILING
 from tests.support.in_this_process import InThisProcess
+from tests.support.own_laws import HERE
 
 SLOW = load(overrides=["loop.rate_hz=100"])
-OWN = "tests.support.tuned_laws:"
 AT_REST = [
     "loop.rate_hz=100", "plant.kind=rigid_body", "plant.ideal=true", "wire.actuators=3", "reference.kind=hold",
     "law.centre_of_mass=[0, 0, 0]", "plant.rigid_body.centre_of_mass=[0, 0, 0]", 'wire.voltage.bits="cont"',
@@ -30,8 +33,8 @@ AT_REST = [
 """A body that stays where it is without a voltage."""
 
 
-def own(name: str, *overrides: str) -> Settings:
-    return with_law_settings(load(overrides=[*AT_REST, f"law.kind={OWN}{name}", *overrides]))
+def own(name: str, *overrides: str, of: str = HERE) -> Settings:
+    return with_law_settings(load(overrides=[*AT_REST, f"law.kind={of}:{name}", *overrides]))
 
 
 @pytest.fixture(autouse=True)
@@ -56,7 +59,8 @@ def modelled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, list[Case]]]:
         asked.append((gain, list(cases)))
         return [optimum(gain) for _ in cases]
 
-    monkeypatch.setattr(tune, "run_cases", runs)
+    for module in (tune, tune_search):
+        monkeypatch.setattr(module, "run_cases", runs)
     monkeypatch.setattr(tune, "survives", lambda *_: 7)
     return asked
 
@@ -67,6 +71,7 @@ def found(settings: Settings, plan: Plan, doing: InThisProcess | None = None) ->
 
 
 FEW = Plan(seeds=1, winds=(0.0,), held_out=1, budget=200, duration_s=0.2)
+MASS = FEW._replace(names=["mass"])
 
 
 @pytest.mark.parametrize(("law", "path", "budget"), [("Offset", "compiled", 120), ("OffsetInPython", "frames", 60)])
@@ -92,11 +97,11 @@ def test_a_search_ends_at_the_bounds_of_the_settings_and_at_the_limits_of_its_co
     assert limited.training.changes_per_s is not None
     assert limited.training.changes_per_s <= 250
     assert limited.training.changes_per_s == limited.held_out.changes_per_s
-    assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * tune.MORE
+    assert found(own("Offset"), FEW).limits.changes_per_s == 100 * 0.5 * tune_costs.MORE
 
 
 def test_what_trips_or_exceeds_a_limit_ranks_behind_anything_that_does_not() -> None:
-    search = tune._Search(own("Offset"), FEW._replace(max_chatter=100.0), InThisProcess(), lambda *_: None)
+    limits = Limits(saturated=None, changes_per_s=100.0)
     worse = Ran(50.0, 1e9, 1.0, 100.0, 180.0)
     ordered = [
         worse._replace(z_track=49.0),
@@ -106,9 +111,9 @@ def test_what_trips_or_exceeds_a_limit_ranks_behind_anything_that_does_not() -> 
         Ran(0, 0, 0, 0, 0, 0.9, reason="late"),
         Ran(0, 0, 0, 0, 0, 0.1, reason="early"),
     ]
-    ranks = [search.rank([ran]) for ran in ordered]
+    ranks = [rank([ran], limits, FEW.weight) for ran in ordered]
     assert ranks == sorted(set(ranks))
-    assert search.rank([ordered[-1]] * 2) == 1 + 2 * 1.9
+    assert rank([ordered[-1]] * 2, limits, FEW.weight) == 1 + 2 * 1.9
 
 
 def test_the_search_never_sees_what_is_held_out(modelled: list[tuple[float, list[Case]]]) -> None:
@@ -169,11 +174,11 @@ def test_a_scaled_gain_keeps_its_ratios_0_stays_and_what_has_no_effect_stays(
     modelled: list[tuple[float, list[Case]]],
 ) -> None:
     settings = load_over(SLOW, ["law.kind=pid", "law.kp=[1, 0.5, 2]", "law.ki=[0, 0, 0.1]"])
-    search = tune._Search(settings, FEW, InThisProcess(), lambda *_: None)
+    search = Search(settings, FEW, InThisProcess(), lambda *_: None)
     assert [one.name for one in search.dimensions] == [
         "kp[0]", "kp[1]", "kp[2]", "kd[0]", "kd[1]", "kd[2]", "ki[2]"
     ]  # fmt: skip
-    scaled = tune._Search(settings, FEW._replace(scale=True), InThisProcess(), lambda *_: None)
+    scaled = Search(settings, FEW._replace(scale=True), InThisProcess(), lambda *_: None)
     assert [one.name for one in scaled.dimensions] == ["kp", "kd", "ki"]
     assert scaled._gains([log(3), 0.0, 0.0])["kp"] == pytest.approx((3, 1.5, 6))  # type: ignore[arg-type]  # a row
     assert scaled.dimensions[0].high == pytest.approx(log(10), abs=1e-4)  # 20 is the largest gain
@@ -192,8 +197,8 @@ def test_a_scaled_gain_keeps_its_ratios_0_stays_and_what_has_no_effect_stays(
         (load_over(SLOW, ["law.kind=lqr"]), FEW, "law lqr names no gains of its own: give --gain NAME.*rate_weight"),
         (load_over(SLOW, ["law.kind=pd", "law.kp=[0, 0, 0]"]), FEW._replace(names=["kp"]), "nothing to search"),
         (SLOW, FEW._replace(budget=20), "--budget must be at least 82"),
-        (own("Runaway"), FEW._replace(names=["mass"]), "no gains were found that do not trip; .*the loop ended"),
-        (own("Raising"), FEW._replace(names=["mass"]), r"no gains were found .*ZeroDivisionError: by nothing"),
+        (own("Runaway", of=FAILING), MASS, "no gains were found that do not trip; .*the loop ended"),
+        (own("Raising", of=FAILING), MASS, r"no gains were found .*ZeroDivisionError: by nothing"),
     ],
 )
 def test_where_there_is_nothing_to_search_or_nothing_flies_it_is_one_line(
@@ -221,7 +226,7 @@ def test_a_run_has_the_same_figures_by_either_path(overrides: list[str], monkeyp
 
 
 def test_a_run_that_trips_lasted_until_then() -> None:
-    ran = run_case(own("Runaway"), 4.0)
+    ran = run_case(own("Runaway", of=FAILING), 4.0)
     assert ran.reason is not None
     assert f"the loop ended after {4 * ran.lasted:g} s" in ran.reason
 
@@ -241,11 +246,11 @@ def test_the_command_prints_json_writes_toml_and_opens_no_network(
     monkeypatch.setattr(workers, "Workers", InThisProcess)
     out = tmp_path / "gains.toml"
     words = ["--seeds", "1", "--winds", "0", "--budget", "100", "--max-chatter", "1e9"]
-    law = [*AT_REST, f"law.kind={OWN}Offset"]
+    law = [*AT_REST, f"law.kind={HERE}:Offset"]
     assert printed(law, *words, "--json", "--out", str(out)) == 0
     result = json.loads(capsys.readouterr().out)
     gain = result["after"]["gains"]["offset"]
-    assert tomllib.loads(out.read_text()) == {"law": {"kind": f"{OWN}Offset", "offset": gain}}
+    assert tomllib.loads(out.read_text()) == {"law": {"kind": f"{HERE}:Offset", "offset": gain}}
     assert result["overrides"] == [f"law.offset={gain}"]
     assert load(overrides=[*law, *result["overrides"]]).law.model_dump()["offset"] == gain
     assert (result["after"]["delay_ms"], result["after"]["lost_frames"]) == (70.0, 7)
@@ -267,12 +272,13 @@ def test_gains_that_are_worse_in_what_is_held_out_are_named_so_and_exit_1(
         """Seed 0 likes 3, and the others do not."""
         return [optimum(law["offset"] if case.seed == 0 else 3.4 - law["offset"]) for case in cases]  # 0.5: 2.9
 
-    monkeypatch.setattr(tune, "run_cases", runs)
+    for module in (tune, tune_search):
+        monkeypatch.setattr(module, "run_cases", runs)
     monkeypatch.setattr(tune, "survives", lambda *_: None)
     monkeypatch.setattr(workers, "Workers", InThisProcess)
     out = tmp_path / "gains.toml"
     words = ["--seeds", "1", "--winds", "0", "--budget", "100", "--max-chatter", "1e9", "--out", str(out)]
-    assert printed([*AT_REST, f"law.kind={OWN}Offset"], *words) == 1
+    assert printed([*AT_REST, f"law.kind={HERE}:Offset"], *words) == 1
     assert "Not to be used: in the held-out set the cost rises from 0.011 to " in capsys.readouterr().out
     assert out.read_text().startswith("# Not to be used")
 
@@ -284,7 +290,8 @@ def test_a_limit_that_is_exceeded_in_what_is_held_out_is_named(
         ran = optimum(law["offset"])
         return [ran._replace(changes_per_s=(1 + case.seed) * ran.changes_per_s) for case in cases]
 
-    monkeypatch.setattr(tune, "run_cases", runs)
+    for module in (tune, tune_search):
+        monkeypatch.setattr(module, "run_cases", runs)
     monkeypatch.setattr(tune, "survives", lambda *_: None)
     result = found(own("Offset"), FEW._replace(max_chatter=500.0))
     assert (result.exceeded, result.worse) == (["changes_per_s"], None)

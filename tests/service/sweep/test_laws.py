@@ -17,9 +17,10 @@ from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.sweep.axes import digest_of
 from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
+from tests.support.failing_laws import FAILING
 
 SLOW = load(overrides=["loop.rate_hz=100"])
-RUNAWAY, RAISING = (f"tests.support.failing_laws:{name}" for name in ("Runaway", "Raising"))
+RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
 
 
 def compared(settings: Settings, **given: Any) -> dict[Choice, Settings]:

@@ -18,12 +18,13 @@ from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller, ControllerSnapshot
-from aeroloop.service.lab.experiment import experiment, through_frames
+from aeroloop.service.lab.experiment import experiment, run_experiment
 from aeroloop.service.logs.batch import BatchController
 from tests.service.control.test_tick import frames
 from tests.service.logs.test_batch import TICKS, WIRES, Run
-from tests.support import own_laws
-from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON, Failure
+from tests.support import failing_laws, own_laws
+from tests.support.failing_laws import FAILING, Failure
+from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON
 
 PERIOD = 0.002
 CONTINUOUS = WireSpec(actuators=3).with_bits(None, None)
@@ -138,7 +139,7 @@ def test_an_experiment_with_expressions_is_compiled_and_has_the_figures_of_the_f
     found = experiment(own, 3.0)
     assert found.path == "compiled"
     commands: list[bytes] = []
-    assert found.figures == through_frames(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
+    assert found.figures == run_experiment(own, 3.0, watch=lambda _k, _in, out: commands.append(out))
     assert found.course is not None
     assert [tuple(row) for row in found.course.commanded.tolist()] == [_codes(own, frame) for frame in commands]
     assert np.abs(found.course.voltages).max() > 1
@@ -159,8 +160,8 @@ def test_an_experiment_with_python_goes_through_frames_and_has_the_same_figures(
 # Laws that fail
 
 WHY = {
-    "raises": "law tests.support.own_laws:Failing: RuntimeError: the estimator diverged (own_laws.py, line {line})",
-    "gives NaN": "law tests.support.own_laws:Failing gave no number",
+    "raises": f"law {FAILING}:Failing: RuntimeError: the estimator diverged (failing_laws.py, line {{line}})",
+    "gives NaN": f"law {FAILING}:Failing gave no number",
     "gives one voltage": "it gives 1 voltages for 3 actuators",
     "another shape": "its state after a tick is not that of `reset`: ticks",
     "another name": "its state after a tick is not that of `reset`: ticks",
@@ -170,9 +171,9 @@ WHY = {
 
 @pytest.mark.parametrize("failure", get_args(Failure))
 def test_a_law_that_fails_commands_no_valid_value_and_says_why_in_one_line(failure: Failure) -> None:
-    lines = Path(own_laws.__file__).read_text().splitlines()
+    lines = Path(failing_laws.__file__).read_text().splitlines()
     line = 1 + next(i for i, text in enumerate(lines) if "raise RuntimeError" in text)
-    one = controller(f"{HERE}:Failing", f"law.failure={failure}")
+    one = controller(f"{FAILING}:Failing", f"law.failure={failure}")
     for k in range(6):
         frame = one.tick(still(CONTINUOUS, k), k)
         assert frame is not None

@@ -15,6 +15,7 @@ from aeroloop.service.config import load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import Adaptive
 from aeroloop.service.control.laws.registry import LawError, gains_of, law_of, own_settings, with_gains
+from tests.support.failing_laws import FAILING
 from tests.support.own_laws import EXPRESSIONS, HERE, PYTHON, Expressions
 
 
@@ -57,14 +58,14 @@ def test_settings_that_are_not_the_laws_are_named_with_their_key(overrides: list
     [
         ("adaptve", "law.kind = 'adaptve' is not known: it is one of adaptive, "),
         (f"{HERE}:Pd", f"{HERE} has no Pd; its classes are"),
-        (f"{HERE}:NoLaw", "does not derive from aeroloop.Law"),
-        (f"{HERE}:not_even_a_class", "does not derive from aeroloop.Law"),
-        (f"{HERE}:NoSettings", "has no Settings that derive from aeroloop.LawSettings"),
+        (f"{FAILING}:NoLaw", "does not derive from aeroloop.Law"),
+        (f"{FAILING}:not_even_a_class", "does not derive from aeroloop.Law"),
+        (f"{FAILING}:NoSettings", "has no Settings that derive from aeroloop.LawSettings"),
         (f"{HERE}:", "does not name a class"),
         (":PD", "does not name a class"),
         ("tests.support.their_laws:PD", "there is no module tests.support.their_laws here"),
         ("their_lab.laws:PD", "there is no module their_lab.laws here; install it, or add its folder to PYTHONPATH"),
-        (f"{HERE}:Picky", f"law {HERE}:Picky: ValueError: flies with eight motors only (own_laws.py, line "),
+        (f"{FAILING}:Picky", f"law {FAILING}:Picky: ValueError: flies with eight motors only (failing_laws.py, line "),
     ],
 )
 def test_a_law_that_is_not_there_or_is_none_is_refused_in_one_line(kind: str, why: str) -> None:
@@ -79,10 +80,10 @@ def test_a_law_that_is_not_there_or_is_none_is_refused_in_one_line(kind: str, wh
     ],
 )
 def test_expressions_of_another_shape_are_refused_before_the_first_tick(kind: str, why: str) -> None:
-    settings = load(overrides=[f"law.kind={HERE}:{kind}"])
+    settings = load(overrides=[f"law.kind={FAILING}:{kind}"])
     with pytest.raises(LawError) as error:
         Controller(settings.wire, settings.law, settings.reference, 0.002)
-    assert f"law {HERE}:{kind}: ValueError: {why}" in str(error.value)
+    assert f"law {FAILING}:{kind}: ValueError: {why}" in str(error.value)
 
 
 def test_gains_are_bounded_by_the_law_and_it_has_no_others() -> None:

@@ -1,0 +1,194 @@
+"""Verbs of `aeroloop lab` that run experiments and print figures of merit: one, tables, grids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aeroloop.service.cli.common import (
+    PAPER_DURATION_S,
+    BitsIn,
+    BitsOut,
+    Config,
+    Duration,
+    EngineOption,
+    Force,
+    Json,
+    Markdown,
+    Overrides,
+    check_engine,
+    check_figure,
+    checked,
+    guarded,
+    loop_of,
+    new_file,
+    show,
+    with_bits_of,
+)
+
+
+def experiment(
+    duration: Duration = PAPER_DURATION_S,
+    bits_out: BitsOut = None,
+    bits_in: BitsIn = None,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run the closed loop in this process, in lockstep, without a network."""
+    settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
+    from aeroloop.service.lab.experiment import experiment_figures
+    from aeroloop.service.terminal.display import figures_table, progress_bar
+
+    with guarded(), progress_bar("experiment", duration, hidden=json) as update:
+        figures = experiment_figures(settings, duration, update)
+    show(figures, json, lambda found: figures_table(found, path=found.path))
+
+
+def tables(
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Print how the errors change with what was not fitted; takes minutes.")
+    ] = False,
+    engine: EngineOption = "processes",
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Predict every cell of the paper's Tables C.2 to C.4 and print it beside the published value."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.lab.tables import markdown as as_markdown
+    from aeroloop.service.lab.tables import markdown_table, predict
+    from aeroloop.service.terminal.display import count_bar, paper_tables, rows_table
+
+    if sensitivity:
+        from aeroloop.service.lab.sensitivity import measure_sensitivity, rows
+
+        with guarded(), count_bar("cells", hidden=json) as update:
+            changes = measure_sensitivity(settings, seeds, update, engine)
+        text = rows(changes)
+        show(changes, json, lambda _: typer.echo(markdown_table(text)) if markdown else rows_table(text))
+        return
+    with guarded(), count_bar("cells", hidden=json) as update:
+        result = predict(settings, seeds, update, engine)
+    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)
+
+
+def calibrate(json: Json = False, config: Config = None, overrides: Overrides = None) -> None:
+    """Fit the plant to two of the paper's cells, calm and windy, and print the fitted values."""
+    settings = loop_of(config, overrides)
+    from aeroloop.service.lab.calibrate import calibrate
+    from aeroloop.service.terminal.display import calibration_table, count_bar
+
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = calibrate(settings, lambda runs: update(runs, None))
+    show(result, json, calibration_table)
+
+
+def burden(
+    bits: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OUT/IN",
+            help="Bits of ε and ω, and of u, such as 8/6; may be repeated; six pairs if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    quantizer: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="uniform, hysteresis-uniform, logarithmic-uniform, or hysteresis-rate (hysteresis for ω, uniform for "
+            "the rest); may be repeated; all four if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="perfect, encoders, gyro (2 mrad/s of noise) or shaken-gyro (20 mrad/s); may be repeated; all four "
+            "if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw error against bits/s: a .png, .svg or .pdf file.", show_default=False)
+    ] = None,
+    force: Force = False,
+    markdown: Markdown = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Measure error against bits for a grid of bits, quantizers, transmit policies and sensors, beside float64."""
+    settings = loop_of(config, overrides)
+    from aeroloop.service.lab.burden import measure_burden
+    from aeroloop.service.lab.burden_grid import grid
+    from aeroloop.service.lab.burden_table import burden_table
+    from aeroloop.service.lab.burden_table import markdown as as_markdown
+    from aeroloop.service.terminal.display import count_bar
+
+    check_engine(engine)
+    with checked():
+        check_figure(figure, config, force)
+        cells = grid(settings, bits or (), quantizer or (), sensors or ())
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = measure_burden(settings, cells, duration, update, engine)
+    show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else burden_table)
+    if figure is not None:
+        from aeroloop.service.lab.burden_figure import draw_burden
+
+        with new_file(figure, config, force) as part:
+            draw_burden(result, part)
+
+
+def sweep(
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE.parquet",
+            help="Table of all experiments. Rows are kept in FILE.jsonl as they come: the same command goes on there.",
+            show_default=False,
+        ),
+    ],
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUES",
+            help="section.key=a,b,c or section.key=a..b*n, n values evenly from a to b; may be repeated, for every "
+            "combination.",
+            show_default=False,
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Runs of each combination, with seeds of wind and sensors from 0 up.")
+    ] = 1,
+    duration: Duration = PAPER_DURATION_S,
+    engine: EngineOption = "processes",
+    force: Force = False,
+    json: Json = False,
+    config: Config = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run an experiment for every combination of values and seeds, and write a table of their figures."""
+    settings = loop_of(config, overrides)
+    check_engine(engine)
+    from aeroloop.service.sweep.axes import parse_axes
+    from aeroloop.service.sweep.sweep import plan, rows_file, run_sweep
+    from aeroloop.service.sweep.table import check_table
+    from aeroloop.service.terminal.display import count_bar
+    from aeroloop.service.terminal.sweep_table import sweep_table
+
+    with checked():
+        check_table(out, [config], force=force or rows_file(out).exists())  # the table of these rows may be made anew
+        planned = plan(settings, parse_axes(vary or ()), seeds, duration)
+    with guarded(), count_bar("experiments", hidden=json) as update:
+        result = run_sweep(planned, out, engine=engine, progress=update)
+    show(result, json, sweep_table)

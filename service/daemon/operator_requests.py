@@ -1,0 +1,46 @@
+"""Operators' requests to a controller: `set_gains` and `track`.
+
+Each is checked in one of Zenoh's threads, which takes time, and applied by the loop between two ticks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from aeroloop.protocol.messages.models import Source
+from aeroloop.protocol.messages.operator import Answer, Gains, Track
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.service.daemon.operator_changes import OperatorChanges
+
+
+def serve(role: Role, changes: OperatorChanges) -> None:
+    """Serve the requests. FollowError or UncertifiedError is the answer where one is refused."""
+    vehicle = role.vehicle
+
+    def prepare_gains(gains: Gains) -> Callable[[], Answer]:
+        changes.admit(gains=gains)
+
+        def apply() -> Answer:
+            changes.admit(gains=gains)  # cached, unless more has changed since
+            text = changes.set_gains(gains)
+            changes.certify()
+            return Answer(done=True, text=f"{vehicle}: {text or 'no gain was given, so none has changed'}")
+
+        return apply
+
+    def prepare_reference(track: Track) -> Callable[[], Answer]:
+        source: Source = "operator" if track.reference is not None else "configured"
+        reference = track.reference or changes.configured
+        plan = changes.plan(reference)
+        changes.admit(reference=reference)
+
+        def apply() -> Answer:
+            changes.admit(reference=reference)
+            text = changes.follow(reference, plan, track.within_s, source)
+            changes.certify()
+            return Answer(done=True, text=f"{vehicle} {text}")
+
+        return apply
+
+    role.serve("set_gains", Gains, prepare_gains)
+    role.serve("track", Track, prepare_reference)
