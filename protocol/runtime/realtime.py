@@ -26,10 +26,13 @@ _PR_SET_TIMERSLACK: Final = 29
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 _MCL_ONFAULT: Final = 4
+_MADV_POPULATE_WRITE: Final = 23  # Linux 5.14
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
 _HEAP_ROOM: Final = 8 << 20
 """Twice what the caches of an emulator at 500 Hz hold [bytes]."""
+_STACK: Final = 2 << 20
+"""Least stack of a thread [bytes]."""
 _CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
 _NO_LATENCY: Final = bytes(4)
 """0 µs, as the s32 that the kernel reads."""
@@ -65,6 +68,7 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     if libc.mlockall(everything | _MCL_ONFAULT) and (ctypes.get_errno() != EINVAL or libc.mlockall(everything)):
         refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
     _make_room(libc)
+    _touch_data(libc)
     try:
         # Every thread: Zenoh's, which carry the frames, must not wait for other work any more than the loop.
         for thread in os.listdir("/proc/self/task"):
@@ -96,3 +100,12 @@ def _make_room(libc: ctypes.CDLL) -> None:
         room = ctypes.c_void_p(libc.malloc(_HEAP_ROOM))
         ctypes.memset(room, 1, _HEAP_ROOM)
         libc.free(room)
+
+
+def _touch_data(libc: ctypes.CDLL) -> None:
+    """Touch what may be written: variables of libraries, Python's heap, malloc's others; not threads' stacks."""
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        addresses, access, *_ = line.split()
+        begin, end = (int(address, 16) for address in addresses.split("-"))
+        if access == "rw-p" and end - begin < _STACK:
+            libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_POPULATE_WRITE)

@@ -18,7 +18,9 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 import zenoh.ext
-from zenoh.handlers import Callback, FifoChannel, Handler, RingChannel
+from zenoh.handlers import FifoChannel, Handler, RingChannel
+
+from aeroloop.protocol.transport.direct import direct
 
 KEPT_S: Final = 65.0
 """A cache holds the messages of this time at the topic's rate [s]: 60 s and the duration of a restart."""
@@ -191,7 +193,7 @@ class RecoveringSubscriber:
     ) -> None:
         bounded = None if waiting_bytes is None else ByteRing(waiting, waiting_bytes)
         # Any: the stubs have a type for each kind of handler.
-        ring: Any = RingChannel(waiting) if bounded is None else Callback(bounded.put, indirect=False)
+        ring: Any = RingChannel(waiting) if bounded is None else direct(bounded.put)
         self._subscriber = zenoh.ext.declare_advanced_subscriber(
             session,
             key,

@@ -84,6 +84,28 @@ def test_what_a_loop_publishes_in_its_first_minute_costs_no_page_faults() -> Non
     assert max(room, again) < 50  # a few of Python's own; there are 1 000 pages
 
 
+LIBRARY_WRITES = """
+import resource
+import numpy
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.wire.loop import LoopSettings
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+    for size in range(1024):  # numpy keeps the freed arrays of each size, in a table of 16 pages
+        numpy.empty(size, numpy.int8)
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+
+prepare_process(LoopSettings())
+print(faults())
+"""
+
+
+def test_what_a_library_first_writes_in_some_later_tick_costs_no_page_faults() -> None:
+    done = subprocess.run([sys.executable, "-c", LIBRARY_WRITES], capture_output=True, text=True, timeout=60, check=True)
+    assert int(done.stdout) < 5  # a page that is read and then written costs two
+
+
 def test_a_prepared_process_is_as_it_reports() -> None:
     # In a process of its own: collector and scheduler are the process's, and pytest needs its own as they are.
     done = subprocess.run([sys.executable, "-c", PREPARED], capture_output=True, text=True, timeout=60, check=True)
@@ -117,7 +139,7 @@ def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_
     flags: list[int] = []
 
     class Libc:
-        prctl = staticmethod(lambda *_: 0)
+        prctl = madvise = staticmethod(lambda *_: 0)
 
         @staticmethod
         def mlockall(value: int) -> int:
@@ -139,7 +161,7 @@ def test_strict_names_what_is_refused_and_off_asks_for_nothing(
         raise PermissionError(1, "Operation not permitted")
 
     class Libc:
-        prctl = staticmethod(lambda *_: 0)
+        prctl = madvise = staticmethod(lambda *_: 0)
         mlockall = staticmethod(lambda *_: -1)
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
@@ -159,7 +181,7 @@ def test_a_strict_process_starts_although_idle_cpus_may_sleep(
     cpu_latency.unlink()
 
     class Libc:
-        prctl = mlockall = staticmethod(lambda *_: 0)
+        prctl = mlockall = madvise = staticmethod(lambda *_: 0)
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
     monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
