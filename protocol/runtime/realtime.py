@@ -29,8 +29,13 @@ _MCL_ONFAULT: Final = 4
 _MADV_POPULATE_WRITE: Final = 23  # Linux 5.14
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
+_M_ARENA_MAX: Final = -8
 _HEAP_ROOM: Final = 8 << 20
 """Twice what the caches of an emulator at 500 Hz hold [bytes]."""
+_OBJECT: Final = 400
+"""Python's own heap holds objects of up to 512 bytes [bytes]."""
+_OBJECTS_ROOM: Final = 2 << 20
+_objects: Final[list[bytes]] = []
 _STACK: Final = 2 << 20
 """Least stack of a thread [bytes]."""
 _CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
@@ -40,6 +45,16 @@ _NO_LATENCY: Final = bytes(4)
 
 class RealtimeError(AeroloopError):
     """`loop.realtime = "strict"`, and this host refused a setting; one line that names it."""
+
+
+def share_heap() -> None:
+    """Let threads that start from now on, Zenoh's, use the one heap in which `prepare_process` makes room.
+
+    Else malloc (glibc's) gives each a heap of its own, which grows page by page as messages come.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(_M_ARENA_MAX, 1)
 
 
 def prepare_process(settings: LoopSettings) -> list[str]:
@@ -68,6 +83,7 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     if libc.mlockall(everything | _MCL_ONFAULT) and (ctypes.get_errno() != EINVAL or libc.mlockall(everything)):
         refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
     _make_room(libc)
+    _make_room_for_objects()
     _touch_data(libc)
     try:
         # Every thread: Zenoh's, which carry the frames, must not wait for other work any more than the loop.
@@ -100,6 +116,12 @@ def _make_room(libc: ctypes.CDLL) -> None:
         room = ctypes.c_void_p(libc.malloc(_HEAP_ROOM))
         ctypes.memset(room, 1, _HEAP_ROOM)
         libc.free(room)
+
+
+def _make_room_for_objects() -> None:
+    """Touch free memory of Python's heap. Of each of its arenas, 1 MiB, an object stays: an empty one is unmapped."""
+    objects = [bytes(_OBJECT) for _ in range(_OBJECTS_ROOM // _OBJECT)]
+    _objects.extend(objects[:: 2**18 // _OBJECT])
 
 
 def _touch_data(libc: ctypes.CDLL) -> None:
