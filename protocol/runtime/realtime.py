@@ -3,7 +3,8 @@
 Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
 second, which is warm-up, and stay. Without `MCL_ONFAULT`, every thread's stack and malloc's arenas are made resident in
 full, three times what is used. What a process publishes stays in its caches for a minute, so its heap grows for as
-long: room for it is touched beforehand, and the heap never shrinks.
+long: room for it is touched beforehand, and the heap, which all threads share, never shrinks. So are room for Python's
+objects, and all variables of libraries.
 
 An idle CPU that sleeps takes long to wake; on a virtual machine, until the host schedules it again. While a process
 keeps /dev/cpu_dma_latency open with 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface.rst).
@@ -35,7 +36,9 @@ _HEAP_ROOM: Final = 8 << 20
 _OBJECT: Final = 400
 """Python's own heap holds objects of up to 512 bytes [bytes]."""
 _OBJECTS_ROOM: Final = 2 << 20
+"""As much as an arena of Python's heap and what the last one has left [bytes]."""
 _objects: Final[list[bytes]] = []
+"""Those that keep arenas mapped."""
 _STACK: Final = 2 << 20
 """Least stack of a thread [bytes]."""
 _CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
