@@ -26,7 +26,7 @@ def test_a_received_message_costs_its_thread_no_page_fault() -> None:
         here, there = gathering.join(), gathering.join()
         here.declare_subscriber("frames", direct(receive))
         publisher = there.declare_publisher("frames")
-        eventually("a subscriber", lambda: publisher.matching_status.matching)
+        eventually("a subscriber", lambda: publisher.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
         for _ in range(MESSAGES):  # each for itself: several that arrive at once share a state
             publisher.put(b"frame")
             assert received.acquire(timeout=PATIENCE_S)
