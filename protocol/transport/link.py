@@ -17,6 +17,8 @@ from typing import Final, NamedTuple
 import zenoh
 from zenoh import handlers
 
+from aeroloop.protocol.transport.direct import direct
+
 _NEVER_S: Final = 1e6
 
 
@@ -221,8 +223,8 @@ class ZenohLink(Link):
             def receive(sample: zenoh.Sample) -> None:
                 mailbox.put(sample.payload.to_bytes())
 
-            direct = handlers.Callback(receive, indirect=False)  # not by a further thread of Python
-            self._declared += [each.declare_subscriber(receive_key, direct).undeclare for each in sessions]
+            handler = direct(receive)
+            self._declared += [each.declare_subscriber(receive_key, handler).undeclare for each in sessions]
         self._publishers = [
             each.declare_publisher(
                 send_key,

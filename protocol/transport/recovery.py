@@ -15,9 +15,10 @@ from threading import Lock
 from typing import Any, Final, NamedTuple
 
 import zenoh
-from zenoh.handlers import Callback, FifoChannel, Handler, RingChannel
+from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.direct import direct
 from aeroloop.protocol.transport.publication import PUBLISHERS, Delivery, Page, read_page, read_sample, request
 
 POLL_S: Final = 2.0
@@ -215,7 +216,7 @@ class RecoveringSubscriber:
     ) -> None:
         bounded = None if waiting_bytes is None else ByteRing(waiting, waiting_bytes)
         # Any: the stubs have a type for each kind of handler.
-        ring: Any = RingChannel(waiting) if bounded is None else Callback(bounded.put, indirect=False)
+        ring: Any = RingChannel(waiting) if bounded is None else direct(bounded.put)
         self._subscriber = session.declare_subscriber(key, ring)
         self._received = bounded or self._subscriber
         self._session = session

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aeroloop.protocol.messages.models import Status
 from aeroloop.service.bench.running import ROLES, running_loop
 from aeroloop.service.config import Settings, load
 
@@ -39,8 +38,8 @@ class Memory(NamedTuple):
         locked: Whether it was asked to lock its memory (`loop.realtime` = try); the recorder never does.
         resident_mb: Resident memory [MB].
         floor_mb: Resident memory of an idle interpreter with the same libraries [MB].
-        faults: Page faults of the loop's thread, minor and major, after the first seconds of the session; 0 of the
-            recorder, which has no loop.
+        faults: Page faults of all of its threads, minor and major, after the first seconds of the session: Zenoh's
+            threads carry the frames. 0 of the recorder, which has no loop.
         ticks: Ticks of the loop meanwhile.
         refused: What the host refused, a line each.
     """
@@ -71,24 +70,26 @@ def _measure(settings: Settings, locked: bool, floor_mb: float, quick: bool) -> 
     with running_loop(settings, own_interpreters=True) as running:
         running.await_drive()
         time.sleep(WARM_UP_S)
-        before = running.statuses()
+        procs = {role: Path(f"/proc/{running.processes.pid(role)}") for role in ROLES}
+        before, faults_before = running.statuses(), {role: faults(procs[role]) for role in ROLES}
         time.sleep(QUICK_SETTLED_S if quick else SETTLED_S)
-        after = running.statuses()
-        for role in ROLES:
-            proc = Path(f"/proc/{running.processes.pid(role)}")
+        after, faults_after = running.statuses(), {role: faults(procs[role]) for role in ROLES}
+        for role, proc in procs.items():
             yield Memory(
                 role=role,
                 locked=locked and role != "recorder",
                 resident_mb=megabytes((proc / "status").read_text(), "VmRSS"),
                 floor_mb=floor_mb,
-                faults=_faults(after[role]) - _faults(before[role]),
+                faults=faults_after[role] - faults_before[role] if after[role].timing else 0,
                 ticks=after[role].ticks - before[role].ticks,
                 refused=after[role].notes if role != "recorder" else [],
             )
 
 
-def _faults(status: Status) -> int:
-    return status.timing.minor_faults + status.timing.major_faults if status.timing else 0
+def faults(proc: Path) -> int:
+    """Page faults of a process, minor and major, of all threads that it has had; `proc` is its folder in /proc."""
+    fields = (proc / "stat").read_text().rpartition(")")[2].split()  # from the third on, see proc(5)
+    return int(fields[7]) + int(fields[9])
 
 
 def megabytes(text: str, name: str) -> float:

@@ -121,8 +121,15 @@ def _publisher(session: zenoh.Session, key: str, end: _End) -> zenoh.Publisher:
 
 
 def _direct(received: Callable[[zenoh.Sample], None]) -> handlers.Callback[zenoh.Sample]:
-    """Call in Zenoh's receiving thread; without it Zenoh would hand each sample to a thread of Python."""
-    return handlers.Callback(received, indirect=False)
+    """Call in Zenoh's receiving thread, which keeps its state of Python, as in `protocol/transport/direct.py`."""
+    kept = threading.local()
+
+    def call(sample: zenoh.Sample) -> None:
+        if not hasattr(kept, "state"):
+            kept.state = ctypes.pythonapi.PyGILState_Ensure()
+        received(sample)
+
+    return handlers.Callback(call, indirect=False)
 
 
 def _prepare(end: _End) -> None:

@@ -39,7 +39,7 @@ def resident(role: str, locked: bool) -> Reading:
 
 
 def page_faults(role: str) -> Reading:
-    """Page faults of a loop's thread after its warm-up; ticks meanwhile."""
+    """Page faults of a loop's process, all threads, after its warm-up; ticks meanwhile."""
 
     def read(quick: bool) -> Figure:
         found = _memories(quick)[role, True]

@@ -214,9 +214,11 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
 def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:
     """Join the network as a role and run until SIGTERM or SIGINT."""
     _follow_parent(options)
+    from aeroloop.protocol.runtime.realtime import share_heap
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.service.daemon.claim import controller_name
 
+    share_heap()  # before a session starts threads
     name = controller_name() if kind == "controller" else None
     with guarded(), Role(kind, settings.vehicle, settings.network, settings.description(), name) as role:
         role.stop_on_signals()

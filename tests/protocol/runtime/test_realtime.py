@@ -84,6 +84,73 @@ def test_what_a_loop_publishes_in_its_first_minute_costs_no_page_faults() -> Non
     assert max(room, again) < 50  # a few of Python's own; there are 1 000 pages
 
 
+OBJECTS_GROW = """
+import resource
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.wire.loop import LoopSettings
+
+prepare_process(LoopSettings())
+kept = []
+before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+kept.extend(bytes(300) for _ in range(3000))
+print(resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before)
+"""
+
+THREADS_GROW = """
+import resource, threading
+from aeroloop.protocol.runtime.realtime import prepare_process, share_heap
+from aeroloop.protocol.wire.loop import LoopSettings
+
+share_heap()
+may_grow, grown = threading.Event(), []
+
+def grow():
+    may_grow.wait()
+    before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+    kept = [bytes(8192) for _ in range(100)]
+    grown.append(resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before)
+
+threads = [threading.Thread(target=grow) for _ in range(4)]
+for thread in threads:
+    thread.start()
+prepare_process(LoopSettings())
+may_grow.set()
+for thread in threads:
+    thread.join()
+print(sum(grown))
+"""
+
+LIBRARY_WRITES = """
+import resource
+import numpy
+from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.wire.loop import LoopSettings
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+    for size in range(1024):  # numpy keeps the freed arrays of each size, in a table of 16 pages
+        numpy.empty(size, numpy.int8)
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+
+prepare_process(LoopSettings())
+print(faults())
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="only glibc's malloc can be set up so")
+@pytest.mark.parametrize(
+    ("code", "bound"),
+    [
+        pytest.param(OBJECTS_GROW, 20, id="Python's own heap grows: 220 pages"),
+        pytest.param(THREADS_GROW, 100, id="other threads take memory: 800 pages"),
+        pytest.param(LIBRARY_WRITES, 5, id="a library writes for the first time: 15 pages, read and then written"),
+    ],
+)
+def test_what_comes_later_than_the_warm_up_costs_no_page_faults(code: str, bound: int) -> None:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert int(done.stdout) < bound
+
+
 def test_a_prepared_process_is_as_it_reports() -> None:
     # In a process of its own: collector and scheduler are the process's, and pytest needs its own as they are.
     done = subprocess.run([sys.executable, "-c", PREPARED], capture_output=True, text=True, timeout=60, check=True)
@@ -117,7 +184,7 @@ def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_
     flags: list[int] = []
 
     class Libc:
-        prctl = staticmethod(lambda *_: 0)
+        prctl = madvise = staticmethod(lambda *_: 0)
 
         @staticmethod
         def mlockall(value: int) -> int:
@@ -139,7 +206,7 @@ def test_strict_names_what_is_refused_and_off_asks_for_nothing(
         raise PermissionError(1, "Operation not permitted")
 
     class Libc:
-        prctl = staticmethod(lambda *_: 0)
+        prctl = madvise = staticmethod(lambda *_: 0)
         mlockall = staticmethod(lambda *_: -1)
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
@@ -159,7 +226,7 @@ def test_a_strict_process_starts_although_idle_cpus_may_sleep(
     cpu_latency.unlink()
 
     class Libc:
-        prctl = mlockall = staticmethod(lambda *_: 0)
+        prctl = mlockall = madvise = staticmethod(lambda *_: 0)
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
     monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)

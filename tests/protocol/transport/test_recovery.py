@@ -21,6 +21,7 @@ from aeroloop.protocol.transport.publication import (
     CachedPublisher,
     Delivery,
     Page,
+    attachment,
     read_page,
     read_request,
     request,
@@ -111,6 +112,24 @@ def test_what_no_cache_answers_for_is_left_after_a_while_and_counted() -> None:
     assert not recovery.lacks
 
 
+def test_a_message_that_came_again_is_neither_delivered_nor_held() -> None:
+    ours = Recovery()
+    for number in (0, 1, 0, 2, 1, 2):
+        ours.receive(message(number), now=0.0)
+    assert taken(ours) == [0, 1, 2]
+    assert (ours._held, ours.lacks) == (0, False)
+
+
+def test_a_page_that_is_not_the_last_says_so() -> None:
+    cache, ours = Cache(OURS, 2 * PAGE_MESSAGES), Recovery()
+    for _ in range(PAGE_MESSAGES + 1):
+        cache.put(0, b"")
+    for left in (True, False):
+        ours.read(KEY, page(cache, ours.wanted().get(OURS, 0)), now=0.0)
+        assert ours.lacks == left
+    assert len(ours.ready) == PAGE_MESSAGES + 1
+
+
 def test_nobody_speaks_for_the_publisher_of_another_key() -> None:
     recovery = Recovery()
     recovery.receive(message(0), now=0.0)
@@ -151,6 +170,8 @@ def test_bad_bytes_are_refused_whole(data: bytes) -> None:
         assert read.first + len(read.messages) <= read.end
     wanted = read_request(data)
     assert (wanted is None) == bool(len(data) % 16)
+    assert read_request(bytes(16 * PUBLISHERS)) is not None
+    assert read_request(bytes(16 * PUBLISHERS + 16)) is None
 
 
 def test_a_page_cut_anywhere_is_none_or_shorter() -> None:
@@ -202,6 +223,63 @@ def test_a_cache_that_is_written_while_it_is_read_gives_no_page_with_a_gap() -> 
     read = page(cache, 0)
     assert [payload for _, payload in read.messages] == [b"%d" % (read.first + i) for i in range(len(read.messages))]
     assert read.messages[-1][1] == b"3"
+
+
+class Answering:
+    """A session whose caches answer at once: with the pages given beforehand, for one query each."""
+
+    def __init__(self) -> None:
+        self.pages: list[bytes] = []
+        self.asked = 0
+        self.samples: list[Any] = []
+
+    def declare_subscriber(self, key: str, handler: object) -> Any:
+        return SimpleNamespace(try_recv=lambda: self.samples.pop(0) if self.samples else None)
+
+    def get(self, key: str, *arguments: object, **options: object) -> Any:
+        self.asked += 1
+        replies = [self.pages.pop(0)] if self.pages else []
+
+        def try_recv() -> Any:
+            if not replies:
+                raise zenoh.ZError("all have answered")
+            ok = SimpleNamespace(payload=zenoh.ZBytes(replies.pop(0)), key_expr=KEY + "/@cache")
+            return SimpleNamespace(ok=ok)
+
+        return SimpleNamespace(try_recv=try_recv)
+
+
+def test_caches_are_queried_at_once_for_what_is_missing_and_ever_more_seldom_for_what_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, session = [100.0], Answering()
+    monkeypatch.setattr(recovery.time, "monotonic", lambda: now[0])
+    subscriber = RecoveringSubscriber(session, ANY)  # type: ignore[arg-type]  # a double
+    cache = Cache(OURS, 10 * PAGE_MESSAGES)
+
+    def asked(seconds: float) -> int:
+        """Queries within a time, in steps of 5 ms."""
+        before = session.asked
+        for _ in range(round(seconds / 0.005)):
+            list(subscriber.take())
+            now[0] += 0.005
+        return session.asked - before
+
+    assert asked(0.2) >= 3  # nobody may be linked yet
+    asked(20.0)
+    assert asked(20.0) in (9, 10, 11)
+    sample = SimpleNamespace(
+        key_expr=KEY, payload=zenoh.ZBytes(b""), attachment=zenoh.ZBytes(attachment(0, OURS, 2 * PAGE_MESSAGES))
+    )
+    session.samples.append(sample)  # after a gap
+    assert asked(0.05) == 1
+    for _ in range(3 * PAGE_MESSAGES):
+        cache.put(0, b"")
+    session.pages = [cache.page(number) for number in range(0, 3 * PAGE_MESSAGES, PAGE_MESSAGES)]
+    assert asked(0.5) >= 3  # pages after each other
+    assert session.pages == []
+    asked(20.0)
+    assert asked(20.0) in (9, 10, 11)
 
 
 # ── between two sessions ──
@@ -272,6 +350,16 @@ def test_what_finds_no_room_to_wait_is_recovered(network: Gathering, waiting_byt
         publisher.put(payload(i))
     time.sleep(0.2)  # nothing is taken meanwhile, so the ring overflows
     assert_complete(found + collect(subscriber, 37), 40)
+
+
+def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:
+    keys = [f"aeroloop/aero/trace/{role}" for role in ("plant", "controller")]
+    publishers = [CachedPublisher(session, key, per_s=1) for session in (network.join(), network.join()) for key in keys]
+    for publisher in publishers:
+        publisher.put(b"")
+    received = collect(RecoveringSubscriber(network.join(), ANY), 4)
+    assert sorted(each.key for each in received) == sorted(2 * keys)
+    assert len({each.publisher for each in received}) == 4
 
 
 def test_a_plain_publisher_is_received_too_and_carries_no_time(network: Gathering) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import mmap
 import os
+import threading
 from pathlib import Path
 
 import pytest
 
-from aeroloop.service.bench.memory import megabytes
+from aeroloop.service.bench.memory import faults, megabytes
 
 STATUS = "VmHWM:\t  200000 kB\nVmRSS:\t  109768 kB\nRssAnon:\t   64000 kB\nVmLck:\t       0 kB\n"
 
@@ -25,3 +27,12 @@ def test_this_process_is_as_large_as_the_kernel_says_in_pages() -> None:
     shared = megabytes(Path("/proc/self/smaps_rollup").read_text(), "Pss")
     assert resident == pytest.approx(before, rel=0.05)  # it grows by what this test touches
     assert 0 < shared <= resident * 1.05
+
+
+def test_page_faults_of_every_thread_are_counted() -> None:
+    pages = 200
+    before = faults(Path("/proc/self"))
+    thread = threading.Thread(target=lambda: mmap.mmap(-1, pages * mmap.PAGESIZE).write(bytes(pages * mmap.PAGESIZE)))
+    thread.start()
+    thread.join()
+    assert faults(Path("/proc/self")) - before >= pages
