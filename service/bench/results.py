@@ -6,12 +6,16 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from math import isfinite
 from pathlib import Path
-from typing import NamedTuple
+from subprocess import SubprocessError
+from typing import Final, NamedTuple
 
 from pydantic import BaseModel, Field, RootModel, ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.bench.item import Item, Margin, NotMeasuredError
+
+INTERRUPTED: Final = "interrupted"
+"""Reason of what ^C left out."""
 
 
 class BenchError(AeroloopError):
@@ -43,6 +47,11 @@ class NotMeasured(BaseModel, frozen=True, extra="forbid"):
 class Results(RootModel[dict[str, Measured | NotMeasured]]):
     """Figures by the item's name, in the order of the table."""
 
+    @property
+    def interrupted(self) -> bool:
+        """Whether ^C ended the run."""
+        return any(isinstance(line, NotMeasured) and line.reason == INTERRUPTED for line in self.root.values())
+
     def ratios(self) -> dict[str, float]:
         """The ratios of what was measured."""
         return {name: line.ratio for name, line in self.root.items() if line.ratio is not None}
@@ -68,13 +77,16 @@ def _is_in(item: Item, word: str) -> bool:
 
 
 def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[str], None] = lambda _: None) -> Results:
-    """Measure items one after the other. One that fails costs no other.
+    """Measure items one after the other. One that fails costs no other; ^C ends with what is measured until then.
 
     `progress` is called with a line before each item, and with its figures after it.
     """
     found: dict[str, Measured | NotMeasured] = {}
+    interrupted = False
     for item in items:
         try:
+            if interrupted:
+                raise NotMeasuredError(INTERRUPTED)
             if quick and not item.quick:
                 raise NotMeasuredError("full runs only")
             progress(f"{item.name}: {item.what}")
@@ -84,7 +96,10 @@ def measure(items: Sequence[Item], *, quick: bool, progress: Callable[[str], Non
             figures = {"ours": _short(ours), "floor": _short(floor), "ratio": _short(ours / floor)}
             found[item.name] = Measured(aim=item.aim, unit=item.unit, note=note, **figures)
             progress(f"  {ours:.4g} / {floor:.4g} {item.unit} = {ours / floor:.3g}")
-        except AeroloopError as error:  # such as a process that ended
+        except KeyboardInterrupt:
+            interrupted = True
+            found[item.name] = NotMeasured(aim=item.aim, unit=item.unit, reason=INTERRUPTED)
+        except (AeroloopError, OSError, ValueError, SubprocessError) as error:  # such as a process that ended
             found[item.name] = NotMeasured(aim=item.aim, unit=item.unit, reason=str(error))
     return Results(found)
 

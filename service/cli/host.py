@@ -19,6 +19,7 @@ from aeroloop.service.cli.common import (
     settings_of,
     show,
 )
+from aeroloop.service.cli.entry import INTERRUPTED
 
 group = typer.Typer()
 
@@ -77,7 +78,10 @@ def bench(
     markdown: Markdown = False,
     json: Json = False,
 ) -> None:
-    """Measure what this project takes beside what the machine gives, in turns: item, ours, floor, ratio, aim."""
+    """Measure what this project takes beside what the machine gives, in turns: item, ours, floor, ratio, aim.
+
+    Each figure is printed on stderr as it is found; ^C ends with the table of those found until then.
+    """
     from aeroloop.service.bench.items import ITEMS
     from aeroloop.service.bench.results import chosen, compared, measure, read_results
     from aeroloop.service.terminal.bench_table import bench_markdown, bench_table
@@ -96,7 +100,7 @@ def bench(
     worse = [change for change in changes if change.worse]
     for change in worse:
         report(str(change))
-    raise typer.Exit(1 if worse else 0)
+    raise typer.Exit(INTERRUPTED if results.interrupted else 1 if worse else 0)
 
 
 @group.command()

@@ -89,6 +89,7 @@ class Attack(BaseModel):
     seconds: float = Field(description="time that the search took, this time [s]")
     ticks_per_s: float = Field(description="ticks of all loops in a second of it")
     left_ranges: int = Field(description="experiments in which a value left the wire's range")
+    path: Literal["compiled"] = Field(default="compiled", description="how the loops ran: as one function, in columns")
     beaten: bool = Field(description="whether anything exceeds what is proven")
     statements: list[Statement]
 

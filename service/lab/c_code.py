@@ -1,8 +1,10 @@
 """C code of a CasADi function, compiled once and kept: several times as fast as CasADi's virtual machine.
 
 The library is named by the hash of its source, compiler and flags, in `$XDG_CACHE_HOME/aeroloop` (`~/.cache/aeroloop`),
-and the newest KEPT stay. `-ffp-contract=off` keeps every rounding, so the bits are those of the virtual machine, which
-takes over wherever there is no compiler, or it fails.
+and the newest KEPT stay. It ends in the hash of what comes before, which no loader reads: one that is cut off or
+damaged is made anew, as loading it may end the process, or give other figures.
+`-ffp-contract=off` keeps every rounding, so the bits are those of the virtual machine, which takes over wherever there
+is no compiler, or it fails.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ import casadi as ca
 FLAGS: Final = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
 KEPT: Final = 64
 _COMPILE_S: Final = 120.0
+_HASH: Final = 32
+"""Bytes of a SHA-256."""
 
 
 def in_c(function: ca.Function) -> ca.Function | None:
@@ -50,7 +54,7 @@ def library_of(source: str) -> Path | None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aeroloop"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         library = folder / f"{sha256(identity.encode()).hexdigest()}.so"
-        if library.exists():
+        if _is_whole(library):
             os.utime(library)
         else:
             _compile(compiler, source, library)
@@ -59,12 +63,22 @@ def library_of(source: str) -> Path | None:
     return library
 
 
+def _is_whole(library: Path) -> bool:
+    if not library.exists():
+        return False
+    made = library.read_bytes()
+    return made[-_HASH:] == sha256(made[:-_HASH]).digest()
+
+
 def _compile(compiler: str, source: str, library: Path) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         code, made = Path(folder, "function.c"), Path(folder, "function.so")
         code.write_text(source)
         command = [compiler, *FLAGS, str(code), "-o", str(made), "-lm"]
         subprocess.run(command, check=True, capture_output=True, timeout=_COMPILE_S)  # noqa: S603  # found on PATH
+        digest = sha256(made.read_bytes()).digest()
+        with made.open("ab") as file:
+            file.write(digest)
         made.replace(library)
     libraries = sorted(library.parent.glob("*.so"), key=lambda path: path.stat().st_mtime)
     for old in libraries[:-KEPT]:

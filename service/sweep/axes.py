@@ -11,13 +11,17 @@ import re
 import tomllib
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import lru_cache
 from hashlib import sha256
 from inspect import getfile
 from itertools import product
 from math import prod
+from os import stat
+from os.path import expanduser, isfile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from aeroloop.plant_emulator.own_plant import EMULATED, class_of
 from aeroloop.service.config import ConfigError, Settings, load_over
 from aeroloop.service.control.laws.registry import BUILT_IN, OwnLawSettings, law_class
 
@@ -118,15 +122,30 @@ def _words(overrides: Sequence[str]) -> str:
 def digest_of(description: dict[str, Any], duration_s: float) -> str:
     """SHA-256 of what an experiment depends on but for the seed, however it was configured.
 
-    Of a law of one's own, the file of its class is part of it; what that imports is not.
+    Of a law or a plant of one's own, the file of its class is part of it, and each file that `plant.own` names, such as
+    an MJCF or FMU; what these import is not. Raises PluginError if there is no such class.
     """
     parts: dict[str, Any] = {name: description[name] for name in SECTIONS}
-    law = OwnLawSettings.model_validate(description["law"])
+    law, plant = OwnLawSettings.model_validate(description["law"]), description["plant"]
     if law.kind not in BUILT_IN:
-        parts["law_file"] = sha256(Path(getfile(law_class(law))).read_bytes()).hexdigest()
-    parts["plant"] |= {name: {**parts["plant"][name], "seed": None} for name in ("wind", "sensors")}
+        parts["law_file"] = _file_digest(getfile(law_class(law)))
+    if plant["kind"] not in EMULATED:
+        named = (value for value in plant["own"].values() if isinstance(value, str | Path))
+        files = [getfile(class_of(plant["kind"])), *filter(isfile, map(expanduser, named))]
+        parts["plant_files"] = [_file_digest(file) for file in files]
+    parts["plant"] = plant | {name: {**plant[name], "seed": None} for name in ("wind", "sensors")}
     canonical = json.dumps({**parts, "duration_s": duration_s}, sort_keys=True, separators=(",", ":"))
     return sha256(canonical.encode()).hexdigest()
+
+
+def _file_digest(path: str) -> str:
+    found = stat(path)
+    return _digest_when(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=64)
+def _digest_when(path: str, _changed: int, _size: int) -> str:
+    return sha256(Path(path).read_bytes()).hexdigest()
 
 
 def _column(description: Any, axis: Axis, given: str) -> Any:

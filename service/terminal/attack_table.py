@@ -27,7 +27,9 @@ def attack_table(attack: Attack, *, verbose: bool = False) -> None:
     console.print(table)
     console.print("\nerrors: of the wire's quantizers, or any within their bounds. from: largest ‖x‖ at the start.")
     if attack.ticks_per_s:
-        console.print(f"{attack.seconds:.0f} s, {attack.ticks_per_s / 1e6:.2f} million ticks a second.")
+        console.print(
+            f"{attack.seconds:.0f} s, {attack.ticks_per_s / 1e6:.2f} million ticks a second; path: {attack.path}."
+        )
 
 
 def _verdict(attack: Attack) -> tuple[str, str]:

@@ -17,6 +17,7 @@ def sweep_table(sweep: Sweep) -> None:
     table.add_row("run now", f"{sweep.done} in {sweep.seconds:.1f} s")
     table.add_row("resumed", str(sweep.resumed))
     table.add_row("failed", f"{sweep.failed}{' (column reason says why)' if sweep.failed else ''}")
+    table.add_row("path", sweep.path)
     if sweep.cpu_s_per_experiment is not None:
         table.add_row("cost of an experiment", f"{sweep.cpu_s_per_experiment:.3g} s of a core")
     if sweep.overhead_ms_per_job is not None:

@@ -51,15 +51,38 @@ def test_an_item_that_fails_or_gives_no_number_costs_no_other_item(bench: Made) 
     def fail(_: bool) -> Figure:
         raise AeroloopError("the plant ended with exit code 1")
 
-    nothing = [item("zero", 1.0, 0.0), item("nan", float("nan")), item("fails", 0)._replace(measure=fail)]
-    code, out, _ = bench([*nothing, item("a", 1.0)], "--json")
+    def vanish(_: bool) -> Figure:
+        raise FileNotFoundError("no process 7")
+
+    failing = [item(name, 0)._replace(measure=measure) for name, measure in (("fails", fail), ("vanishes", vanish))]
+    code, out, _ = bench([item("zero", 1.0, 0.0), item("nan", float("nan")), *failing, item("a", 1.0)], "--json")
     assert code == 0
     assert [line.get("reason") for line in json.loads(out).values()] == [
         "1 over 0",
         "nan over 1",
         "the plant ended with exit code 1",
+        "no process 7",
         None,
     ]
+
+
+def test_an_interrupt_keeps_what_was_measured_and_measures_nothing_more(bench: Made, tmp_path: Path) -> None:
+    def interrupt(_: bool) -> Figure:
+        raise KeyboardInterrupt
+
+    items = [item("a", 3.0), item("b", 0)._replace(measure=interrupt), item("c", 1.0), item("d", 1.0, quick=False)]
+    code, out, err = bench(items, "--json", "--quick")
+    assert code == 130
+    found = json.loads(out)
+    assert found["a"]["ratio"] == 3.0
+    assert [line.get("reason") for line in found.values()] == [None, *["interrupted"] * 3]
+    assert "c" not in err
+    before = tmp_path / "before.json"
+    before.write_text(out)
+    code, out, err = bench([item("a", 9.0), *items[1:]], "--compare", before)
+    assert code == 130
+    assert "not measured (interrupted): b, c, d" in out
+    assert "a is worse" in err
 
 
 def test_json_holds_the_five_figures_of_each_item_and_a_reason_where_there_are_none(bench: Made) -> None:

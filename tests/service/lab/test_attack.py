@@ -147,7 +147,9 @@ def test_what_beats_a_bound_is_reported_and_exits_with_1(
     file = tmp_path / "rounds.jsonl"
     words = ("lab", "attack", "--set", *SMALL, "--runs", str(ROUND), "--duration", str(SHORT), "--out", str(file))
     assert run(words) == 0
-    assert "Not beaten" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Not beaten" in printed
+    assert "path: compiled" in printed
     monkeypatch.setattr(attacks, "reach", too_small)
     assert run(words) == 1  # the same experiments, read from the file
     assert "Beaten: ‖z‖" in capsys.readouterr().out

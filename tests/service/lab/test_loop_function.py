@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
@@ -170,6 +171,36 @@ def test_only_the_newest_libraries_stay(tmp_path: Path, monkeypatch: pytest.Monk
     left = {path.stem for path in (tmp_path / "aeroloop").iterdir()}
     assert len(left) == c_code.KEPT
     assert not left & {"0", "1", "2", "3"}
+
+
+@needs_a_compiler
+def test_a_library_that_is_cut_off_or_damaged_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One cut off ends the process that loads it; a flipped bit may give other figures."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = c_code.source_of(ca.Function("twice", [x := ca.SX.sym("x")], [2 * x]))
+    library = c_code.library_of(source)
+    assert library is not None
+    whole = library.read_bytes()
+    flipped = bytes([*whole[:4000], whole[4000] ^ 1, *whole[4001:]])
+    for damaged in (b"", b"hello", whole[:1000], whole[: len(whole) // 2], whole[:-1], flipped, bytes(len(whole))):
+        library.unlink()  # it is loaded
+        library.write_bytes(damaged)
+        assert c_code.library_of(source) == library
+        assert ca.external("twice", str(library))(21) == 42
+        assert len(library.read_bytes()) == len(whole)
+
+
+@needs_a_compiler
+def test_no_other_process_sees_a_library_that_is_not_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All workers of a first run compile the same at once."""
+    cache, seen, compiler = tmp_path / "aeroloop", tmp_path / "seen", shutil.which("cc") or shutil.which("gcc")
+    (tmp_path / "cc").write_text(f'#!/bin/sh\n{compiler} "$@"\nls {cache} | grep [.]so >> {seen}\ntrue\n')
+    (tmp_path / "cc").chmod(0o755)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    source = c_code.source_of(ca.Function("twice", [x := ca.SX.sym("x")], [2 * x]))
+    assert c_code.library_of(source) is not None
+    assert seen.read_text() == ""
 
 
 def test_one_function_serves_all_cells_that_differ_in_bits_seeds_and_wind() -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import ConfigError, load
 from aeroloop.service.config_sources import tree_of
-from aeroloop.service.sweep.axes import Axis, configurations, parse_axes
+from aeroloop.service.sweep.axes import Axis, configurations, digest_of, parse_axes
 
 BENCH = load()
 SCALARS = (
@@ -121,3 +121,23 @@ def test_a_configuration_has_one_name_however_it_was_configured() -> None:
 def test_a_combination_that_is_no_configuration_is_refused() -> None:
     with pytest.raises(ConfigError, match="counter_bits = 4 counts"):
         configurations(BENCH, parse_axes(["wire.counter_bits=4,8", "loop.rate_hz=500,1000"]), 1, 1.0)
+
+
+def test_a_changed_law_or_plant_of_ones_own_is_another_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    law, plant, model = tmp_path / "changing_law.py", tmp_path / "changing_plant.py", tmp_path / "changing.xml"
+    mine = [
+        load(overrides=["law.kind=changing_law:Mine"]),
+        load(overrides=["plant.kind=changing_plant:Mine"]),
+        load(overrides=["plant.kind=mujoco", f"plant.own.model={model}"]),
+    ]
+    digests = set[str]()
+    for gain in (1, 2):
+        law.write_text(f"from tests.support.failing_laws import Runaway\nclass Mine(Runaway):\n    gain = {gain}\n")
+        plant.write_text(f"import aeroloop\nclass Mine(aeroloop.Plant):\n    gain = {gain}\n")
+        model.write_text(f"<mujoco model='{gain}'/>")
+        for settings in mine * 2:  # a file that stays as it is changes no name
+            digests.add(digest_of(settings.description(), 1.0))
+    assert len(digests) == 6

@@ -15,7 +15,6 @@ from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.sweep.axes import digest_of
 from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
 from tests.support.failing_laws import FAILING
 
@@ -117,14 +116,3 @@ def test_what_a_law_survives_is_the_last_step_before_the_bound(monkeypatch: pyte
         ]
         assert errors[0] <= 10 < errors[1]
     assert law_margins.survives(settings.description(), False, 0.01) is None
-
-
-def test_a_changed_law_of_ones_own_is_another_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    file = tmp_path / "changing_law.py"
-    digests = []
-    for gain in (1, 2):
-        file.write_text(f"from tests.support.failing_laws import Runaway\nclass Mine(Runaway):\n    gain = {gain}\n")
-        description = load_over(SLOW, ["law.kind=changing_law:Mine"]).description()
-        digests.append(digest_of(description, 1.0))
-    assert digests[0] != digests[1]

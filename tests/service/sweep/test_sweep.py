@@ -54,10 +54,17 @@ def test_a_row_has_the_values_the_seed_and_the_figures_of_its_experiment(tmp_pat
 def test_a_run_that_trips_is_a_row_with_its_reason(tmp_path: Path) -> None:
     limits = "plant.limits.max_rate=0.001,10"
     result, (tripped, fine) = swept(tmp_path / "a.parquet", limits)
-    assert result.failed == 1
+    assert (result.failed, result.path) == (1, "compiled")
     assert "the loop ended after" in tripped["reason"]
     assert tripped["z_track"] is tripped["skipped_ticks"] is fine["reason"] is None
     assert fine["z_track"] > 0
+
+
+def test_the_sweep_and_each_row_say_which_path_ran(tmp_path: Path) -> None:
+    """A fault runs frame by frame."""
+    result, rows = swept(tmp_path / "a.parquet", 'plant.faults=[],["rate:bias=0.1@0.1"]')
+    assert [row["path"] for row in rows] == ["compiled", "frames"]
+    assert result.path == "compiled, frames"
 
 
 def test_a_sweep_that_gets_more_values_and_seeds_runs_those_alone_and_ends_in_the_same_table(tmp_path: Path) -> None:
