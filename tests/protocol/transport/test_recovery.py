@@ -354,7 +354,9 @@ def test_what_finds_no_room_to_wait_is_recovered(network: Gathering, waiting_byt
 
 def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:
     keys = [f"aeroloop/aero/trace/{role}" for role in ("plant", "controller")]
-    publishers = [CachedPublisher(session, key, per_s=1) for session in (network.join(), network.join()) for key in keys]
+    publishers = [
+        CachedPublisher(session, key, per_s=1) for session in (network.join(), network.join()) for key in keys
+    ]
     for publisher in publishers:
         publisher.put(b"")
     received = collect(RecoveringSubscriber(network.join(), ANY), 4)
