@@ -25,11 +25,8 @@ AGAIN_S = 5.0
 """Until the plant is driven again: links take up to 1 s (retries), a claim 0.25 s, a daemon that starts 1 to 3 s."""
 
 
-def cables(hosts: Deployment) -> None:
+def cables_loss_and_a_narrow_link(hosts: Deployment) -> None:
     hosts.cut_off_each()
-
-
-def loss_and_a_narrow_link(hosts: Deployment) -> None:
     hosts.lossy(20, "both", 2.0)
     hosts.slow(256, 2.0)
     hosts.lossy(1, "both", 2.0)
@@ -53,7 +50,7 @@ def assert_cheap(outcome: Outcome) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "happens", "clocks_differ"),
-    [("peers", cables, False), ("peers", loss_and_a_narrow_link, False), ("router", cables_and_a_new_router, True)],
+    [("peers", cables_loss_and_a_narrow_link, False), ("router", cables_and_a_new_router, True)],
 )
 def test_the_plant_rests_in_time_is_driven_again_and_the_log_lacks_nothing(
     tmp_path: Path, kind: Kind, happens: Callable[[Deployment], None], clocks_differ: bool

@@ -253,10 +253,9 @@ def lockstep(tmp_path: Path) -> Iterator[Hil]:
         yield loop
 
 
-@pytest.mark.parametrize("fault", ["drop=0.01", "drop=0.05", "drop=0.2", "duplicate=0.2"])
-def test_lost_and_repeated_commands_are_ridden_out(lockstep: Hil, fault: str) -> None:
+def test_lost_and_repeated_commands_are_ridden_out(lockstep: Hil) -> None:
     """The watchdog's 50 ticks without a command do not come about by chance: 0.2⁵⁰. The plant holds what it has."""
-    lockstep.start(settings={"plant.faults": [f"command:{fault}"]})
+    lockstep.start(settings={"plant.faults": ["command:drop=0.2", "command:duplicate=0.2"]})
     lockstep.run(5)
     assert lockstep.state("plant") == "driven"
     figures = lockstep.log.figures
@@ -295,14 +294,13 @@ def test_a_command_repeated_for_ever_trips_the_watchdog(lockstep: Hil) -> None:
     assert lockstep.log.trips == ["no fresh command for 100 ms: 0 V"]
 
 
-def test_corrupted_commands_end_in_a_trip_with_its_cause_or_do_no_harm(lockstep: Hil) -> None:
+def test_corrupted_commands_end_in_a_trip_with_its_cause_and_do_no_harm(lockstep: Hil) -> None:
     """One bit in sixteen makes the code that says "no valid value" out of 0 V, so a trip is a matter of time."""
-    lockstep.start(settings={"plant.faults": ["command:garble=0.02@1"]})
-    lockstep.run(10)
+    lockstep.start(settings={"plant.faults": ["command:garble=0.3@0.5"]})
+    lockstep.run(2.5)  # 300 corrupted frames, of which the first dozens do
     log = lockstep.log
-    assert len(log.trips) <= 1
-    for trip in log.trips:
-        assert "no valid value" in trip or "no fresh command" in trip
+    (trip,) = log.trips
+    assert "no valid value" in trip or "no fresh command" in trip
     assert all(abs(u) <= 24 for _, truth in log.messages("truth") if isinstance(truth, Truth) for u in truth.voltages)
 
 

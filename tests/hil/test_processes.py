@@ -21,7 +21,9 @@ from mcap.records import Channel
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Truth
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
+from aeroloop.service.host.operator import gather
 from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.review.review import review
@@ -65,26 +67,27 @@ def eventually(what: str, condition: Callable[[], bool], timeout_s: float = STAR
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize(("bits_out", "bits_in"), [("8", "6"), ("cont", "cont")])
-def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit(
-    tmp_path: Path, bits_out: str, bits_in: str
+def test_a_demo_in_lockstep_gives_the_experiments_figures_to_the_last_bit_and_review_those_of_the_demo(
+    tmp_path: Path,
 ) -> None:
-    cell = ("--duration", "4", "--bits-out", bits_out, "--bits-in", bits_in)
-    demo = aeroloop("demo", "--lockstep", "--log", str(tmp_path / "a.mcap"), *cell)
+    log, fault = tmp_path / "a.mcap", "rate:bias=0.01@0.5..1"
+    cell = ("--duration", "2", "--set", f'plant.faults=["{fault}"]')
+    demo = aeroloop("demo", "--lockstep", "--log", str(log), *cell)
     experiment = aeroloop("lab", "experiment", *cell)
     assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}
     assert demo["skipped_ticks"] == 0
-
-
-def test_review_gives_the_figures_that_the_demo_printed(tmp_path: Path) -> None:
-    log = tmp_path / "a.mcap"
-    fault = "rate:bias=0.01@0.5..1"
-    demo = aeroloop("demo", "--lockstep", "--duration", "2", "--log", str(log), "--set", f'plant.faults=["{fault}"]')
     assert [(one["fault"], one["begin_s"], one["end_s"]) for one in demo["faults"]] == [(fault, 0.5, 1.0)]
     judged = aeroloop("log", "review", str(log))
     figures = {name: judged[name] for name in demo}
     figures["reasons"] = {name: why for name, why in judged["reasons"].items() if name in demo}
     assert figures == demo  # which has no age and holds nothing against the theorem
+
+
+def test_a_demo_in_lockstep_without_quantization_gives_the_experiments_figures_to_the_last_bit(tmp_path: Path) -> None:
+    cell = ("--duration", "1", "--bits-out", "cont", "--bits-in", "cont")
+    demo = aeroloop("demo", "--lockstep", "--log", str(tmp_path / "a.mcap"), *cell)
+    experiment = aeroloop("lab", "experiment", *cell)
+    assert {name: demo[name] for name in FIGURES} == {name: experiment[name] for name in FIGURES}
 
 
 def test_a_demo_in_real_time_tracks_and_two_run_beside_each_other(tmp_path: Path) -> None:
@@ -259,12 +262,13 @@ def test_an_operator_arms_looks_and_stops_and_no_controller_drives_before_the_pl
         return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
 
     def states() -> dict[str, str]:
-        roles = aeroloop("op", "status", "--set", f"network.rendezvous={rendezvous}")["aero"]
-        return {role: status["state"] for role, status in roles.items()}
+        statuses = gather(NetworkSettings(rendezvous=[rendezvous])).statuses["aero"]
+        return {role: status.state for role, status in statuses.items()}
 
     parts("controller")
     eventually("a refusal", said(tmp_path, "controller", "`aeroloop op arm` clears it"))
-    assert states() == {"plant": "idle", "controller": "searching"}
+    printed = aeroloop("op", "status", "--set", f"network.rendezvous={rendezvous}")["aero"]
+    assert {role: status["state"] for role, status in printed.items()} == {"plant": "idle", "controller": "searching"}
     op("arm")
     eventually("a session", said(tmp_path, "emulator", "granted to"))
     eventually("driving", lambda: states() == {"plant": "driven", "controller": "running"})

@@ -108,7 +108,10 @@ def test_a_law_that_fails_faults_by_name_and_the_plant_is_at_0_v(hil: Hil, kind:
     # It trips by the command without a value, or is released before it has read that, and then waits for a claim.
     hil.eventually("the plant is not driven", lambda: hil.state("plant") in ("tripped", "idle"))
     if kind == "Raising":
-        hil.eventually("the status says why", lambda: (hil.status("controller").cause or "").startswith(fault))
+        hil.eventually(
+            "the status says why",
+            lambda: hil.state("controller") is not None and (hil.status("controller").cause or "").startswith(fault),
+        )
         with pytest.raises(HilError, match=rf"is faulted: {re.escape(fault)}.*; `aeroloop op arm` lets it"):
             hil.set_gains(stiffness=[1.0, 1.0, 1.0])
     assert hil.processes.stop("controller") == (1 if kind == "Hanging" else 0)

@@ -72,6 +72,7 @@ class Deployment(Hosts):
         for role in HOSTS:
             self._keys.issue(role, "aero" if role in ("plant", "controller") else None)
         self._troubles: list[tuple[str, float, float]] = []  # title, begin and end [s since 1970]
+        self._finished = float("inf")  # when the daemons are ended [s since 1970]: what that costs is no trouble's
 
     def options(self, overrides: Sequence[str] = ()) -> list[str]:
         """As of any hosts, with certificates for the example's."""
@@ -153,6 +154,7 @@ class Deployment(Hosts):
         Not before `RECOVERY_S`: nothing shows from outside when the recorder has all that it asks the ends' caches for.
         """
         time.sleep(RECOVERY_S)
+        self._finished = time.time()
         for host in ("controller", "plant", "recorder"):
             self.daemons[host].send_signal(signal.SIGTERM)
             self.daemons[host].wait(STOP_WAIT_S)
@@ -172,7 +174,7 @@ class Deployment(Hosts):
             for at, status in log.messages("status")
             if isinstance(status, Status) and status.role == "plant"
         )
-        ends = [begun for _, begun, _ in self._troubles[1:]] + [float("inf")]
+        ends = [*(begun for _, begun, _ in self._troubles[1:]), self._finished]
         for (title, begun, ended), until in zip(self._troubles, ends, strict=True):
             tripped = [at for at in trips if begun < at < until]
             driven = [at for at, state in states if state == "driven" and tripped and tripped[-1] < at < until]

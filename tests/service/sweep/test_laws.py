@@ -15,8 +15,12 @@ from aeroloop.service.config import Settings, load, load_over
 from aeroloop.service.control.laws.tuning import response_of
 from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
+from aeroloop.service.sweep import laws as laws_module
+from aeroloop.service.sweep import sweep
+from aeroloop.service.sweep.axes import digest_of
 from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
 from tests.support.failing_laws import FAILING
+from tests.support.in_this_process import InThisProcess
 
 SLOW = load(overrides=["loop.rate_hz=100"])
 RUNAWAY, RAISING = f"{FAILING}:Runaway", f"{FAILING}:Raising"
@@ -73,8 +77,10 @@ def test_an_unknown_choice_is_one_line(given: dict[str, Any], text: str) -> None
 
 
 def test_a_law_that_runs_away_or_raises_is_a_row_with_its_reason_and_the_others_have_their_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for module in (sweep, laws_module):  # what workers bring back: test_engines.py
+        monkeypatch.setattr(module, "Workers", InThisProcess)
     out, figure = tmp_path / "laws.parquet", tmp_path / "laws.png"
     laws = [word for kind in ("pd", RUNAWAY, RAISING) for word in ("--law", kind)]
     few = ["--bits", "8/6", "--wind", "calm", "--plant", "aero", "--duration", "3", "--set", "loop.rate_hz=100"]
