@@ -17,7 +17,6 @@ from aeroloop.service.lab import law_margins
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.sweep import laws as laws_module
 from aeroloop.service.sweep import sweep
-from aeroloop.service.sweep.axes import digest_of
 from aeroloop.service.sweep.law_choices import LAWS, Choice, LawsError, compare
 from tests.support.failing_laws import FAILING
 from tests.support.in_this_process import InThisProcess
