@@ -22,7 +22,7 @@ KEPT_S: Final = 65.0
 """A cache holds the messages of this time at the topic's rate [s]: 60 s and the duration of a restart."""
 PAGE_BYTES: Final = 49_152
 """A page ends with the message that exceeds it: what a link sends at once is 65 536 bytes."""
-PAGE_MESSAGES: Final = 500
+PAGE_MESSAGES: Final = 250
 """Messages of a page, which are put together while the loop may wait for Python's lock."""
 PUBLISHERS: Final = 256
 """Publishers that a query may name."""
