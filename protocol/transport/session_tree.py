@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
-import stat
-import struct
-from contextlib import suppress
 from typing import Any, Final, Literal
 
 import zenoh
@@ -120,25 +116,9 @@ def open_tree(tree: dict[str, Any], threads: str = ONE_THREAD) -> zenoh.Session:
     `threads` are Zenoh's, for all sessions of the process, unless one was opened or ZENOH_RUNTIME was set before.
     """
     os.environ.setdefault("ZENOH_RUNTIME", threads)
-    session = zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
-    session.info.declare_link_events_listener(lambda _: _do_not_linger(), history=True)
-    return session
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
 
 
 def reason(error: Exception) -> str:
     """Zenoh's message without the source locations it carries."""
     return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")
-
-
-def _do_not_linger() -> None:
-    """Make closing a TCP socket of this process return at once.
-
-    Why: Zenoh sets SO_LINGER to 10 s. When a peer's cable is pulled, closing its link then blocks the thread that also
-    carries other peers' frames until the peer acknowledges what was sent: the loop stood for 1 to 2 s.
-    """
-    for name in os.listdir("/proc/self/fd"):
-        with suppress(OSError):  # closed in the meantime
-            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
-                continue
-            with socket.socket(fileno=os.dup(int(name))) as each:
-                each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))

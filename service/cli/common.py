@@ -216,9 +216,12 @@ def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options
     _follow_parent(options)
     from aeroloop.protocol.runtime.realtime import share_heap
     from aeroloop.protocol.runtime.role import Role
+    from aeroloop.protocol.transport.lingering import no_linger
     from aeroloop.service.daemon.claim import controller_name
 
     share_heap()  # before a session starts threads
+    if (refused := no_linger()) is not None:
+        log.warning("%s", refused)
     name = controller_name() if kind == "controller" else None
     with guarded(), Role(kind, settings.vehicle, settings.network, settings.description(), name) as role:
         role.stop_on_signals()
