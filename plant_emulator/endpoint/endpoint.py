@@ -54,9 +54,10 @@ class Endpoint(Tenancy):
         self.plant = plant
         self.accepted = 0
         self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
-        self._encode = [quantizer.encode for quantizer in self._quantizers]
+        self._encode = tuple(quantizer.encode for quantizer in self._quantizers)
         self._level = wire.voltage.quantizer().level
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
+        self._read, self._write = wire.command.unpack, wire.measurement.pack
         transmit = wire.transmit
         self._counters = wire.measurement.counters
         heartbeat = transmit.heartbeat_ticks(period_ns, self._counters)
@@ -122,7 +123,7 @@ class Endpoint(Tenancy):
         codes = self._encoded(seen)
         counter = self.counter
         self._unmeasured[counter] = codes is self._no_measurement
-        return self.wire.measurement.pack(counter, codes) if self._sender.due(k, codes) else SILENCE
+        return self._write(counter, codes) if self._sender.due(k, codes) else SILENCE
 
     @property
     def session_tick(self) -> int:
@@ -140,18 +141,19 @@ class Endpoint(Tenancy):
         return (self.ticked - self._start) % self._counters
 
     def _encoded(self, seen: Measurement) -> list[float]:
-        attitude, rate = seen
-        if not isfinite(sum(attitude) + sum(rate)):
+        (w, x, y, z), (a, b, c) = seen
+        if not isfinite((w + x + y + z) + (a + b + c)):
             return self._no_measurement
-        values = (*sent_vector(attitude), *rate)
-        return [encode(value) for encode, value in zip(self._encode, values, strict=True)]
+        x, y, z = sent_vector((w, x, y, z))
+        of_x, of_y, of_z, of_a, of_b, of_c = self._encode  # by name: a loop over them costs as much as they do
+        return [of_x(x), of_y(y), of_z(z), of_a(a), of_b(b), of_c(c)]
 
     def _command(self, frame: bytes) -> Outcome:
         """Apply a command frame if it is well-formed, fresh and valid."""
         if frame == SILENCE and self._silence_commands and self._codes:
             read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
         else:
-            read = self.wire.command.unpack(frame)
+            read = self._read(frame)
         if read is None:
             self.refused += 1
             return Outcome.MALFORMED
@@ -165,7 +167,7 @@ class Endpoint(Tenancy):
         if age > self._watchdog:
             self.stale += 1
             return Outcome.STALE
-        voltages = tuple(self._level(code) for code in codes)
+        voltages = tuple(map(self._level, codes))
         if not isfinite(sum(voltages)):
             if any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1)):
                 voltages = self.off  # the right answer to an invalid measurement; the guard limits how long it lasts
@@ -175,7 +177,8 @@ class Endpoint(Tenancy):
         self.voltages = voltages
         self._codes, self._echo, self._answered = codes, echo, answered
         self._fresh_tick = self.ticked
-        self._machine.fire(PlantTrigger.COMMAND)
+        if self.state is not PlantState.DRIVEN:
+            self._machine.fire(PlantTrigger.COMMAND)
         self.accepted += 1
         return Outcome.ACTED
 
@@ -183,13 +186,12 @@ class Endpoint(Tenancy):
         """Trip if no fresh command was received in time."""
         if self.session is None or self._unmeasured_yet:
             return
-        waited = tick - 1 - self._fresh_tick
-        if self.state is PlantState.DRIVEN and waited >= self._watchdog:
-            text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms"
-        elif self.state is PlantState.GRANTED and waited >= self._first_command:
-            text = f"no first command within {self._first_command * self.period_ns * 1e-9:.3g} s"
-        else:
+        driven, waited = self.state is PlantState.DRIVEN, tick - 1 - self._fresh_tick
+        if waited < (self._watchdog if driven else self._first_command):
             return
+        text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms"
+        if not driven:
+            text = f"no first command within {self._first_command * self.period_ns * 1e-9:.3g} s"
         self._trip(TripCause.COMMAND_TIMEOUT, text)
 
     def _begin(self) -> None:

@@ -151,6 +151,7 @@ class FaultyPlant(Plant):
     Attributes:
         plant: The plant without its faults.
         actuators: Number of motors.
+        elapsed: Plant time since `start` [s]; 0 before.
     """
 
     def __init__(
@@ -161,6 +162,7 @@ class FaultyPlant(Plant):
         self._period, self._limit, self._seed = period, voltage_limit, seed
         self._started = False
         self._ticks = 0
+        self.elapsed = 0.0
         self._attached = 0
         self._commanded: Values = (0.0,) * plant.actuators
         self._applied = self._commanded
@@ -173,8 +175,8 @@ class FaultyPlant(Plant):
 
     @property
     def time(self) -> float:
-        """Plant time since `start` [s]; 0 before."""
-        return round(self._ticks * self._period, 9)
+        """`elapsed`, rounded to the nanosecond."""
+        return round(self.elapsed, 9)
 
     def start(self) -> None:
         """Start the time at 0. A second call does nothing."""
@@ -230,7 +232,9 @@ class FaultyPlant(Plant):
         self._actuated = False
         self.plant.advance()
         self.passed = self.plant.passed
-        self._ticks += self._started
+        if self._started:
+            self._ticks += 1
+            self.elapsed = self._ticks * self._period
         self._seen = None
         if self._sensors:
             self.measure()  # faults that hold or delay values need every sample

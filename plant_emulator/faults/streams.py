@@ -123,7 +123,7 @@ class FaultyStream:
             self.inject(fault, 0.0)
 
     def passes(self, frame: bytes | None, t: float) -> list[bytes]:
-        """Pass the frame of a tick, if any, through the faults at time t [s], which rises.
+        """Pass the frame of a tick, if any, through the faults at time t [s], which rises. It is rounded here.
 
         Returns:
             The frames that pass at this tick, in order.

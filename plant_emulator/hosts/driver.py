@@ -142,7 +142,7 @@ class Driver:
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
-        front, measured = self._front, self.endpoint.wire.measurement
+        front = self._front
         measurement = self.tick(arrival.frame if arrival is not None else None, k)
         sent_ns = time.monotonic_ns()
         echo = None
@@ -150,6 +150,7 @@ class Driver:
             front.send(sent)
             if self._loop.lockstep:
                 # The controller takes a frame without a counter for the tick after its last.
+                measured = self.endpoint.wire.measurement
                 echo = measured.counter(sent)
                 self._counter = (self._counter + 1) % measured.counters if echo is None else echo
                 if sent == SILENCE:

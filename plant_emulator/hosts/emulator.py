@@ -131,15 +131,15 @@ class Emulator(Driver):
             self._session = session
             self._measurements.forget()
             self._commands.forget()
-        if session is not None:
-            self._faulty.start()
-        passed = self._commands.passes(frame, self._faulty.time)
+            if session is not None:
+                self._faulty.start()
+        passed = self._commands.passes(frame, self._faulty.elapsed)
         return passed[-1] if passed else None
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
         if frame == SILENCE and not self._loop.lockstep:  # not a frame, so no fault acts on it
-            return self._measurements.passes(None, self._faulty.time) or [SILENCE]
-        return self._measurements.passes(frame, self._faulty.time)
+            return self._measurements.passes(None, self._faulty.elapsed) or [SILENCE]
+        return self._measurements.passes(frame, self._faulty.elapsed)
 
 
 class EmulatorOnZenoh(Emulator):

@@ -62,6 +62,7 @@ def step_function(
         [after, mechanism.attitude(body), mechanism.rate(body), mechanism.axis_angles(body)],
         ["x", "u", "wind"],
         ["after", "attitude", "rate", "angles"],
+        {"cse": True},
     )
 
 
@@ -93,33 +94,29 @@ class EmulatedPlant(Plant):
     ) -> None:
         self.actuators = mechanism.actuators
         self._wind, self._sensors, self._limit = wind, sensors, voltage_limit
-        self._step = Compiled(step_function(mechanism, rotor, friction, period, substeps))
+        attitude, rate, angles = initially(mechanism)
+        true = sensors.given if angles else {name: sensors.given[name] for name in ("attitude", "rate")}
+        self._step = Compiled(step_function(mechanism, rotor, friction, period, substeps), true)
         self._x, self._u, self._load = (self._step.inputs[name] for name in ("x", "u", "wind"))
-        self._after, self._q, self._omega, self._angles = (
-            self._step.outputs[name] for name in ("after", "attitude", "rate", "angles")
-        )
+        self._evaluate, self._after = self._step.evaluate, self._step.outputs["after"]
         for i, value in enumerate(mechanism.initial):
             self._x[i] = value
-        self._attitude, self._rate, angles = initially(mechanism)
-        self._measurement = sensors.read(self._attitude, self._rate, angles)
+        self._measurement = sensors.read(attitude, rate, angles)
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Hold voltages [V], clipped to the supply's limits. Shape (actuators,)."""
         limit = self._limit
         for i, voltage in enumerate(voltages):
-            self._u[i] = max(-limit, min(limit, voltage))
+            self._u[i] = voltage if -limit <= voltage <= limit else max(-limit, min(limit, voltage))
 
     def advance(self) -> None:
         """Integrate one period and sample the sensors."""
         if not self._wind.calm:
             for i, torque in enumerate(self._wind.sample()):
                 self._load[i] = torque
-        self._step()
+        self._evaluate()
         self._x[:] = self._after
-        w, x, y, z = self._q
-        a, b, c = self._omega
-        self._attitude, self._rate = (w, x, y, z), (a, b, c)
-        self._measurement = self._sensors.read(self._attitude, self._rate, self._angles)
+        self._measurement = self._sensors.sample()
 
     def measure(self) -> Measurement:
         """Sensor values at the end of the last period."""
@@ -127,7 +124,9 @@ class EmulatedPlant(Plant):
 
     def truth(self) -> State:
         """The present true state."""
-        return State(self._attitude, self._rate, tuple(self._u))
+        w, x, y, z = self._sensors.given["attitude"]
+        a, b, c = self._sensors.given["rate"]
+        return State((w, x, y, z), (a, b, c), tuple(self._u))
 
     def close(self) -> None:
         """0 V."""

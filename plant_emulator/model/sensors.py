@@ -89,41 +89,49 @@ class Sensors:
             the encoders, within a step [1]), error (of the gyro [rad/s]). Outputs: seen (q and ω as measured), after
             (`held` of the next sample).
         zeros: Of pitch and yaw encoders, within a step [1].
+        given: Memory of attitude, rate and joint angles, by name: what `sample` samples.
     """
 
     def __init__(self, settings: SensorSettings, period: float) -> None:
         self._settings = settings
+        self._gyro = settings.rate == "gyro"
         self._encoders = settings.attitude == "encoders" or settings.rate == "derivative"
         self.function = sensor_function(settings, period)
         self._random = np.random.default_rng(settings.seed)
         self.zeros: list[float] = self._random.random(len(settings.counts)).tolist()
         self._noise: list[Vector] = []
-        self._sample = Compiled(self.function)
-        self._given, self._seen = self._sample.inputs, self._sample.outputs["seen"]
-        self._given["zeros"][:] = memoryview(array("d", self.zeros))
-        self._given["held"][:] = memoryview(array("d", [nan, 0.0, nan, 0.0]))
+        self._compiled = Compiled(self.function)
+        self._evaluate, given = self._compiled.evaluate, self._compiled.inputs
+        self.given = {name: given[name] for name in ("attitude", "rate", "angles")}
+        self._angles, self._held, self._error = given["angles"], given["held"], given["error"]
+        self._seen, self._after = self._compiled.outputs["seen"], self._compiled.outputs["after"]
+        given["zeros"][:] = memoryview(array("d", self.zeros))
+        self._held[:] = memoryview(array("d", [nan, 0.0, nan, 0.0]))
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
-        given = self._given
+        q, omega = self.given["attitude"], self.given["rate"]
+        q[0], q[1], q[2], q[3] = attitude
+        omega[0], omega[1], omega[2] = rate
         if self._encoders:
-            if not isfinite(angles[0] + angles[1]):
-                return NO_MEASUREMENT
-            given["angles"][0], given["angles"][1] = angles
-        true = given["attitude"]
-        true[0], true[1], true[2], true[3] = attitude
-        given["rate"][0], given["rate"][1], given["rate"][2] = rate
-        if self._settings.rate == "gyro":
-            given["error"][0], given["error"][1], given["error"][2] = self.error()
-        self._sample()
-        given["held"][:] = self._sample.outputs["after"]
-        w, x, y, z, a, b, c = self._seen
+            self._angles[0], self._angles[1] = angles
+        return self.sample()
+
+    def sample(self) -> Measurement:
+        """Sample the true values that stand in `given`. Call it once a period."""
+        if self._encoders and not isfinite(self._angles[0] + self._angles[1]):
+            return NO_MEASUREMENT
+        if self._gyro:
+            self._error[0], self._error[1], self._error[2] = self.error()
+        self._evaluate()
+        self._held[:] = self._after
+        w, x, y, z, a, b, c = self._seen.tolist()
         return Measurement((w, x, y, z), (a, b, c))
 
     @property
     def held(self) -> list[float]:
         """Memory of the filters; see `function`."""
-        return self._given["held"].tolist()  # type: ignore[return-value]  # doubles
+        return self._held.tolist()  # type: ignore[return-value]  # doubles
 
     def error(self) -> Vector:
         """Draw a gyro's next error, noise and bias [rad/s]."""

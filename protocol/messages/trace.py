@@ -432,10 +432,13 @@ class TraceWriter:
         records = np.frombuffer(self._buffer, self._dtype, rows)
         names = self._dtype.names
         assert names is not None
-        columns = [
-            (np.diff(records[name], prepend=records.dtype[name].type(0)) if name in STEPS else records[name]).tobytes()
-            for name in names
-        ]
+        columns = []
+        for name in names:
+            column = records[name]
+            if name in STEPS:
+                column = column.copy()
+                column[1:] -= records[name][:-1]
+            columns.append(column.tobytes())
         self._published += rows
         self.rows = 0
         self.state, self.changes, self.operations = None, [], []
