@@ -38,7 +38,10 @@ class Shapes:
         self.root = _schema(model)
 
     def resolved(self, shape: Shape) -> Shape:
-        """The node that a reference stands for, under the referring field's description."""
+        """The node that a reference stands for, also one that may be null, under the referring field's description."""
+        references = [each for each in shape.get("anyOf", []) if "$ref" in each]
+        if len(references) == 1:
+            shape = {**references[0], **{name: value for name, value in shape.items() if name != "anyOf"}}
         if "$ref" not in shape:
             return shape
         target = self.root["$defs"][shape["$ref"].rpartition("/")[2]]
@@ -209,7 +212,7 @@ def _many(one: str, shape: Shape) -> str:
 
 def either(options: Sequence[str]) -> str:
     """Choices in words: `a, b or c`."""
-    *most, last = dict.fromkeys(options)
+    *most, last = dict.fromkeys(options) or [""]
     return f"{', '.join(most)} or {last}" if most else last
 
 

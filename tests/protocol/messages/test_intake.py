@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from random import Random
 from typing import Any
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from aeroloop.protocol import wording
 from aeroloop.protocol.messages.intake import FEW, REFERENCE, STATUS, IntakeError, read
-from aeroloop.protocol.messages.models import FaultStatus, Status, Tenure
+from aeroloop.protocol.messages.models import FaultStatus, Grant, Status, Tenure
 from aeroloop.protocol.messages.operator import MAX_POINTS, Inject, Message, Points, Request, Track
 from aeroloop.protocol.messages.topics import POINTS_BYTES, STATUS_BYTES, TOPICS
 from tests.support.every_message import MESSAGES
@@ -32,6 +33,20 @@ def test_a_mutated_message_is_read_or_refused_in_one_short_line(message: Message
         except IntakeError as error:
             (line,) = str(error).splitlines()
             assert len(line) < 2000
+
+
+def test_an_unknown_kind_is_refused_also_within_what_may_be_absent() -> None:
+    """A plant's answer to a claim, with the vehicle's last session."""
+    record: dict[str, Any] = {
+        "controller": "c",
+        "session": "s",
+        "gains": {},
+        "gains_from": "operator",
+        "reference": {"kind": "x"},
+    }
+    record |= {"reference_from": "operator", "within_s": 1.0, "since_tick": 0}
+    with pytest.raises(IntakeError, match=r'last\.reference\.kind must be "hold", .* or "stream", not "x"'):
+        read(Grant, json.dumps({"session": "s", "last": record}).encode())
 
 
 @settings(max_examples=100)
