@@ -21,7 +21,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.direct import direct
 from aeroloop.protocol.transport.publication import PUBLISHERS, Delivery, Page, read_page, read_sample, request
 
-POLL_S: Final = 2.0
+POLL_S: Final = 0.5
 """Pause between two queries when nothing is missing [s]."""
 AGAIN_S: Final = 0.025
 """Least pause [s]: a process takes 50 queries a second on a topic. It doubles while nothing new is found."""
@@ -224,13 +224,13 @@ class RecoveringSubscriber:
         self._recovery = Recovery()
         self._replies: Handler[zenoh.Reply] | None = None
         self._pause = AGAIN_S
-        self._due = 0.0
+        self._asked = self._due = 0.0
         self._lacked = False
 
     @property
-    def joining(self) -> bool:
-        """Whether messages are missing that may be recovered; later ones are held back for them."""
-        return self._recovery.lacks
+    def recovering(self) -> bool:
+        """Whether an answer is awaited, or messages are missing that may be recovered; take again soon."""
+        return self._replies is not None or self._recovery.lacks
 
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
         """Messages received and not yet taken, each publisher's in order. Never waits.
@@ -269,11 +269,12 @@ class RecoveringSubscriber:
                 return
             except zenoh.ZError:  # all have answered
                 self._replies = None
-                self._due, self._pause = now + self._pause, min(2 * self._pause, POLL_S)
+                self._due, self._pause = self._asked + self._pause, min(2 * self._pause, POLL_S)
         if recovery.lacks and not self._lacked:  # a gap is new
             self._pause, self._due = AGAIN_S, min(self._due, now + AGAIN_S)
         self._lacked = recovery.lacks
         if now >= self._due:
+            self._asked = now
             with suppress(zenoh.ZError):  # the session is closed
                 self._replies = self._ask()
 

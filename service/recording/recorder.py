@@ -35,6 +35,7 @@ WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
 
 SOON_S: Final = 0.05
+"""Unless caches are being queried: of each, a page is taken at a time."""
 MANY: Final = 100
 """After so many messages at once, as of a flood, the next are taken soon: each may hold 64 KiB of Zenoh's buffers."""
 
@@ -96,7 +97,7 @@ class Recorder:
         self._role.event("started", f"recording to {self.log.path}")
         try:
             taken = 0
-            while not self._role.stop.wait(0.0 if self._behind else WORK_EVERY_S if taken < MANY else SOON_S):
+            while not self._role.stop.wait(self._pause_s(taken)):
                 taken = self._take()
                 self._role.take_inbox()
                 if time.monotonic() >= self._status_due:
@@ -122,11 +123,16 @@ class Recorder:
             pass
         now = last = time.monotonic()
         deadline = now + GOES_ON_S
-        while now < deadline and (now - last < QUIET_S or self._subscriptions.joining):
+        while now < deadline and (now - last < QUIET_S or self._subscriptions.recovering):
             time.sleep(0.0 if self._behind else QUIET_S / 10)
             now = time.monotonic()
             if self._take():
                 last = now
+
+    def _pause_s(self, taken: int) -> float:
+        if self._behind:
+            return 0.0
+        return SOON_S if taken >= MANY or self._subscriptions.recovering else WORK_EVERY_S
 
     @property
     def _behind(self) -> bool:

@@ -47,9 +47,9 @@ class Subscriptions:
         ]
 
     @property
-    def joining(self) -> bool:
-        """Whether messages are missing that may be recovered."""
-        return any(subscriber.joining for subscriber in self._topics.values())
+    def recovering(self) -> bool:
+        """Whether caches are being queried for messages; take again soon."""
+        return any(subscriber.recovering for subscriber in self._topics.values())
 
     def take(self, *, held: bool = False) -> Iterator[Delivery]:
         """Messages received and not yet taken, topic by topic, descriptions first; with `held` all. Never waits."""

@@ -267,7 +267,7 @@ def test_caches_are_queried_at_once_for_what_is_missing_and_ever_more_seldom_for
 
     assert asked(0.2) >= 3  # nobody may be linked yet
     asked(20.0)
-    assert asked(20.0) in (9, 10, 11)
+    assert 38 <= asked(20.0) <= 41
     sample = SimpleNamespace(
         key_expr=KEY, payload=zenoh.ZBytes(b""), attachment=zenoh.ZBytes(attachment(0, OURS, 2 * PAGE_MESSAGES))
     )
@@ -279,7 +279,7 @@ def test_caches_are_queried_at_once_for_what_is_missing_and_ever_more_seldom_for
     assert asked(0.4) >= 8  # pages after each other
     assert session.pages == []
     asked(20.0)
-    assert asked(20.0) in (9, 10, 11)
+    assert 38 <= asked(20.0) <= 41
 
 
 # ── between two sessions ──

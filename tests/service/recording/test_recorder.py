@@ -27,6 +27,7 @@ from aeroloop.service.recording import backlog, rolling
 from aeroloop.service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
 from aeroloop.service.recording.recorder import MANY, SOON_S, WORK_EVERY_S, Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
+from aeroloop.service.recording.subscriptions import Subscriptions
 from aeroloop.service.settings import RecorderSettings
 from tests.service.recording.conftest import CHANGES
 from tests.support.made_messages import Ends, description_of
@@ -273,14 +274,21 @@ class Waits(threading.Event):
         return super().wait(timeout)
 
 
-def test_while_many_messages_come_the_next_are_taken_soon_and_then_as_seldom_as_before(
-    record: Record, publisher: Publisher
+@pytest.mark.parametrize("recovering", [False, True])
+def test_the_next_messages_are_taken_soon_while_many_come_or_caches_are_queried_and_else_seldom(
+    record: Record, publisher: Publisher, monkeypatch: pytest.MonkeyPatch, recovering: bool
 ) -> None:
-    """What waits in a ring may hold far more memory than its own size."""
+    """What waits in a ring may hold far more memory than its own size; of a cache a page is taken at a time."""
+    monkeypatch.setattr(Subscriptions, "recovering", recovering)
     running, waits = record(), Waits()
     running.role.stop = waits
     publisher.send(1)
     eventually("the first", lambda: running.recorder.log.written > 2)
+    if recovering:
+        eventually("soon", lambda: waits.asked[-1] == SOON_S)
+        monkeypatch.setattr(Subscriptions, "recovering", False)
+        eventually("as seldom as before", lambda: waits.asked[-1] == WORK_EVERY_S)
+        waits.asked.clear()
     assert set(waits.asked) <= {WORK_EVERY_S}
     publisher.send(2 * MANY)
     eventually("soon", lambda: SOON_S in waits.asked)
