@@ -260,16 +260,19 @@ class RecoveringSubscriber:
         """Read answers, and query the caches again when it is time."""
         recovery = self._recovery
         if self._replies is not None:
-            found = len(recovery.ready)
+            found, answered = len(recovery.ready), False
             try:
                 while (reply := self._replies.try_recv()) is not None:
                     if reply.ok is not None and (page := read_page(reply.ok.payload.to_bytes())) is not None:
                         recovery.read(topics.cached_key(str(reply.ok.key_expr)), page, now)
-                        self._pause = AGAIN_S if len(recovery.ready) > found else self._pause
-                return
             except zenoh.ZError:  # all have answered
-                self._replies = None
-                self._due, self._pause = self._asked + self._pause, min(2 * self._pause, POLL_S)
+                answered = True
+            if len(recovery.ready) > found:  # the next pages, without waiting for a process that hangs
+                answered, self._pause = True, AGAIN_S
+            if not answered:
+                return
+            self._replies = None
+            self._due, self._pause = self._asked + self._pause, min(2 * self._pause, POLL_S)
         if recovery.lacks and not self._lacked:  # a gap is new
             self._pause, self._due = AGAIN_S, min(self._due, now + AGAIN_S)
         self._lacked = recovery.lacks

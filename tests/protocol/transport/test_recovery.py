@@ -231,6 +231,7 @@ class Answering:
     def __init__(self) -> None:
         self.pages: list[bytes] = []
         self.asked = 0
+        self.hangs = False  # whether one of those asked never answers
         self.samples: list[Any] = []
 
     def declare_subscriber(self, *_: object) -> Any:
@@ -241,6 +242,8 @@ class Answering:
         replies = [self.pages.pop(0)] if self.pages else []
 
         def try_recv() -> Any:
+            if not replies and self.hangs:
+                return None
             if not replies:
                 raise zenoh.ZError("all have answered")
             ok = SimpleNamespace(payload=zenoh.ZBytes(replies.pop(0)), key_expr=KEY + "/@cache")
@@ -280,6 +283,22 @@ def test_caches_are_queried_at_once_for_what_is_missing_and_ever_more_seldom_for
     assert session.pages == []
     asked(20.0)
     assert 38 <= asked(20.0) <= 41
+
+
+def test_a_process_that_hangs_does_not_hold_up_the_pages_of_others() -> None:
+    session, cache = Answering(), Cache(OURS, 10 * PAGE_MESSAGES)
+    session.hangs = True
+    subscriber, found = RecoveringSubscriber(session, ANY), list[Delivery]()  # type: ignore[arg-type]  # a double
+    for _ in range(8 * PAGE_MESSAGES):
+        cache.put(0, b"")
+    session.pages = [cache.page(number) for number in range(0, 8 * PAGE_MESSAGES, PAGE_MESSAGES)]
+
+    def received() -> bool:
+        found.extend(subscriber.take())
+        return len(found) == 8 * PAGE_MESSAGES
+
+    eventually("all pages", received)
+    assert session.asked in (8, 9)
 
 
 # ── between two sessions ──
