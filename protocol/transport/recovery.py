@@ -116,7 +116,7 @@ class Recovery:
         """Take a page of a cache on a key."""
         publisher = self._of((key, page.publisher), now)
         if not publisher.begun:
-            publisher.begun, publisher.next = True, page.first
+            publisher.begun, publisher.next = True, min(page.first, min(publisher.held, default=page.first))
         if not publisher.lacks:
             publisher.stuck = now
         publisher.end = max(publisher.end, page.end)
