@@ -1,7 +1,7 @@
 """Plant end on Zenoh.
 
 Answers claims and operator commands, opens and closes the session's link, publishes status, events and the trace, and
-counts the frames. Claims, operator commands and lost peers arrive in Zenoh's threads and are queued until the owner
+counts the frames. Claims, operator commands and lost peers arrive in other threads and are queued until the owner
 takes them between ticks, so that only one thread uses the endpoint.
 """
 
@@ -169,7 +169,7 @@ class ZenohFront(Front):
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
         self.publish_status()
 
-    # ── queries and tokens from Zenoh's threads, processed between ticks ──
+    # ── queries and tokens from other threads, processed between ticks ──
 
     def _watch(self, holder: str) -> None:
         def seen(appeared: bool) -> None:

@@ -207,7 +207,7 @@ class Role:
         return time.monotonic() - self._started
 
     def answer(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
-        """Answer queries on a key until the role is closed. The callback runs in one of Zenoh's threads."""
+        """Answer queries on a key until the role is closed. The callback runs in a thread of its own."""
         self.zenoh.declare_queryable(key, callback, complete=True)
 
     def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
@@ -219,7 +219,7 @@ class Role:
         Args:
             topic: Name of a query in the table.
             model: Model of the request; any other payload is answered by an Answer with the error.
-            prepare: Called with the request in one of Zenoh's threads, for work that takes time. The function that it
+            prepare: Called with the request in a thread of the topic's, for work that takes time. The function that it
                 returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
         """
         key = topics.key(topic, self.vehicle)
@@ -278,7 +278,7 @@ class Role:
         return True
 
     def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
-        """Call back when a role's liveliness token appears (True) and disappears, in one of Zenoh's threads.
+        """Call back when a role's liveliness token appears (True) and disappears, in a thread of its own.
 
         A token of another name calls no Python. Zenoh merges those of one name: the first appears, the last disappears.
 
@@ -350,7 +350,7 @@ class Role:
         self.publish("status", status)
 
     def _answer_status(self, query: zenoh.Query) -> None:
-        """Answer with the last status and its age, which shows a loop that hangs: Zenoh's threads do not."""
+        """Answer with the last status and its age, which shows a loop that hangs: the thread that answers does not."""
         if self._status is not None:
             taken, status = self._status
             aged = status.model_copy(update={"age_s": round(time.monotonic() - taken, 3)})

@@ -186,7 +186,7 @@ class ByteRing:
         self._lock = Lock()
 
     def put(self, sample: zenoh.Sample) -> None:
-        """Add a sample, in one of Zenoh's threads."""
+        """Add a sample, in Zenoh's thread."""
         size = len(sample.payload)
         with self._lock:
             self._samples.append((sample, size))

@@ -39,9 +39,8 @@ RETRY_MS: Final = (50, 1000)
 ONE_THREAD: Final = (
     "(app: (worker_threads: 1), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))"
 )
-"""All of Zenoh in one thread, as ZENOH_RUNTIME. Each further one adds a wake-up to a frame's way, together two fifths
-of the loop's latency. Nothing may block it, so threads of Python answer queries; `tests/benchmarks/third_parties.py`
-measures it."""
+"""All of Zenoh in one thread, as ZENOH_RUNTIME. Each further one adds a wake-up to a frame's way (README.md). Nothing
+may block it, so threads of Python answer queries; `tests/benchmarks/third_parties.py` measures it."""
 
 
 def session_tree(

@@ -1,6 +1,6 @@
 """Operators' requests to a controller: `set_gains` and `track`.
 
-Each is checked in one of Zenoh's threads, which takes time, and applied by the loop between two ticks.
+Each is checked in a thread beside the loop, which takes time, and applied by the loop between two ticks.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 
 from aeroloop.service.config import Settings
 from aeroloop.service.control.reference import Floats
-from aeroloop.service.lab.c_code import library_of, source_of
+from aeroloop.service.lab.c_code import shared_object_of, source_of
 from aeroloop.service.lab.loop_function import loop_of
 
 _LOOP: Final = """
@@ -38,7 +38,7 @@ def bare_loop(settings: Settings, ticks: int) -> Callable[[], Floats] | None:
     sizes = {name: tick.numel_in(name) for name in tick.name_in()} | {"out": tick.numel_out("out")}
     memory = {"integers": tick.sz_iw() + 1, "work": tick.sz_w() + 1}
     scratch = {"arguments": tick.sz_arg(), "results": tick.sz_res(), **memory}
-    library = library_of(source_of(tick) + _LOOP.format(**sizes, **scratch))
+    library = shared_object_of(source_of(tick) + _LOOP.format(**sizes, **scratch))
     if library is None:
         return None
     run = ctypes.CDLL(str(library)).bare_loop

@@ -28,7 +28,7 @@ _HASH: Final = 32
 
 def in_c(function: ca.Function) -> ca.Function | None:
     """The same function in C, compiled now or before; None where that fails."""
-    library = library_of(source_of(function))
+    library = shared_object_of(source_of(function))
     try:
         return ca.external(function.name(), str(library)) if library is not None else None
     except RuntimeError:  # not a library
@@ -43,7 +43,7 @@ def source_of(function: ca.Function) -> str:
     return source
 
 
-def library_of(source: str) -> Path | None:
+def shared_object_of(source: str) -> Path | None:
     """The library of C code, compiled now or before; None where that fails."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:

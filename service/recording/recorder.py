@@ -35,9 +35,9 @@ WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
 
 SOON_S: Final = 0.05
-"""Unless caches are being queried: of each, a page is taken at a time."""
+"""While caches are queried: of each, a page is taken at a time. Also after many messages."""
 MANY: Final = 100
-"""After so many messages at once, as of a flood, the next are taken soon: each may hold 64 KiB of Zenoh's buffers."""
+"""So many at once, as of a flood: each may hold 64 KiB of Zenoh's buffers."""
 
 STATUS_EVERY_S: Final = 1.0
 

@@ -178,14 +178,14 @@ def test_a_library_that_is_cut_off_or_damaged_is_made_anew(tmp_path: Path, monke
     """One cut off ends the process that loads it; a flipped bit may give other figures."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     source = c_code.source_of(ca.Function("twice", [x := ca.SX.sym("x")], [2 * x]))
-    library = c_code.library_of(source)
+    library = c_code.shared_object_of(source)
     assert library is not None
     whole = library.read_bytes()
     flipped = bytes([*whole[:4000], whole[4000] ^ 1, *whole[4001:]])
     for damaged in (b"", b"hello", whole[:1000], whole[: len(whole) // 2], whole[:-1], flipped, bytes(len(whole))):
         library.unlink()  # it is loaded
         library.write_bytes(damaged)
-        assert c_code.library_of(source) == library
+        assert c_code.shared_object_of(source) == library
         assert ca.external("twice", str(library))(21) == 42
         assert len(library.read_bytes()) == len(whole)
 
@@ -199,7 +199,7 @@ def test_no_other_process_sees_a_library_that_is_not_whole(tmp_path: Path, monke
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     source = c_code.source_of(ca.Function("twice", [x := ca.SX.sym("x")], [2 * x]))
-    assert c_code.library_of(source) is not None
+    assert c_code.shared_object_of(source) is not None
     assert seen.read_text() == ""
 
 
