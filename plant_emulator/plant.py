@@ -1,4 +1,4 @@
-"""Plant interface: actuate, advance, measure and close.
+"""Plant interface: actuate, advance, measure and close; and the check of a user's own class behind it.
 
 The emulated plant, the USB board and a user's own class implement it; `plant.kind = "package.module:Class"` names the
 latter. The endpoint calls actuate → advance → measure once a tick. Frames, claims, watchdog, limits and faults are the
@@ -34,12 +34,37 @@ endpoint's and the same for every plant. A plant of one's own:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from math import hypot, isfinite
+from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError, create_model
 
+from aeroloop.protocol import plugins
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS
+from aeroloop.protocol.wording import problems
+
+T = TypeVar("T")
+
+EMULATED: Final = ("aero", "rigid_body")
+"""Kinds that are not a class but a body of the emulated plant."""
+
+GROUP: Final = "aeroloop.plants"
+
+BUILT_IN: Final = {
+    **dict.fromkeys(EMULATED, "aeroloop.plant_emulator.model.emulated:EmulatedPlant"),
+    "mujoco": "aeroloop.plant_emulator.engines.mujoco:MujocoPlant",
+    "fmu": "aeroloop.plant_emulator.engines.fmu:FmuPlant",
+}
+
+_UNIT: Final = 0.01
+"""A quaternion that is this much longer or shorter than 1 is none: values in another order or unit, or a drift."""
+
+
+class PlantError(AeroloopError):
+    """A plant of one's own failed; one line with its class, file and line."""
 
 
 class Measurement(NamedTuple):
@@ -120,3 +145,121 @@ class Plant(ABC):
     @abstractmethod
     def close(self) -> None:
         """Set 0 V and release all resources. A second call does nothing."""
+
+
+def class_of(kind: str) -> type[Plant]:
+    """The class that `plant.kind` names. Raises PluginError."""
+    return plugins.find("plant.kind", kind, GROUP, BUILT_IN, Plant)  # type: ignore[type-abstract]  # made if concrete
+
+
+def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: float) -> OwnPlant:
+    """Make the plant that `plant.kind` names.
+
+    Args:
+        kind: As configured.
+        own: `[plant.own]`.
+        period: Time of one `advance` [s].
+        voltage_limit: Largest voltage that reaches it [V].
+
+    Raises:
+        PluginError: There is no such class.
+        PlantError: Its settings are wrong, its constructor failed, or it has no usable number of motors.
+    """
+    found = class_of(kind)
+    section = create_model("Section", own=(found.Settings, ...))
+    whole = create_model("Configured", plant=(section, ...))  # so that a wrong key is named in full
+    try:
+        settings: Any = whole.model_validate({"plant": {"own": dict(own)}})
+    except ValidationError as error:
+        raise PlantError(f"plant.kind = {kind!r}: {'; '.join(problems(error, whole))}") from None
+    try:
+        return OwnPlant(found(settings.plant.own, period), voltage_limit)
+    except AeroloopError as error:
+        raise PlantError(str(error)) from None
+    except Exception as error:
+        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.own_words(error)}") from None
+
+
+class OwnPlant(Plant):
+    """Watches over a plant of one's own. At most `voltage_limit` [V] reaches it.
+
+    Raises:
+        PlantError: From the constructor and every method: the plant failed. From then on only `close` is of use.
+    """
+
+    def __init__(self, plant: Plant, voltage_limit: float) -> None:
+        self._plant, self._limit = plant, voltage_limit
+        self._name = type(plant).__name__
+        self._failed = self._closed = False
+        self.paces = plant.paces
+        count = getattr(plant, "actuators", None)
+        if not (isinstance(count, int) and 1 <= count <= MAX_ACTUATORS):
+            raise self._failure(f"has actuators = {count!r}, which must be a whole number from 1 to {MAX_ACTUATORS}")
+        self.actuators = count
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Hold voltages [V], clipped to the supply's limits. Shape (actuators,)."""
+        limit = self._limit
+        self._call(self._plant.actuate, tuple(max(-limit, min(limit, volts)) for volts in voltages))
+
+    def advance(self) -> None:
+        """Let one period pass."""
+        self._call(self._plant.advance)
+        self.passed = self._plant.passed
+
+    def measure(self) -> Measurement:
+        """The sensors' present values."""
+        measured = self._call(self._plant.measure)
+        try:
+            (w, x, y, z), (a, b, c) = (map(float, part) for part in measured)
+        except (TypeError, ValueError):
+            raise self._failure(
+                f"measured {_shown(measured)}: measure() must return Measurement((w, x, y, z), (x, y, z))"
+            ) from None
+        length = hypot(w, x, y, z)
+        if isfinite(length) and abs(length - 1) > _UNIT:
+            raise self._failure(f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)")
+        return Measurement((w, x, y, z), (a, b, c))
+
+    def truth(self) -> State | None:
+        """The true state; None where the plant knows none."""
+        true = self._call(self._plant.truth)
+        if true is None:
+            return None
+        try:
+            (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true)
+        except (TypeError, ValueError):
+            raise self._failure(
+                f"gave {_shown(true)}: truth() must return State((w, x, y, z), (x, y, z), voltages) or None"
+            ) from None
+        if len(voltages) != self.actuators:
+            raise self._failure(f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators")
+        known = isfinite(sum((w, x, y, z, a, b, c, *voltages)))
+        return State((w, x, y, z), (a, b, c), tuple(voltages)) if known else None
+
+    def close(self) -> None:
+        """Set 0 V, and release its resources; after a failure as far as that is possible."""
+        if not self._closed:
+            self._closed = True
+            failed = self._failed
+            try:
+                self._call(self._plant.close)
+            except PlantError:
+                if not failed:  # otherwise the first failure is the one to show
+                    raise
+
+    def _call(self, method: Callable[..., T], *values: object) -> T:
+        try:
+            return method(*values)
+        except Exception as error:
+            words = str(error) if isinstance(error, AeroloopError) else plugins.own_words(error)
+            raise self._failure(f"failed in {method.__name__}(): {words}") from None
+
+    def _failure(self, what: str) -> PlantError:
+        self._failed = True
+        return PlantError(f"{self._name} {what}")
+
+
+def _shown(value: object) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:80]}…"

@@ -1,18 +1,20 @@
-"""Settings of the plant end, and the plant, faults and limits built from them.
+"""Settings of the plant end, Quanser's board included, and the plant, faults and limits built from them.
 
 This is the only module that selects the parts of a plant.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
+from aeroloop.plant_emulator.endpoint.endpoint import LimitMonitor, LimitSettings
+from aeroloop.plant_emulator.faults.injection import FaultyPlant
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.faults.schedule import MAX_FAULTS
-from aeroloop.plant_emulator.faults.signals import FaultyPlant
 from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.friction import FrictionSettings
@@ -21,19 +23,66 @@ from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySetting
 from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
-from aeroloop.plant_emulator.own_plant import EMULATED, PlantError, own_plant
-from aeroloop.plant_emulator.plant import Plant
-from aeroloop.plant_emulator.quanser_settings import QuanserSettings
+from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
 from aeroloop.protocol.wire.loop import WATCHDOG_S
+
+Sign: TypeAlias = Literal[-1, 1]
+
+CardType: TypeAlias = Literal["quanser_aero2_usb", "quanser_aero_usb"]
+
+_PITCH_COUNTS: Final[Mapping[str, int]] = {"quanser_aero2_usb": 2880, "quanser_aero_usb": 2048}
+
+
+class QuanserSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
+    """The board, and how its channels map to the body. Verify the signs and the gyro's axes on the bench."""
+
+    card_type: CardType = Field(default="quanser_aero2_usb", description="Aero 2 or Aero, by its HIL name")
+    card_identifier: str = Field(
+        default="0", min_length=1, description="which board; a virtual one is '0@tcpip://localhost:18950'"
+    )
+    rate: Literal["derivative", "gyro"] = Field(
+        default="derivative", description="derivative: of the encoders' angles, filtered"
+    )
+    pitch_counts: int | None = Field(
+        default=None, gt=0, description="pitch encoder's counts a turn; if left out, the card type's (2880, 2048)"
+    )
+    yaw_counts: int = Field(default=4096, gt=0, description="yaw encoder's counts a turn")
+    encoder_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of pitch and yaw; -1 where counts run down")
+    bandwidth: float = Field(default=50.0, gt=0, description="ωn of the derivative's filter [rad/s]")
+    damping_ratio: float = Field(default=0.8, gt=0, lt=1, description="ζ of the derivative's filter [1]")
+    gyro_axes: tuple[int, int, int] = Field(
+        default=(0, 1, 2), description="which of the gyro's channels 0, 1, 2 measures the body's x, y, z"
+    )
+    gyro_signs: tuple[Sign, Sign, Sign] = Field(default=(1, 1, 1), description="of the body's x, y, z")
+    gyro_scale: float = Field(default=1.0, gt=0, description="angular velocity at a gyro reading of 1 [rad/s]")
+    motor_channels: tuple[int, int] = Field(default=(0, 1), description="analog outputs of u2 and u3")
+    motor_signs: tuple[Sign, Sign] = Field(default=(1, 1), description="of u2 and u3")
+    voltage_limit: float = Field(
+        default=18.0, gt=0, le=24, description="largest voltage of a motor [V]; 18 recommended, 24 maximum"
+    )
+    board_watchdog_s: float = Field(
+        default=0.1, gt=0, le=10, description="the board's watchdog sets 0 V after this long without a good sample [s]"
+    )
+
+    @field_validator("gyro_axes", "motor_channels")
+    @classmethod
+    def _each_channel_once(cls, channels: tuple[int, ...]) -> tuple[int, ...]:
+        if sorted(channels) != list(range(len(channels))):
+            raise ValueError(f"must name each of 0…{len(channels) - 1} once")
+        return channels
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Encoder counts a turn, pitch and yaw."""
+        return self.pitch_counts or _PITCH_COUNTS[self.card_type], self.yaw_counts
 
 
 class PlantSettings(BaseModel, extra="forbid"):
     """The plant end: the plant, its disturbances, sensors and faults, the watchdog and the limits."""
 
-    via: Literal["emulator", "can", "quanser", "quanser-fake"] = Field(
+    via: Literal["emulator", "can", "quanser"] = Field(
         default="emulator",
-        description="the plant: emulated, a node on the CAN bus of [can], Quanser's USB board, or a fake of that board "
-        "with an emulated Aero",
+        description="the plant: emulated, a node on the CAN bus of [can], or Quanser's USB board",
     )
     kind: str = Field(
         default="aero",
@@ -51,7 +100,13 @@ class PlantSettings(BaseModel, extra="forbid"):
         "axes, no rotor lag, no friction, no wind, perfect sensors",
     )
     armed_at_start: bool = Field(
-        default=True, description="grant the first claim without `op arm`; after a trip, `op arm` is always needed"
+        default=True,
+        description="grant the first claim without `op arm`, unless a process before this one left a trip or a stop",
+    )
+    state_directory: Path | None = Field(
+        default=None,
+        description="folder of the file that keeps a trip or a stop until `op arm`, whatever restarts; null: systemd's "
+        "$STATE_DIRECTORY, else $XDG_STATE_HOME/aeroloop, else ~/.local/state/aeroloop",
     )
     watchdog_s: float = Field(
         default=WATCHDOG_S, gt=0, le=10, description="0 V after this long without a fresh command [s]"
@@ -174,9 +229,9 @@ class PlantSettings(BaseModel, extra="forbid"):
         limit = self.voltage_limit
         return FaultyPlant(plant, self.parsed_faults, period, voltage_limit=limit, seed=self.fault_seed)
 
-    def guard(self, period_ns: int, commanded_limit: float) -> Guard:
-        """Build the guard. A motor is saturated at the supply's limit or at the outermost quantizer level [V]."""
-        return Guard(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
+    def limit_monitor(self, period_ns: int, commanded_limit: float) -> LimitMonitor:
+        """Build the check of the limits; `commanded_limit` is the outermost level of the quantizer [V]."""
+        return LimitMonitor(self.limits, period_ns, min(self.voltage_limit, commanded_limit))
 
 
 _OF_EMULATED = ("ideal", "substeps", "aero", "rigid_body", "rotor", "friction", "wind", "sensors")

@@ -56,11 +56,6 @@ class ControllerSettings(BaseModel, extra="forbid"):
         description="stop commanding, as faulted, after a tick of the law that takes longer; not in lockstep [s]",
     )
     require_recorder: bool = Field(default=False, description="do not claim before a recorder is on the network")
-    require_certificate: bool = Field(
-        default=False,
-        description="do not claim unless the theorem holds of this configuration (`aeroloop lab certify`), and refuse "
-        "an operator's change after which it would not",
-    )
 
 
 class RecorderSettings(BaseModel, extra="forbid"):
@@ -73,9 +68,6 @@ class RecorderSettings(BaseModel, extra="forbid"):
     )
     chunk_s: float = Field(
         default=1.0, gt=0, le=60, description="write a chunk this often: the most that a crash or a power cut loses [s]"
-    )
-    frames: bool = Field(
-        default=False, description="also record the frames on the network, beside the ends' own traces"
     )
     decoded_hz: float = Field(
         default=10.0, ge=0, le=10_000, description="beside raw messages, log decoded ones this often; 0: none [Hz]"

@@ -1,22 +1,21 @@
-"""Plant endpoint, sans-I/O: measures into frames, actuates from frames, runs the watchdog.
+"""Plant endpoint, sans-I/O: measures into frames, actuates from frames, watchdog and limits.
 
 It uses no socket and no clock; time is the tick index. Once a tick its owner passes in the newest command frame and
 sends the measurement frame that it returns. A command acts from the start of the period in which it was received until
-another replaces it.
-Without a fresh command the watchdog trips: the session ends, and the motors stay at 0 V until the plant is armed and
-claimed.
-
-Freshness is counted in ticks: a command echoes the counter of the measurement that it answers, which gives its age.
+another replaces it. Without a fresh command the watchdog trips: the session ends, and the motors stay at 0 V until the
+plant is armed and claimed.
 """
 
 from __future__ import annotations
 
-from math import isfinite
+from collections.abc import Sequence
+from math import acos, cos, degrees, hypot, isfinite, radians
 
-from aeroloop.plant_emulator.endpoint.envelope import Guard
-from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from pydantic import BaseModel, Field
+
+from aeroloop.plant_emulator.endpoint.vehicle_claim import Trip, VehicleClaim
 from aeroloop.plant_emulator.plant import Measurement, Plant
-from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCause
+from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.loop import WATCHDOG_S
@@ -24,11 +23,11 @@ from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE, Sender
 
 
-class Endpoint(Tenancy):
+class Endpoint(VehicleClaim):
     """One plant, one controller at a time.
 
-    After `watchdog_s` without a fresh command [s] the plant gets 0 V; `guard` trips it at its limits, if there are any.
-    The other arguments are Tenancy's.
+    After `watchdog_s` without a fresh command [s] the plant gets 0 V; at its `limits`, if there are any, it trips. The
+    other arguments are VehicleClaim's.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
@@ -45,7 +44,7 @@ class Endpoint(Tenancy):
         *,
         lockstep: bool = False,
         watchdog_s: float = WATCHDOG_S,
-        guard: Guard | None = None,
+        limits: LimitMonitor | None = None,
         armed: bool = False,
     ) -> None:
         if plant.actuators != wire.actuators:
@@ -55,33 +54,22 @@ class Endpoint(Tenancy):
         self.accepted = 0
         self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
         self._encode = tuple(quantizer.encode for quantizer in self._quantizers)
-        self._level = wire.voltage.quantizer().level
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
-        self._read, self._write = wire.command.unpack, wire.measurement.pack
+        self._write = wire.measurement.pack
         transmit = wire.transmit
-        self._counters = wire.measurement.counters
         heartbeat = transmit.heartbeat_ticks(period_ns, self._counters)
         self._sender = Sender(transmit.measurement, heartbeat, self._counters)
-        self._silence_commands = lockstep and transmit.command == "on_change"
         # On change and without lockstep, a controller learns that values are valid again only from the next frame that
         # it receives in time, a heartbeat later at most: until then its commands may still have no valid value.
         clocked = transmit.measurement == "on_change" and not lockstep
         self._forgiven = heartbeat if clocked else 0
-        self.protect(watchdog_s, guard)
+        self._limits = limits
+        self.protect(watchdog_s)
+        self._first_command = max(1, self._first_command_ns // period_ns)
         self._start = 0  # tick of the session's first measurement
         self._unmeasured_yet = False
         self._fresh_tick = 0  # tick of the last fresh command, or of the session's first measurement
         self._unmeasured = [False] * self._counters  # whether the last measurement of each counter had no valid value
-        self._codes: tuple[float, ...] = ()  # of the last fresh command
-        self._echo = -1  # of the last fresh command
-        self._answered = -1  # tick of the measurement that it answers; before the session's first for none
-
-    def protect(self, watchdog_s: float, guard: Guard | None) -> None:
-        """Set the watchdog's time [s] and the limits."""
-        watchdog_ns = round(watchdog_s * 1e9)
-        self._watchdog = max(1, round(watchdog_ns / self.period_ns))
-        self._first_command = max(1, self.first_command_ns(watchdog_ns) // self.period_ns)
-        self._guard = guard
 
     @property
     def saturated(self) -> int:
@@ -114,9 +102,8 @@ class Endpoint(Tenancy):
         if self._unmeasured_yet:
             self._unmeasured_yet = False
             self._start = self._fresh_tick = self.ticked
-            self._answered = self.ticked - 1
         seen = self.plant.measure()
-        if self._guard is not None and (trip := self._guard.check(seen, self.voltages)) is not None:
+        if self._limits is not None and (trip := self._limits.check(seen, self.voltages)) is not None:
             self._trip(*trip)
             self.plant.actuate(self.voltages)
             return None
@@ -129,11 +116,6 @@ class Endpoint(Tenancy):
     def session_tick(self) -> int:
         """Tick of the last measurement since the session's first, which has 0; −1 before that."""
         return self.ticked - self._start
-
-    @property
-    def answered(self) -> int:
-        """Session tick that the command in force answers; −1 for none."""
-        return self._answered - self._start
 
     @property
     def counter(self) -> int:
@@ -149,38 +131,15 @@ class Endpoint(Tenancy):
         return [of_x(x), of_y(y), of_z(z), of_a(a), of_b(b), of_c(c)]
 
     def _command(self, frame: bytes) -> Outcome:
-        """Apply a command frame if it is well-formed, fresh and valid."""
-        if frame == SILENCE and self._silence_commands and self._codes:
-            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
-        else:
-            read = self._read(frame)
-        if read is None:
-            self.refused += 1
-            return Outcome.MALFORMED
-        echo, codes = read
-        # The echo is a tick modulo `counters` and means the latest measurement with that counter. A repeated echo is
-        # refused: after a whole round of the counter it would look fresh again.
-        age = (self.ticked - self._start - echo) % self._counters
-        answered = self.ticked - age
-        if echo == self._echo or answered <= self._answered:
-            return Outcome.REPEATED
-        if age > self._watchdog:
-            self.stale += 1
-            return Outcome.STALE
-        voltages = tuple(map(self._level, codes))
-        if not isfinite(sum(voltages)):
-            if any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1)):
-                voltages = self.off  # the right answer to an invalid measurement; the guard limits how long it lasts
-            else:
-                self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
-                return Outcome.INVALID
-        self.voltages = voltages
-        self._codes, self._echo, self._answered = codes, echo, answered
-        self._fresh_tick = self.ticked
-        if self.state is not PlantState.DRIVEN:
-            self._machine.fire(PlantTrigger.COMMAND)
-        self.accepted += 1
-        return Outcome.ACTED
+        outcome = super()._command(frame)
+        if outcome is Outcome.ACTED:
+            self._fresh_tick = self.ticked
+            self.accepted += 1
+        return outcome
+
+    def _may_be_invalid(self, echo: int) -> bool:
+        """An invalid command is the right answer to an invalid measurement; the limits bound how long that lasts."""
+        return any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1))
 
     def _watch(self, tick: int) -> None:
         """Trip if no fresh command was received in time."""
@@ -195,16 +154,79 @@ class Endpoint(Tenancy):
         self._trip(TripCause.COMMAND_TIMEOUT, text)
 
     def _begin(self) -> None:
-        if self._guard is not None:
-            self._guard.reset()
+        super()._begin()
+        if self._limits is not None:
+            self._limits.reset()
         for quantizer in self._quantizers:
             quantizer.reset()
         self._start = self._fresh_tick = self.ticked + 1
         self._unmeasured = [False] * self._counters
         self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
-        self._codes, self._echo, self._answered = (), -1, self.ticked
         self._sender.forget()
 
-    def _rest(self) -> None:
-        self.voltages = self.off
-        self._answered = self._start - 1
+
+# ── limits ──
+
+
+class LimitSettings(BaseModel, extra="forbid"):
+    """Limits; beyond any of them the plant trips."""
+
+    max_tilt_deg: float = Field(
+        default=75.0, gt=0, le=180, description="largest angle between the body's z axis and the vertical [deg]"
+    )
+    max_rate: float = Field(default=20.0, gt=0, description="largest angular velocity [rad/s]")
+    max_saturated_s: float = Field(
+        default=3.0, gt=0, le=600, description="longest time a motor may stay at its voltage limit [s]"
+    )
+    max_invalid_s: float = Field(
+        default=0.1, gt=0, le=60, description="longest time the sensors may have no valid value [s]"
+    )
+
+
+class LimitMonitor:
+    """Checks one plant against its limits once a tick, by its own sensors; durations are counted in ticks.
+
+    At `voltage_limit` [V] a motor counts as saturated.
+    """
+
+    def __init__(self, settings: LimitSettings, period_ns: int, voltage_limit: float) -> None:
+        self._settings = settings
+        self._period_ns = period_ns
+        self._full = voltage_limit
+        self._least_upright = cos(radians(settings.max_tilt_deg))
+        self._saturated = self._invalid = 0
+
+    def reset(self) -> None:
+        """Reset the counts for a new session."""
+        self._saturated = self._invalid = 0
+
+    def check(self, seen: Measurement, voltages: Sequence[float]) -> Trip | None:
+        """Return a reason to trip, or None, for this tick's measurement and commanded voltages [V] (actuators,)."""
+        limits = self._settings
+        (w, x, y, z), (wx, wy, wz) = seen
+        if not isfinite(w + x + y + z + wx + wy + wz):
+            self._invalid += 1
+            if (invalid_s := self._seconds(self._invalid)) > limits.max_invalid_s:
+                reason = f"the sensors have had no valid value for {invalid_s * 1e3:.0f} ms"
+                return Trip(TripCause.SENSORS, reason)
+            return None
+        self._invalid = 0
+        upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
+        if upright < self._least_upright:
+            tilt = degrees(acos(max(-1.0, upright)))
+            reason = f"tilted by {tilt:.1f}°, more than limits.max_tilt_deg = {limits.max_tilt_deg:g}°"
+            return Trip(TripCause.ENVELOPE, reason)
+        if (speed := hypot(wx, wy, wz)) > limits.max_rate:
+            reason = f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
+            return Trip(TripCause.ENVELOPE, reason)
+        if max(voltages) < self._full and min(voltages) > -self._full:
+            self._saturated = 0
+            return None
+        self._saturated += 1
+        if (saturated_s := self._seconds(self._saturated)) > limits.max_saturated_s:
+            reason = f"a motor has been at its voltage limit for {saturated_s:.1f} s"
+            return Trip(TripCause.SATURATION, reason)
+        return None
+
+    def _seconds(self, ticks: int) -> float:
+        return ticks * self._period_ns * 1e-9

@@ -1,33 +1,40 @@
 """FMU as a plant: a model that Simulink, OpenModelica, Dymola or another tool exported for co-simulation, FMI 2 or 3.
 
 FMPy loads it. Once a period the voltages are set, the FMU advances by the period in equal communication steps, and the
-outputs that the settings name are read. What they give is both the true state and what the sensors measure.
-
-From roll φ, pitch θ and yaw ψ, yaw about z first, then pitch, then roll, the body rates are
-
-    ω = [φ̇ − ψ̇ sin θ, θ̇ cos φ + ψ̇ sin φ cos θ, −θ̇ sin φ + ψ̇ cos φ cos θ]
+outputs that the settings name are read. What they give is both the true state and what the sensors measure. What can be
+wrong is one line each: the file, what it was exported for, its binary, a variable's name, causality, type or unit, a
+start value, its own fixed step, and what it fails with, in its own words.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import chdir, suppress
+from math import cos, isclose, prod, radians, sin
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal
+from shutil import rmtree
+from tempfile import mkdtemp
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 from weakref import finalize
+from zipfile import ZipFile
 
 from pydantic import BaseModel, Field, model_validator
 
-from aeroloop.plant_emulator.engines.fmu_instance import Instance
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.wire.attitude import from_euler
-from aeroloop.protocol.wire.symbolic import Compiled
+from aeroloop.protocol.plugins import PluginError
+from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wording import closest, either
 
 Name = Annotated[str, Field(min_length=1, max_length=500)]
 Names3 = tuple[str, str, str]
 
-_DEGREE: Final = 0.017453292519943295
-"""One degree [rad]."""
+_FATAL: Final = 4
+"""FMI's status after which the FMU must not be called again."""
+
+
+class FmuError(PluginError):
+    """The FMU cannot be used, or failed; one line with its file and, where it logged any, its own words."""
 
 
 class FmuSettings(BaseModel, extra="forbid", frozen=True):
@@ -96,32 +103,49 @@ class FmuPlant(Plant):
     repeatable: ClassVar[bool] = True  # a simulation; of one that is not, a replay finds the first tick that differs
 
     def __init__(self, settings: FmuSettings, period: float) -> None:
+        self._settings, self._name, self._step = settings, settings.file.name, period / settings.substeps
         self.actuators = len(settings.voltages)
-        self._fmu = fmu = Instance(settings.file, period / settings.substeps, settings.log)
-        self._substeps = settings.substeps
-        inputs = [fmu.element(name, ("input",), "V") for name in settings.voltages]
-        outputs = [fmu.element(name, ("output", "local"), unit) for name, unit in settings.outputs.items()]
-        self._release = finalize(self, fmu.close)
+        self._steps = 0
+        self._description = description = _description(settings.file)
+        self._variables: Mapping[str, Any] = {each.name: each for each in description.modelVariables}
+        fixed = float(description.coSimulation.fixedInternalStepSize or 0)  # of FMI 3
+        if fixed and not (round(self._step / fixed) and isclose(self._step / fixed, round(self._step / fixed))):
+            raise FmuError(
+                f"{self._name} has steps of {fixed:g} s, of which {self._step:g} s, the loop's period or its part by "
+                "plant.own.substeps, is no multiple: set loop.rate_hz, or export the FMU with another step"
+            )
+        self._inputs = _Numbers.of([self._element(name, ("input",), "V") for name in settings.voltages])
+        outputs = settings.outputs.items()
+        self._outputs = _Numbers.of([self._element(name, ("output", "local"), unit) for name, unit in outputs])
+        self._loaded = _Loaded()
+        self._release = finalize(self, self._loaded.free)
         try:
-            fmu.load(settings.start)
-            self._inputs, self._outputs = fmu.signals(inputs), fmu.signals(outputs)
-        except Exception:
+            self._load()
+        except BaseException:
             self.close()
             raise
-        self._read = Compiled(_reading(settings))
+        self._set_values = self._get(self._inputs)
         self.actuate((0.0,) * self.actuators)
         self._sample()
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Hold voltages [V] from the next period on. Shape (actuators,)."""
-        values = self._inputs.values
         for at, voltage in zip(self._inputs.at, voltages, strict=True):
-            values[at] = voltage
+            self._set_values[at] = voltage
 
     def advance(self) -> None:
         """Advance the FMU by one period."""
-        self._fmu.step(self._inputs, self._outputs, self._substeps)
-        self._sample()
+        try:
+            set_values = self._loaded.fmu.setReal if self._fmi2 else self._loaded.fmu.setFloat64
+            set_values(self._inputs.references, self._set_values)
+            for _ in range(self._settings.substeps):
+                ended = self._loaded.fmu.doStep(self._steps * self._step, self._step)
+                self._steps += 1
+                if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
+                    raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._own_words()}")
+            self._sample()
+        except Exception as error:
+            raise self._failure(f"it failed at {self._steps * self._step:g} s", error) from None
 
     def measure(self) -> Measurement:
         """The FMU's outputs at the end of the last period."""
@@ -129,36 +153,247 @@ class FmuPlant(Plant):
 
     def truth(self) -> State:
         """The same, with the voltages."""
-        return State(*self._measurement, tuple(self._inputs.values[at] for at in self._inputs.at))
+        return State(*self._measurement, tuple(self._set_values[at] for at in self._inputs.at))
 
     def close(self) -> None:
-        """End and free the FMU."""
+        """End and free the FMU, and remove its unpacked files. A second call does nothing."""
         self._release()
 
+    @property
+    def _fmi2(self) -> bool:
+        return bool(self._description.fmiMajorVersion == 2)
+
+    def _get(self, numbers: _Numbers) -> list[float]:
+        values: list[float] = (
+            self._loaded.fmu.getReal(numbers.references)
+            if self._fmi2
+            else self._loaded.fmu.getFloat64(numbers.references, numbers.total)
+        )
+        return values
+
     def _sample(self) -> None:
-        values, into = self._outputs.values, self._read.inputs["values"]
-        for i, at in enumerate(self._outputs.at):
-            into[i] = values[at]
-        self._read()
-        w, x, y, z = self._read.outputs["attitude"]
-        a, b, c = self._read.outputs["rate"]
-        self._measurement = Measurement((w, x, y, z), (a, b, c))
+        settings, values = self._settings, self._get(self._outputs)
+        of = dict(zip(settings.outputs, (values[at] for at in self._outputs.at), strict=True)) | {"": 0.0}
+        angles = _in_radians([of[name] for name in settings.angles or ()], settings.angle_unit)
+        a, b, c = _in_radians([of[name] for name in settings.rate or settings.angle_rates or ()], settings.rate_unit)
+        if settings.quaternion:
+            w, x, y, z = (of[name] for name in settings.quaternion)
+            attitude: Quaternion = (w, x, y, z)
+        else:
+            attitude = quaternion_of(*angles)
+        rate = body_rate((angles[0], angles[1]), (a, b, c)) if settings.angle_rates else (a, b, c)
+        self._measurement = Measurement(attitude, rate)
+
+    # ── checks and start ──
+
+    def _element(self, name: str, causalities: Sequence[str], unit: str) -> tuple[Any, int]:
+        """Variable and offset that a name stands for; `q[2]` may be an element of an array, counted from 1.
+
+        It must have one of these causalities, the first being the usual one, and not be declared in another unit, if
+        that is one of an angle or its rate.
+        """
+        array = re.fullmatch(r"(.+)\[(\d+)\]", name)
+        index = 0
+        if name not in self._variables and array and array[1] in self._variables:
+            name, index = array[1], int(array[2]) - 1
+        real = "Real" if self._fmi2 else "Float64"
+        fitting = [
+            each for each, known in self._variables.items() if known.causality == causalities[0] and known.type == real
+        ]
+        variable = self._known(name, fitting)
+        if variable.causality not in causalities or variable.type != real:
+            raise FmuError(
+                f"{self._name}: {name} is {_kind(variable)}, not an {causalities[0]} of type {real}; "
+                f"of those it has {_listed(fitting)}"
+            )
+        size = prod(variable.shape)
+        if not 0 <= index < size:
+            raise FmuError(f"{self._name}: {name} has {size} elements, and none is {name}[{index + 1}]")
+        declared = variable.unit or getattr(variable.declaredType, "unit", None)
+        if declared != unit and {declared, unit} <= {"rad", "deg", "rad/s", "deg/s"}:
+            raise FmuError(f"{self._name}: {name} is in {declared}, not in {unit}: set angle_unit or rate_unit")
+        return variable, index
+
+    def _load(self) -> None:
+        """Unpack, load and initialize it with the start values and parameters."""
+        import fmpy
+
+        for name in self._settings.start:
+            self._known(name, self._variables)
+        try:
+            fmpy.extract(self._settings.file, self._loaded.folder)
+            with chdir("."):  # FMPy changes the folder to load the library, and does not return where that fails
+                self._loaded.fmu = fmpy.instantiate_fmu(
+                    self._loaded.folder,
+                    self._description,
+                    "CoSimulation",
+                    debug_logging=self._settings.log,
+                    logger=self._loaded.log,
+                )
+            if self._fmi2:
+                self._loaded.fmu.setupExperiment(startTime=0.0)
+            left = self._apply(self._settings.start, fmpy.simulation.settable_in_instantiated)
+            self._loaded.fmu.enterInitializationMode()
+            for name in self._apply(left, fmpy.simulation.settable_in_initialization_mode):
+                kind = _kind(self._variables[name])
+                raise FmuError(f"{self._name}: plant.own.start.{name} cannot be set: it is {kind}")
+            self._loaded.fmu.exitInitializationMode()
+        except Exception as error:
+            raise self._failure("it does not start", error) from None
+
+    def _apply(self, start: Mapping[str, object], when: object) -> dict[str, object]:
+        """Set the start values that may be set now; returns the others."""
+        from fmpy.simulation import apply_start_values
+
+        left: dict[str, object] = {}
+        for name, value in start.items():
+            try:
+                left |= apply_start_values(self._loaded.fmu, self._description, {name: value}, when)
+            except (TypeError, ValueError) as error:
+                raise FmuError(f"{self._name}: plant.own.start.{name}: {error}") from None
+        return left
+
+    def _known(self, name: str, fitting: Iterable[str]) -> Any:
+        if name not in self._variables:
+            alike = closest(name, fitting)
+            hint = f": did you mean {alike}?" if alike else f"; it has {_listed(fitting)}"
+            raise FmuError(f"{self._name} has no variable {name}{hint}")
+        return self._variables[name]
+
+    def _own_words(self) -> str:
+        return (
+            f": {self._loaded.logged[1]}"
+            if self._loaded.logged[1]
+            else "; it logged nothing: plant.own.log = true may say more"
+        )
+
+    def _failure(self, what: str, error: Exception) -> FmuError:
+        if isinstance(error, FmuError):
+            return error
+        self._loaded.fatal |= getattr(error, "status", None) == _FATAL
+        text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        preferred = float(getattr(self._description.defaultExperiment, "stepSize", None) or self._step)
+        hint = (
+            ""
+            if isclose(preferred, self._step)
+            else f" (steps are of {self._step:g} s, and it prefers {preferred:g} s: see plant.own.substeps)"
+        )
+        return FmuError(f"{self._name}: {what}: {text}{self._own_words()}{hint}")
 
 
-def _reading(settings: FmuSettings) -> ca.Function:
-    """q [1] and ω [rad/s] of the values of `settings.outputs`."""
-    values = ca.SX.sym("values", len(settings.outputs))
-    of = dict(zip(settings.outputs, ca.vertsplit(values), strict=True)) | {"": ca.SX(0)}
-    degrees = {"rad": 1.0, "rad/s": 1.0}
+class _Loaded:
+    """An FMU in this process: the library's object, the folder of its files, and what it logged. Outlives no plant."""
 
-    def column(names: Sequence[str], unit: str) -> ca.SX:
-        return degrees.get(unit, _DEGREE) * ca.vertcat(*(of[name] for name in names))
+    def __init__(self) -> None:
+        self.folder = mkdtemp(prefix="aeroloop-fmu-")
+        self.fmu: Any = None
+        self.fatal = False
+        self.logged = (-1, "")  # status and text of the gravest message; of those the last
 
-    angles = column(settings.angles or (), settings.angle_unit)
-    q = column(settings.quaternion, "rad") if settings.quaternion else from_euler(angles)
-    rate = column(settings.rate or settings.angle_rates or (), settings.rate_unit)
-    if settings.angle_rates:
-        (sr, sp, _), (cr, cp, _) = ca.vertsplit(ca.sin(angles)), ca.vertsplit(ca.cos(angles))
-        roll, pitch, yaw = ca.vertsplit(rate)
-        rate = ca.vertcat(roll - sp * yaw, cr * pitch + sr * cp * yaw, -sr * pitch + cr * cp * yaw)
-    return ca.Function("reading", [values], [q, rate], ["values"], ["attitude", "rate"])
+    def log(self, *message: Any) -> None:
+        """Keep a message. FMI 2 gives the FMU's name, too, before these three."""
+        status, _, text = message[-3:]
+        if status >= self.logged[0]:
+            self.logged = (status, " ".join((text or b"").decode(errors="replace").split()))
+
+    def free(self) -> None:
+        """End and free it, and remove its files."""
+        if self.fmu is not None and not self.fatal:
+            with suppress(Exception):  # one that failed may refuse to be ended, and is freed nonetheless
+                self.fmu.terminate()
+            self.fmu.freeInstance()
+        rmtree(self.folder, ignore_errors=True)
+
+
+class _Numbers(NamedTuple):
+    """Some numbers that an FMU holds, scalars or elements of arrays, which are set and read as wholes.
+
+    Attributes:
+        references: Of the variables that they belong to.
+        at: Where each is among all elements of these variables.
+        total: Number of these elements.
+    """
+
+    references: list[int]
+    at: list[int]
+    total: int
+
+    @classmethod
+    def of(cls, elements: Sequence[tuple[Any, int]]) -> _Numbers:
+        """The numbers of these variables and offsets."""
+        first: dict[int, int] = {}
+        total = 0
+        for variable, _ in elements:
+            if variable.valueReference not in first:
+                first[variable.valueReference] = total
+                total += prod(variable.shape)
+        return cls(list(first), [first[variable.valueReference] + offset for variable, offset in elements], total)
+
+
+def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Attitude of these angles [rad]: yaw about z first, then pitch, then roll."""
+    (cr, sr), (cp, sp), (cy, sy) = ((cos(angle / 2), sin(angle / 2)) for angle in (roll, pitch, yaw))
+    return (
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    )
+
+
+def body_rate(angles: tuple[float, float], derivatives: Vector) -> Vector:
+    """ω [rad/s] from roll φ and pitch θ [rad] and the derivatives of roll, pitch and yaw ψ [rad/s].
+
+    ω = [φ̇ − ψ̇ sin θ, θ̇ cos φ + ψ̇ sin φ cos θ, −θ̇ sin φ + ψ̇ cos φ cos θ]
+    """
+    (roll, pitch), (d_roll, d_pitch, d_yaw) = angles, derivatives
+    return (
+        d_roll - sin(pitch) * d_yaw,
+        cos(roll) * d_pitch + sin(roll) * cos(pitch) * d_yaw,
+        -sin(roll) * d_pitch + cos(roll) * cos(pitch) * d_yaw,
+    )
+
+
+def _in_radians(values: list[float], unit: str) -> list[float]:
+    return [radians(value) for value in values] if unit.startswith("deg") else values
+
+
+def _description(file: Path) -> Any:
+    """The FMU's model description, if it can be used here."""
+    try:
+        import fmpy
+    except ModuleNotFoundError as missing:
+        what = "FMPy" if missing.name == "fmpy" else f"FMPy with {missing.name}"
+        raise FmuError(f"an FMU needs {what}, which is not installed: pip install 'aeroloop[fmi]'") from None
+    if not file.is_file():
+        raise FmuError(f"there is no file {file}: set plant.own.file")
+    try:
+        with file.open("rb") as opened:  # FMPy would not close it
+            description = fmpy.read_model_description(opened, validate=False)
+            files = ZipFile(opened).namelist()
+        version = description.fmiMajorVersion
+    except Exception as error:
+        raise FmuError(f"{file} is not an FMU: {' '.join(str(error).split())}") from None
+    if version not in (2, 3):
+        raise FmuError(f"{file.name} is of FMI {description.fmiVersion}: export it for FMI 2 or 3")
+    if description.coSimulation is None:
+        raise FmuError(f"{file.name} is for model exchange only: export it for co-simulation")
+    platform = fmpy.platform if version == 2 else fmpy.platform_tuple
+    library = f"binaries/{platform}/{description.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    if library not in files:
+        others = sorted({name.split("/")[1] for name in files if re.match("binaries/[^/]+/.", name)})
+        sources = any(re.match(r"sources/.+\.c$", name) for name in files)
+        remedy = f"`fmpy compile {file}` builds one from its sources" if sources else "export it on this platform"
+        raise FmuError(f"{file.name} has no binary for {platform}, only for {either(others or ['none'])}: {remedy}")
+    return description
+
+
+def _kind(variable: Any) -> str:
+    """Causality and type in words."""
+    cause = variable.causality or "local"
+    return f"{'an' if cause[0] in 'aeiou' else 'a'} {cause} of type {variable.type}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    some = list(names)
+    return ", ".join(some[:8]) + (f" and {len(some) - 8} more" if len(some) > 8 else "") or "none"

@@ -13,12 +13,12 @@ from math import ceil, copysign, exp, hypot, inf, log
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, Field
 
 from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
-from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 

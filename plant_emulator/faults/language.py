@@ -1,4 +1,4 @@
-"""Notation of faults; `signals` and `streams` apply them.
+"""Notation of faults; `injection` applies them.
 
 A fault is written `signal:kind[=value][@start[..end]]`, in seconds of the plant's time. Without a start it acts at
 once, without an end for ever:
@@ -23,10 +23,9 @@ voltages; `motors` fails all of them at the same times. README.md has the limits
 
 from __future__ import annotations
 
-from math import ceil, ulp
+from dataclasses import dataclass
+from math import ulp
 from typing import Final, Literal, NamedTuple, TypeAlias, get_args
-
-from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 
@@ -112,18 +111,59 @@ _CHANGED: Final[dict[Whole, str]] = {
 }
 
 
-class Fault(BaseModel, frozen=True, extra="forbid"):
+@dataclass(frozen=True)
+class Fault:
     """One kind of failure of one signal for a span of time.
 
     Raises:
-        ValidationError: A ValueError; each of its messages is one line. `parse` raises a ValueError of one line.
+        ValueError: What is wrong and what would be right, in one line.
+
+    Attributes:
+        signal: Sensor, motor or stream that fails, a key of SIGNALS.
+        kind: Kind of failure.
+        value: Size [the signal's unit, s or 1]; None for a kind without one.
+        start_s: Start, in the plant's time [s].
+        end_s: End [s]; None for none.
     """
 
-    signal: str = Field(description="sensor, motor or stream that fails")
-    kind: Kind = Field(description="kind of failure")
-    value: float | None = Field(default=None, validate_default=True, description="size [signal's unit, s or 1]")
-    start_s: float = Field(default=0.0, description="start, in the plant's time [s]")
-    end_s: float | None = Field(default=None, description="end [s]; none if left out")
+    signal: str
+    kind: Kind
+    value: float | None = None
+    start_s: float = 0.0
+    end_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise ValueError(f"there is no signal {self.signal!r}; there are {_listed(SIGNALS)}")
+        whole, _, kinds = SIGNALS[self.signal]
+        if self.kind not in kinds:
+            as_a_whole = f"; {whole} as a whole does" if self.kind in SIGNALS[whole].kinds else ""
+            raise ValueError(f"{self.signal} takes no {self.kind!r}, but {_listed(kinds)}{as_a_whole}")
+        self._check_value(whole)
+        start, end = self.start_s, self.end_s
+        if not 0 <= start <= MAX_TIME_S:
+            raise ValueError(f"it must begin within 0 to {MAX_TIME_S:g} s, not at {_text(start)} s")
+        if end is not None and not start < end <= MAX_TIME_S:
+            raise ValueError(
+                f"it must end after it begins at {_text(start)} s and by {MAX_TIME_S:g} s, not at {_text(end)} s"
+            )
+
+    def _check_value(self, whole: Whole) -> None:
+        kind, value = self.kind, self.value
+        if kind in ("bias", "noise"):
+            high, unit = _SIZES[whole]
+            low = 0.0 if kind == "noise" else -high
+            words = f"{low:g} to {high:g} {unit}"
+        elif kind in _VALUES:
+            low, high, words = _VALUES[kind]
+        elif value is None:
+            return
+        else:
+            raise ValueError(f"{kind} takes no value, but was given {_text(value)}: write {kind} alone")
+        if value is None:
+            raise ValueError(f"{kind} takes {words}: write {kind}=0.1, say")
+        if not low <= value <= high:
+            raise ValueError(f"{kind} takes {words}, not {_text(value)}")
 
     @classmethod
     def parse(cls, text: str) -> Fault:
@@ -132,29 +172,22 @@ class Fault(BaseModel, frozen=True, extra="forbid"):
         Raises:
             ValueError: One line with the text and the error in it.
         """
-        try:
-            return cls._parse(text.strip())
-        except ValidationError as error:
-            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-        except ValueError as error:
-            reason = str(error)
-        raise ValueError(f"fault {text!r}: {reason}")
-
-    @classmethod
-    def _parse(cls, text: str) -> Fault:
-        what, at, when = text.partition("@")
+        what, at, when = text.strip().partition("@")
         signal, colon, failure = what.partition(":")
-        if not colon:
-            raise ValueError("it is written signal:kind[=value][@start[..end]], such as attitude:off@5")
         kind, equals, value = failure.partition("=")
         start, dots, end = when.partition("..")
-        return cls(
-            signal=signal,
-            kind=kind,  # type: ignore[arg-type]  # a text until it is validated
-            value=_number(value) if equals else None,
-            start_s=_number(start) if at else 0.0,
-            end_s=_number(end) if dots else None,
-        )
+        try:
+            if not colon:
+                raise ValueError("it is written signal:kind[=value][@start[..end]], such as attitude:off@5")
+            return cls(
+                signal,
+                kind,  # type: ignore[arg-type]  # a text until it is checked
+                _number(value) if equals else None,
+                _number(start) if at else 0.0,
+                _number(end) if dots else None,
+            )
+        except ValueError as error:
+            raise ValueError(f"fault {text!r}: {error}") from None
 
     def __str__(self) -> str:
         value = "" if self.value is None else f"={_text(self.value)}"
@@ -171,83 +204,6 @@ class Fault(BaseModel, frozen=True, extra="forbid"):
     def effect(self) -> str:
         """What it does to what, after a number: `commands dropped`."""
         return f"{_CHANGED[self.target.whole]} {_CHANGES[self.kind]}"
-
-    def active(self, t: float) -> bool:
-        """Whether it acts at time t [s]: start ≤ t < end."""
-        return self.start_s <= t and not self.over(t)
-
-    def over(self, t: float) -> bool:
-        """Whether it has ended by time t [s]."""
-        return self.end_s is not None and t >= self.end_s
-
-    def later(self, by: float) -> Fault:
-        """The same fault, `by` [s] later, rounded to the nanosecond as ticks are."""
-        end = None if self.end_s is None else round(self.end_s + by, 9)
-        return self.model_copy(update={"start_s": round(self.start_s + by, 9), "end_s": end})
-
-    @field_validator("signal")
-    @classmethod
-    def _is_a_signal(cls, signal: str) -> str:
-        if signal not in SIGNALS:
-            raise ValueError(f"there is no signal {signal!r}; there are {_listed(SIGNALS)}")
-        return signal
-
-    @field_validator("kind", mode="before")
-    @classmethod
-    def _happens_to_the_signal(cls, kind: object, info: ValidationInfo) -> object:
-        if (name := info.data.get("signal")) is None:
-            return kind
-        signal = SIGNALS[name]
-        if kind not in signal.kinds:
-            as_a_whole = f"; {signal.whole} as a whole does" if kind in SIGNALS[signal.whole].kinds else ""
-            raise ValueError(f"{name} takes no {kind!r}, but {_listed(signal.kinds)}{as_a_whole}")
-        return kind
-
-    @field_validator("value")
-    @classmethod
-    def _is_what_the_kind_takes(cls, value: float | None, info: ValidationInfo) -> float | None:
-        if (kind := info.data.get("kind")) is None:
-            return value
-        if kind in ("bias", "noise"):
-            high, unit = _SIZES[SIGNALS[info.data["signal"]].whole]
-            low = 0.0 if kind == "noise" else -high
-            words = f"{low:g} to {high:g} {unit}"
-        elif kind in _VALUES:
-            low, high, words = _VALUES[kind]
-        elif value is None:
-            return value
-        else:
-            raise ValueError(f"{kind} takes no value, but was given {_text(value)}: write {kind} alone")
-        if value is None:
-            raise ValueError(f"{kind} takes {words}: write {kind}=0.1, say")
-        if not low <= value <= high:
-            raise ValueError(f"{kind} takes {words}, not {_text(value)}")
-        return value
-
-    @field_validator("start_s")
-    @classmethod
-    def _starts_in_time(cls, start: float) -> float:
-        if not 0 <= start <= MAX_TIME_S:
-            raise ValueError(f"it must begin within 0 to {MAX_TIME_S:g} s, not at {_text(start)} s")
-        return start
-
-    @field_validator("end_s")
-    @classmethod
-    def _ends_after_its_start(cls, end: float | None, info: ValidationInfo) -> float | None:
-        start = info.data.get("start_s")
-        if end is not None and start is not None and not start < end <= MAX_TIME_S:
-            raise ValueError(
-                f"it must end after it begins at {_text(start)} s and by {MAX_TIME_S:g} s, not at {_text(end)} s"
-            )
-        return end
-
-
-def first_tick(time_s: float, period: float) -> int:
-    """The first tick at or after a time [s]. Tick n is at n·period, rounded to the nanosecond."""
-    tick = max(0, ceil(time_s / period) - 1)
-    while round(tick * period, 9) < time_s:
-        tick += 1
-    return tick
 
 
 def _number(text: str) -> float:

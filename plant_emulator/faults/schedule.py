@@ -5,66 +5,52 @@ The plant's time is a whole number of periods, so both ticks follow from the fau
 
 from __future__ import annotations
 
-from math import inf
-from typing import Final, Literal, NamedTuple
+from math import ceil, inf
+from typing import Final, Literal, NamedTuple, TypeAlias
 
-from aeroloop.plant_emulator.faults.language import Fault, first_tick
-from aeroloop.plant_emulator.faults.signals import ValueFault
-from aeroloop.plant_emulator.faults.streams import StreamFault
+from aeroloop.plant_emulator.faults.injection import ActingFault
 from aeroloop.protocol.messages.models import FaultStatus
 
 MAX_FAULTS: Final = 64
 """Faults that may act or be to come at the same time; as many that are over are remembered."""
 
-Source = Literal["configured", "injected"]
+Source: TypeAlias = Literal["configured", "injected"]
 
 
-class Turn(NamedTuple):
+class FaultTransition(NamedTuple):
     """A fault's begin, end or injection: when, in ticks of the plant's time, and one line that says what."""
 
     tick: int
     text: str
 
 
-def begins(fault: str, source: Source) -> str:
-    """Text of the event of a fault's begin."""
-    return f"fault begins ({source}): {fault}"
-
-
-def ends(fault: str, source: Source, changed: int, effect: str) -> str:
-    """Text of the event of a fault's end, with what it changed."""
-    return f"fault ends ({source}): {fault}, {changed} {effect}"
-
-
 class _Scheduled:
-    """A fault as it was written; what applies it; its ticks, of which `end` is None if there is none."""
+    """A fault with its ticks, of which `end` is None if there is none."""
 
-    def __init__(self, fault: Fault, source: Source, applied: ValueFault | StreamFault, period: float) -> None:
-        self.fault, self.source, self.applied = fault, source, applied
-        end_s = applied.fault.end_s
-        self.begin = first_tick(applied.fault.start_s, period)
-        self.end = None if end_s is None else first_tick(end_s, period)
+    def __init__(self, acting: ActingFault, source: Source, period: float) -> None:
+        self.acting, self.source = acting, source
+        self.begin = first_tick(acting.start, period)
+        self.end = None if acting.end == inf else first_tick(acting.end, period)
         self.begun = False
         self.over = self.begin == self.end  # it lies between two ticks
 
     @property
     def due(self) -> float:
-        """Its next turn; infinity if none is left."""
+        """Its next transition; infinity if none is left."""
         tick = self.end if self.begun else self.begin
         return inf if self.over or tick is None else tick
 
-    def turns(self, now: int) -> list[Turn]:
-        """Its turns up to now that were not yet taken."""
-        turns = []
+    def transitions(self, now: int) -> list[FaultTransition]:
+        """Its transitions up to now that were not yet taken."""
+        found, fault = [], f"({self.source}): {self.acting.fault}"
         if not self.begun and self.due <= now:
             self.begun = True
-            turns.append(Turn(self.begin, begins(str(self.fault), self.source)))
-        if self.begun and self.due <= now:
+            found.append(FaultTransition(self.begin, f"fault begins {fault}"))
+        if self.begun and self.end is not None and self.due <= now:
             self.over = True
-            assert self.end is not None
-            text = ends(str(self.fault), self.source, self.applied.changed, self.fault.effect)
-            turns.append(Turn(self.end, text))
-        return turns
+            text = f"fault ends {fault}, {self.acting.changed} {self.acting.fault.effect}"
+            found.append(FaultTransition(self.end, text))
+        return found
 
 
 class Schedule:
@@ -87,35 +73,43 @@ class Schedule:
         forgotten = over[: max(0, len(over) + count - MAX_FAULTS)]
         self._faults = [fault for fault in self._faults if fault not in forgotten]
 
-    def add(self, fault: Fault, source: Source, applied: ValueFault | StreamFault) -> None:
-        """Add a fault as it was written, with what applies it."""
-        self._faults.append(added := _Scheduled(fault, source, applied, self._period))
+    def add(self, acting: ActingFault, source: Source) -> None:
+        """Add a fault at work."""
+        self._faults.append(added := _Scheduled(acting, source, self._period))
         self.due = min(self.due, added.due)
 
-    def turns(self, now: int) -> list[Turn]:
+    def transitions(self, now: int) -> list[FaultTransition]:
         """Begins and ends up to now that were not yet taken, in order of time."""
-        turns = [turn for fault in self._faults for turn in fault.turns(now)]
+        found = [transition for fault in self._faults for transition in fault.transitions(now)]
         self.due = min((fault.due for fault in self._faults), default=inf)
-        return sorted(turns, key=lambda turn: turn.tick)
+        return sorted(found, key=lambda transition: transition.tick)
 
-    def clear(self, now: int) -> list[Turn]:
+    def clear(self, now: int) -> list[FaultTransition]:
         """End all faults now, and forget those that have not begun. Returns the ends."""
         self._faults = [fault for fault in self._faults if fault.begun]
         for fault in self._faults:
             if not fault.over:
                 fault.end = now
-        return self.turns(now)
+        return self.transitions(now)
 
     def statuses(self, first: int | None) -> list[FaultStatus]:
         """The faults in order; `first` is the plant's tick at which its time began, None if it has not."""
         return [
             FaultStatus(
-                fault=str(one.fault),
+                fault=str(one.acting.fault),
                 source=one.source,
                 begin_tick=None if first is None else first + one.begin,
                 end_tick=None if first is None or one.end is None else first + one.end,
-                changed=one.applied.changed,
-                effect=one.fault.effect,
+                changed=one.acting.changed,
+                effect=one.acting.fault.effect,
             )
             for one in self._faults
         ]
+
+
+def first_tick(time_s: float, period: float) -> int:
+    """The first tick at or after a time [s]. Tick n is at n·period, rounded to the nanosecond."""
+    tick = max(0, ceil(time_s / period) - 1)
+    while round(tick * period, 9) < time_s:
+        tick += 1
+    return tick

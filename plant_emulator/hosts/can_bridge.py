@@ -1,9 +1,9 @@
 """Bridge between Zenoh and a plant on a CAN bus.
 
-On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace; an
-emulated node's faults, too. On the bus it is the controller's side. Frames pass unchanged, byte for byte. It runs its
-own watchdog besides the node's and trips when the bus fails or the node is silent, has another wire spec or trips. It
-reopens a failed bus by itself; the plant is driven again once it is armed.
+On Zenoh it is the plant: it grants and refuses claims, trips, and publishes status, events and the plant's trace. On
+the bus it is the controller's side. Frames pass unchanged, byte for byte. It runs its own watchdog besides the node's
+and trips when the bus fails or the node is silent, has another wire spec or trips. It reopens a failed bus by itself;
+the plant is driven again once it is armed.
 
 A tick of the bridge is a forwarded measurement. Commands are judged fresh or stale by the node's rule.
 """
@@ -11,35 +11,32 @@ A tick of the bridge is a forwarded measurement. Commands are judged fresh or st
 from __future__ import annotations
 
 import time
-from math import isfinite
-from typing import Final, Literal
+from threading import Condition
+from typing import Final
 
-from aeroloop.plant_emulator.endpoint.tenancy import Notice, Tenancy
-from aeroloop.plant_emulator.faults.node_faults import NodeFaults
-from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
+from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.states import PlantState, PlantTrigger, TripCause
+from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Outcome
-from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.transport.link import Arrival, Wake
+from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 WAIT_S: Final = 0.01
 SESSIONS: Final = 16
-_AHEAD: Final = 16
-"""Ticks by which a fault report may be ahead of the measurements that were forwarded."""
 _UNBEGUN_NS: Final = round(FIRST_COMMAND_S * 1e9)  # for the first command, before the session's first measurement
 
 
-class Relay(Tenancy):
+class Relay(VehicleClaim):
     """Claims, sessions and watchdog for a plant on a bus, sans-I/O.
 
-    The session ends after `watchdog_s` without a fresh command [s]; the other arguments are Tenancy's.
+    The session ends after `watchdog_s` without a fresh command [s]; the other arguments are VehicleClaim's.
 
     Attributes:
         number: Number of the session on the bus.
@@ -50,37 +47,23 @@ class Relay(Tenancy):
         super().__init__(wire, period_ns, lockstep=lockstep, armed=armed)
         self.number = 0
         self.counter = 0
-        self._counters = wire.measurement.counters
-        self._level = wire.voltage.quantizer().level
+        self._silent_measurements = lockstep and wire.transmit.measurement == "on_change"
         self.protect(watchdog_s)
         self._begun = False  # from the first measurement with counter 0; frames before it are of another session
         self._session_tick = -1
         self._fresh_ns: int | None = None  # time of the last fresh command or of the session's start
         self._judged = Outcome.NONE  # of the last command since the last tick
-        self._codes: tuple[float, ...] = ()  # of the last fresh command
-        self._echo = self._answered = -1
 
     @property
     def session_tick(self) -> int:
         """Tick of the last measurement since the session's first, by its counter; a lost round goes unnoticed."""
         return self._session_tick
 
-    @property
-    def answered(self) -> int:
-        """Session tick that the last fresh command answers; −1 for none."""
-        return self._answered
-
-    def protect(self, watchdog_s: float) -> None:
-        """Set the watchdog's time [s]."""
-        self._watchdog_ns = round(watchdog_s * 1e9)
-        self._watchdog = max(1, round(self._watchdog_ns / self.period_ns))
-        self._first_command_ns = self.first_command_ns(self._watchdog_ns)
-
     def measurement(self, frame: bytes) -> bytes | None:
         """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick."""
         if self.session is None:
             return None
-        if self._is_silence(frame, "measurement"):
+        if frame == SILENCE and self._silent_measurements:
             if not self._begun:
                 return None
             self.counter = (self.counter + 1) % self._counters
@@ -105,19 +88,10 @@ class Relay(Tenancy):
         """
         if self.session is None:
             return None
-        if self._is_silence(frame, "command") and self.state is PlantState.DRIVEN:
-            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
-        else:
-            read = self.wire.command.unpack(frame)
-        if read is None:
-            self.refused += 1
-            self._judged = Outcome.MALFORMED
-            return None
-        self._judged = self._judge(*read)
+        self._judged = self._command(frame)
         if self._judged is Outcome.ACTED:
             self._fresh_ns = now_ns
-            self._machine.fire(PlantTrigger.COMMAND)
-        return frame
+        return None if self._judged is Outcome.MALFORMED else frame
 
     def watch(self, now_ns: int) -> bool:
         """Trip if no fresh command was received in time. In lockstep only the first command has a deadline.
@@ -147,30 +121,11 @@ class Relay(Tenancy):
         self._session_tick += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
 
-    def _judge(self, echo: int, codes: tuple[float, ...]) -> Outcome:
-        """Judge a command by the endpoint's rule."""
-        age = (self.counter - echo) % self._counters
-        answered = self._session_tick - age
-        if not self._begun or echo == self._echo or answered <= self._answered:
-            return Outcome.REPEATED
-        if age > self._watchdog:
-            self.stale += 1
-            return Outcome.STALE
-        self._codes, self._echo, self._answered = codes, echo, answered
-        voltages = tuple(self._level(code) for code in codes)
-        self.voltages = voltages if isfinite(sum(voltages)) else self.off
-        return Outcome.ACTED
-
-    def _is_silence(self, frame: bytes, direction: Literal["measurement", "command"]) -> bool:
-        return frame == SILENCE and self.lockstep and getattr(self.wire.transmit, direction) == "on_change"
-
     def _begin(self) -> None:
+        super()._begin()
         self.number = (self.number + 1) % SESSIONS
         self._begun, self._session_tick, self._fresh_ns = False, -1, None
-        self._judged, self._codes, self._echo, self._answered = Outcome.NONE, (), -1, -1
-
-    def _rest(self) -> None:
-        self.voltages, self._answered = self.off, -1
+        self._judged = Outcome.NONE
 
 
 class Bridge:
@@ -189,10 +144,9 @@ class Bridge:
         self._relay = Relay(
             wire, loop.period_ns, lockstep=loop.lockstep, watchdog_s=settings.watchdog_s, armed=settings.armed_at_start
         )
-        self._changed = Wake()
+        self._changed = Condition()
         self._bus = CanLink(bus, wire, "controller", self._changed, lockstep=loop.lockstep)
-        self._faults = NodeFaults(settings.parsed_faults, bus.node)
-        self._front = ZenohFront(role, loop, self._relay, self._changed, self._faults.statuses)
+        self._network = ZenohNetwork(role, loop, self._relay, settings.state_directory, self._changed)
         self._fingerprint = fingerprint(wire, loop.period_ns, lockstep=loop.lockstep)
         self._beat_due = 0.0
         self._sent_state = self._relay.state  # by heartbeat
@@ -202,72 +156,55 @@ class Bridge:
 
     def run(self) -> None:
         """Run until the role stops; then release the node and publish a last status."""
-        front, relay = self._front, self._relay
+        network, relay = self._network, self._relay
         if not self._loop.lockstep:
-            front.notes = self._machine_notes = prepare_process(self._loop)
-        front.serve()
+            network.notes = self._machine_notes = prepare_process(self._loop)
+        network.serve()
         try:
             while not self._role.stop.is_set():
-                if not self._frame_pending():
-                    self._changed.wait(WAIT_S)
+                with self._changed:
+                    self._changed.wait_for(self._frame_pending, WAIT_S)
                 relay.unavailable = self._unavailable()
-                front.take_inbox()
+                network.take_inbox()
                 self._follow()
                 self._pass_frames()
-                self._take_fault_reports()
                 if relay.watch(now_ns := time.monotonic_ns()):
                     self._account(None, now_ns)
                 self._watch_node()
                 self._follow()
                 if self._bus.errors or self._bus.refused:
                     count = f"the bus: {self._bus.errors} errors, {self._bus.refused} malformed frames"
-                    front.notes = [*self._machine_notes, count]
-                front.follow_session()
-                front.publish_when_due()
+                    network.notes = [*self._machine_notes, count]
+                network.follow_session()
+                network.publish_when_due()
+                collect_garbage()
         finally:
             if relay.session is not None:
                 relay.release(relay.session)
             self._beat()
             self._bus.close()
-            front.leave()
-
-    def reconfigure(self, settings: PlantSettings) -> None:
-        """Apply the settings that can change between two ticks: the watchdog's time."""
-        self._relay.operated("reconfigure", settings={"watchdog_s": settings.watchdog_s})
-        self._relay.protect(settings.watchdog_s)
+            network.leave()
 
     def _frame_pending(self) -> bool:
-        link = self._front.link
+        link = self._network.link
         return self._bus.pending or (link is not None and link.pending)
 
     def _pass_frames(self) -> None:
         arrival = self._bus.take()
         if arrival is not None and self._relay.measurement(arrival.frame) is not None:
             sent_ns = time.monotonic_ns()
-            self._front.send(arrival.frame)
+            self._network.send(arrival.frame)
             self._account(arrival.frame, sent_ns)
-        arrival = self._front.link.take() if self._front.link else None
+        arrival = self._network.link.take() if self._network.link else None
         if arrival is not None:
             self._arrival = arrival
             frame = self._relay.command(arrival.frame, time.monotonic_ns())
             if frame is not None:
                 self._bus.send(frame)
 
-    def _take_fault_reports(self) -> None:
-        """Queue an event for each fault of the node that began or ended, at the session tick that the node reports."""
-        relay = self._relay
-        while self._bus.reports:
-            report = self._bus.reports.popleft()
-            now = relay.event_tick
-            ago = 0 if now is None else (now - report.tick + _AHEAD) % 256 - _AHEAD
-            text = self._faults.take(report, relay.ticked - ago)
-            if text is not None:
-                tick = None if now is None else max(0, now - ago)
-                relay.notices.append(Notice("fault", text, relay.session, tick))
-
     def _account(self, measurement: bytes | None, sent_ns: int) -> None:
         arrival, self._arrival = self._arrival, None
-        self._front.after_tick(measurement, arrival, sent_ns)
+        self._network.after_tick(measurement, arrival, sent_ns)
 
     def _watch_node(self) -> None:
         """Trip when the bus fails, or the node is silent, tripped, restarted or of another wire spec."""

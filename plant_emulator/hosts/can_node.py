@@ -8,25 +8,15 @@ commands, and trips on its own watchdog and limits. The node's own heartbeat car
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.front import Front
-from aeroloop.plant_emulator.faults.node_faults import phase_of
-from aeroloop.protocol.messages.models import Claim, Event, EventKind, FaultStatus
+from aeroloop.plant_emulator.hosts.driver import PlantNetwork
+from aeroloop.protocol.messages.models import Claim, Event, EventKind
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.throttle import Throttle
-from aeroloop.protocol.transport.can_format import (
-    HEARTBEAT_S,
-    CanSettings,
-    FaultPhase,
-    FaultReport,
-    Heartbeat,
-    fault_check,
-    fingerprint,
-)
+from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -34,27 +24,15 @@ from aeroloop.protocol.wire.loop import LoopSettings
 MASTER: Final = "the controller's side"
 
 
-class CanFront(Front):
+class CanNetwork(PlantNetwork):
     """A plant end on a CAN bus; `settings` have the bus and this node's number.
-
-    `faults` returns the status of an emulator's faults.
 
     Raises:
         CanError: The bus cannot be opened, or a frame does not fit it.
     """
 
-    def __init__(
-        self,
-        settings: CanSettings,
-        loop: LoopSettings,
-        endpoint: Endpoint,
-        faults: Callable[[], list[FaultStatus]] = list,
-    ) -> None:
+    def __init__(self, settings: CanSettings, loop: LoopSettings, endpoint: Endpoint) -> None:
         super().__init__()
-        self._faults = faults
-        self._reported: dict[int, FaultPhase] = {}
-        self._in_turn = 0
-        self._turned = False  # whether a fault began or ended that is not yet reported
         self._settings = settings
         self._loop = loop
         self._endpoint = endpoint
@@ -108,19 +86,16 @@ class CanFront(Front):
         """Log events, and send a heartbeat at once if the state has changed."""
         for notice in self._endpoint.notices:
             self._log(*notice)
-            self._turned |= notice.kind == "fault"
         self._endpoint.notices.clear()
-        self._endpoint.operations.clear()  # the bridge writes the trace
+        self._endpoint.changes.clear()  # the bridge writes the trace
         if self._endpoint.state is not self._sent_state:
             self._sent_state = self._endpoint.state
             self.publish_status()
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Log events, report a fault that began or ended, send a heartbeat that is due. The bridge writes the trace."""
+        """Log events and send a heartbeat that is due. The bridge writes the trace."""
         del measurement, arrival, sent_ns
         self.follow_session()
-        if self._turned:
-            self._turned = self._report_turned()
         self.publish_when_due()
 
     def publish_when_due(self) -> None:
@@ -129,13 +104,10 @@ class CanFront(Front):
             self.publish_status()
 
     def publish_status(self) -> None:
-        """Send a heartbeat, and the report of the next fault in turn."""
+        """Send a heartbeat."""
         self._beat_due = time.monotonic() + HEARTBEAT_S
         trip = self._endpoint.trip
         self._bus.beat(Heartbeat(self._endpoint.state, trip.number if trip else 0, self._fingerprint))
-        if faults := self._faults():
-            self._in_turn = (self._in_turn + 1) % len(faults)
-            self._report(self._in_turn, faults[self._in_turn])
 
     def leave(self) -> None:
         """Release a session, send an idle heartbeat, and close the bus."""
@@ -147,24 +119,6 @@ class CanFront(Front):
     def _log(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
         """Log an event; on the bus there is no place for its text, and none for the vehicle's name."""
         log_event(Event(role="node", kind=kind, text=text, session=session, tick=tick), None)
-
-    def _report_turned(self) -> bool:
-        """Report one fault that began or ended since its last report; whether there was one.
-
-        Why one a tick: the queue of an interface may hold ten frames.
-        """
-        for place, fault in enumerate(self._faults()):
-            if phase_of(fault, self._endpoint.ticked)[0] is not self._reported.get(place, FaultPhase.TO_COME):
-                self._report(place, fault)
-                return True
-        return False
-
-    def _report(self, place: int, fault: FaultStatus) -> None:
-        endpoint = self._endpoint
-        phase, since = phase_of(fault, endpoint.ticked)
-        self._reported[place] = phase
-        tick = (endpoint.session_tick - (endpoint.ticked - since)) % 256
-        self._bus.report(FaultReport(place, phase, tick, fault_check(fault.fault), fault.changed))
 
     def _begin(self, peer: Heartbeat) -> None:
         if peer.fingerprint != self._fingerprint:

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from typing import Final
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.front import Front
-from aeroloop.plant_emulator.own_plant import PlantError
-from aeroloop.plant_emulator.plant import Plant
+from aeroloop.plant_emulator.plant import Plant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
-from aeroloop.protocol.runtime.realtime import prepare_process
+from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming
-from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
@@ -29,6 +28,64 @@ from aeroloop.protocol.wire.transmit import SILENCE
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6
 """With hardware, the loop waits for the answer to a sample for this share of the period."""
+
+
+class PlantNetwork(ABC):
+    """Network side of a driver, which alone calls it: ZenohNetwork on Zenoh, CanNetwork on a CAN bus.
+
+    Attributes:
+        timing: Timing of the driver's loop; None in lockstep.
+        skipped: Ticks of sessions that the driver missed.
+        notes: Real-time settings that the machine refused.
+    """
+
+    def __init__(self) -> None:
+        self.timing: LoopTiming | None = None
+        self.skipped = 0
+        self.notes: list[str] = []
+
+    @property
+    @abstractmethod
+    def link(self) -> Link | None:
+        """Link of the session's frames; None without a session."""
+
+    @abstractmethod
+    def serve(self) -> None:
+        """Start serving the network."""
+
+    @abstractmethod
+    def take_inbox(self) -> None:
+        """Between two ticks, process what was received: claims, releases, operator commands."""
+
+    @abstractmethod
+    def send(self, frame: bytes) -> None:
+        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+
+    @abstractmethod
+    def follow_session(self) -> None:
+        """Publish events, and close the link of a session that ended."""
+
+    @abstractmethod
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """After the measurement was sent: write the tick's trace row, publish events and a status that is due.
+
+        Args:
+            measurement: The endpoint's frame; SILENCE if it is not to be sent, None if there is none.
+            arrival: The command received since the last tick, before any injected fault; None for none.
+            sent_ns: When the measurement was sent, on `time.monotonic_ns()`.
+        """
+
+    @abstractmethod
+    def publish_when_due(self) -> None:
+        """Publish the status if it is due."""
+
+    @abstractmethod
+    def publish_status(self) -> None:
+        """Publish the status."""
+
+    @abstractmethod
+    def leave(self) -> None:
+        """Publish that the plant stopped at 0 V, and leave the network."""
 
 
 class Driver:
@@ -57,18 +114,18 @@ class Driver:
             loop.period_ns,
             lockstep=loop.lockstep,
             watchdog_s=settings.watchdog_s,
-            guard=settings.guard(loop.period_ns, wire.voltage.quantizer().outermost),
+            limits=settings.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost),
             armed=settings.armed_at_start,
         )
 
-    def run(self, front: Front) -> None:
+    def run(self, network: PlantNetwork) -> None:
         """Run until `stop` is set or the plant fails; then close the plant at 0 V and leave the network.
 
         Raises:
             PlantError: A plant of one's own failed; the loop has tripped and says so.
         """
-        self._front = front
-        front.serve()
+        self._network = network
+        network.serve()
         try:
             if self._loop.lockstep:
                 self._run_lockstep()
@@ -81,20 +138,12 @@ class Driver:
             try:
                 self._plant.close()
             finally:
-                front.leave()
-
-    def reconfigure(self, settings: PlantSettings) -> None:
-        """Apply the settings that can change between two ticks: limits and watchdog."""
-        self._settings = settings
-        changed = {"watchdog_s": settings.watchdog_s, "limits": settings.limits.model_dump()}
-        self.endpoint.operated("reconfigure", settings=changed)
-        guard = settings.guard(self._loop.period_ns, self.endpoint.wire.voltage.quantizer().outermost)
-        self.endpoint.protect(settings.watchdog_s, guard)
+                network.leave()
 
     def _run_real_time(self) -> None:
-        front = self._front
-        front.notes = prepare_process(self._loop)
-        timing = front.timing = LoopTiming()
+        network = self._network
+        network.notes = prepare_process(self._loop)
+        timing = network.timing = LoopTiming()
         grid = None if self._plant.paces else TickGrid(self._loop.period_ns)
         while not self._stop.is_set():
             skipped = grid.skipped if grid else 0
@@ -102,19 +151,20 @@ class Driver:
             woke_ns = time.monotonic_ns()
             due_ns = grid.due_ns if grid else woke_ns
             before = self.endpoint.session
-            front.take_inbox()
+            network.take_inbox()
             if grid and self.endpoint.session not in (None, before):
                 # Granting took time, and the controller takes its grid from the session's first measurement.
                 k, skipped = grid.wait(), grid.skipped
             self._tick(self._command(), k)
             if self.endpoint.session:
-                front.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
+                network.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
+            collect_garbage()
             timing.woke(due_ns, woke_ns)
             timing.done()
 
     def _command(self) -> Arrival | None:
         """Return the command for this period. Hardware applies it at once, so the loop waits for it."""
-        link = self._front.link
+        link = self._network.link
         if link is None:
             return None
         return link.wait(ANSWER_SHARE * self._loop.period) if self._plant.paces else link.take()
@@ -122,10 +172,10 @@ class Driver:
     def _run_lockstep(self) -> None:
         arrival = None
         while not self._stop.is_set():
-            self._front.take_inbox()
-            if self._front.link is None or not self._may_step():
-                time.sleep(IDLE_WAIT_S if self._front.link is None else 0)
-                self._front.publish_when_due()
+            self._network.take_inbox()
+            if self._network.link is None or not self._may_step():
+                time.sleep(IDLE_WAIT_S if self._network.link is None else 0)
+                self._network.publish_when_due()
                 continue
             echo = self._tick(arrival, self.endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
@@ -142,12 +192,12 @@ class Driver:
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
         """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
-        front = self._front
+        network = self._network
         measurement = self.tick(arrival.frame if arrival is not None else None, k)
         sent_ns = time.monotonic_ns()
         echo = None
         for sent in self._outgoing(measurement):
-            front.send(sent)
+            network.send(sent)
             if self._loop.lockstep:
                 # The controller takes a frame without a counter for the tick after its last.
                 measured = self.endpoint.wire.measurement
@@ -155,21 +205,21 @@ class Driver:
                 self._counter = (self._counter + 1) % measured.counters if echo is None else echo
                 if sent == SILENCE:
                     echo = self._counter
-        front.after_tick(measurement, arrival, sent_ns)
+        network.after_tick(measurement, arrival, sent_ns)
         return echo
 
     def _await_answer(self, echo: int) -> Arrival | None:
         """Wait for the command that echoes a counter. Returns None if the session ends first."""
         deadline = time.monotonic() + self._settings.answer_timeout_s
-        while self._front.link and not self._stop.is_set():
-            arrival = self._front.link.wait(IDLE_WAIT_S)
+        while self._network.link and not self._stop.is_set():
+            arrival = self._network.link.wait(IDLE_WAIT_S)
             if arrival is not None and self.endpoint.wire.command.counter(arrival.frame) in (echo, None):
                 return arrival
-            self._front.take_inbox()
+            self._network.take_inbox()
             if time.monotonic() > deadline:
                 self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
-            self._front.follow_session()
-            self._front.publish_when_due()
+            self._network.follow_session()
+            self._network.publish_when_due()
         return None
 
     # ── hooks of subclasses ──

@@ -10,14 +10,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 
-from aeroloop.plant_emulator.endpoint.front import Front
-from aeroloop.plant_emulator.endpoint.tenancy import Notice
+from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
+from aeroloop.plant_emulator.faults.injection import FaultyPlant, FaultyStream
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.schedule import Schedule, Source, Turn
-from aeroloop.plant_emulator.faults.signals import FaultyPlant
-from aeroloop.plant_emulator.faults.streams import FaultyStream
-from aeroloop.plant_emulator.hosts.driver import Driver
-from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
+from aeroloop.plant_emulator.faults.schedule import FaultTransition, Schedule, Source
+from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
+from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import FaultStatus, Truth
@@ -73,13 +71,13 @@ class Emulator(Driver):
             self._measurements.clear()
             self._commands.clear()
             self._publish(self._schedule.clear(self._faulty.ticks))
-            self.endpoint.operated("inject", name=None)
+            self.endpoint.record_change("inject", name=None)
         self._add(faults, "injected")
         done = ["no faults any more"] if clear else []
         for fault in faults:
-            self.endpoint.operated("inject", name=str(fault))
+            self.endpoint.record_change("inject", name=str(fault))
             done.append(f"fault injected: {fault}")
-        self._publish([Turn(self._faulty.ticks, text) for text in done])
+        self._publish([FaultTransition(self._faulty.ticks, text) for text in done])
         return done
 
     def fault_statuses(self) -> list[FaultStatus]:
@@ -103,27 +101,27 @@ class Emulator(Driver):
         """Tick the plant end, and note the faults that began or ended."""
         measurement = super().tick(frame, k)
         if self._faulty.ticks >= self._schedule.due:
-            self._publish(self._schedule.turns(self._faulty.ticks))
+            self._publish(self._schedule.transitions(self._faulty.ticks))
         return measurement
 
     def _add(self, faults: Sequence[Fault], source: Source) -> None:
         now = self._faulty.time
         self._schedule.make_room(len(faults))
         for fault in faults:
-            applied = (
+            acting = (
                 self._faulty.inject(fault) or self._measurements.inject(fault, now) or self._commands.inject(fault, now)
             )
-            assert applied is not None
-            self._schedule.add(fault, source, applied)
+            assert acting is not None
+            self._schedule.add(acting, source)
 
-    def _publish(self, turns: Sequence[Turn]) -> None:
+    def _publish(self, transitions: Sequence[FaultTransition]) -> None:
         """Queue events of faults, with the session's tick if there was one then."""
         endpoint = self.endpoint
-        for turn in turns:
+        for transition in transitions:
             tick = endpoint.event_tick
             if tick is not None:
-                tick = max(0, tick + turn.tick - self._faulty.ticks)
-            endpoint.notices.append(Notice("fault", turn.text, endpoint.session, tick))
+                tick = max(0, tick + transition.tick - self._faulty.ticks)
+            endpoint.notices.append(Notice("fault", transition.text, endpoint.session, tick))
 
     def _incoming(self, frame: bytes | None) -> bytes | None:
         session = self.endpoint.session
@@ -155,16 +153,14 @@ class EmulatorOnZenoh(Emulator):
         self._steps: int | None = 0 if settings.steps_on_request else None  # steps left; None: no limit
         self._truth_every = self._ticks_between_truths()
 
-    def run(self, front: Front | None = None) -> None:
+    def run(self, network: PlantNetwork | None = None) -> None:
         """Run until the role stops; then set 0 V and publish a last status."""
         self._role.serve("inject", Inject, self._inject)
         self._role.serve("advance", Advance, lambda advance: lambda: self._advance(advance.seconds))
-        super().run(front or ZenohFront(self._role, self._loop, self.endpoint, faults=self.fault_statuses))
-
-    def reconfigure(self, settings: PlantSettings) -> None:
-        """Apply limits, watchdog and the rate of true states."""
-        super().reconfigure(settings)
-        self._truth_every = self._ticks_between_truths()
+        if network is None:
+            directory = self._settings.state_directory
+            network = ZenohNetwork(self._role, self._loop, self.endpoint, directory, faults=self.fault_statuses)
+        super().run(network)
 
     def _may_step(self) -> bool:
         return self._steps != 0
@@ -180,7 +176,7 @@ class EmulatorOnZenoh(Emulator):
     def _await_answer(self, echo: int) -> Arrival | None:
         arrival = super()._await_answer(echo)
         if self._steps == 0:
-            self._front.publish_status()  # ends the wait of the `advance` query's sender
+            self._network.publish_status()  # ends the wait of the `advance` query's sender
         return arrival
 
     def _ticks_between_truths(self) -> int:

@@ -15,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.own_plant import PlantError, class_of
+from aeroloop.plant_emulator.plant import PlantError, class_of
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import NEVER, Batch, Operation, Sent
+from aeroloop.protocol.messages.trace import NEVER, Batch, PlantChange, Sent
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -66,7 +65,7 @@ def why_not(plant: PlantSettings) -> str | None:
 
 
 class PlantReplay:
-    """Replays one process of an emulated plant, from its settings at its start; later changes are in the trace.
+    """Replays one process of an emulated plant, from its settings and its trace.
 
     Raises:
         ValueError: The plant cannot be replayed, with the reason of `why_not`.
@@ -76,7 +75,6 @@ class PlantReplay:
     def __init__(self, loop: LoopSettings, wire: WireSpec, plant: PlantSettings) -> None:
         if reason := why_not(plant):
             raise ValueError(reason)
-        self._plant = plant
         self._emulator = Emulator(loop, wire, plant, threading.Event())
         self._wire = wire
         self._none = bytes(wire.measurement.size)
@@ -209,7 +207,7 @@ class PlantReplay:
 
     # ── between ticks ──
 
-    def _operate(self, operation: Operation) -> bool:
+    def _operate(self, operation: PlantChange) -> bool:
         """Advance the plant to an operation's tick and apply it. Returns whether that was possible."""
         emulator, endpoint = self._emulator, self._emulator.endpoint
         if operation.cause is TripCause.PLANT:
@@ -240,13 +238,7 @@ class PlantReplay:
             case "inject":
                 fault = operation.name
                 emulator.inject([] if fault is None else [Fault.parse(fault)], clear=fault is None)
-            case "reconfigure":
-                changed = operation.settings or {}
-                limits = LimitSettings.model_validate(changed["limits"])
-                update = {"watchdog_s": changed["watchdog_s"], "limits": limits}
-                self._plant = self._plant.model_copy(update=update)
-                emulator.reconfigure(self._plant)
-        endpoint.operations.clear()
+        endpoint.changes.clear()
         endpoint.notices.clear()
         return self._stopped is None
 

@@ -15,12 +15,13 @@ and u₃.
 
 from __future__ import annotations
 
+import casadi as ca
+import numpy as np
 from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.lazy import numpy as np
-from aeroloop.protocol.wire.attitude import R, S, Vector, from_euler
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.wire.rotations import R, S, from_euler
 
 
 class AeroSettings(BaseModel, extra="forbid"):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import casadi as ca
+
 from aeroloop.plant_emulator.model.friction import FrictionSettings, friction_torque
 from aeroloop.plant_emulator.model.mechanism import Mechanism
 from aeroloop.plant_emulator.model.rotor import RotorSettings, rotor_derivative, thrust_voltage
 from aeroloop.plant_emulator.model.sensors import Sensors
 from aeroloop.plant_emulator.model.wind import Wind
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
-from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.symbolic import Compiled
 

@@ -6,9 +6,8 @@ Why: with a jump the result would depend on where the integration steps fall.
 
 from __future__ import annotations
 
+import casadi as ca
 from pydantic import BaseModel, Field
-
-from aeroloop.protocol.lazy import casadi as ca
 
 
 class FrictionSettings(BaseModel, extra="forbid"):

@@ -9,9 +9,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Annotated
 
+import casadi as ca
 from pydantic import AfterValidator
 
-from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.attitude import Vector
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from math import hypot
 
+import casadi as ca
+import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.lazy import numpy as np
-from aeroloop.protocol.wire.attitude import Quaternion, R, S, T, Vector
+from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.rotations import R, S, T
 
 
 class RigidBodySettings(BaseModel, extra="forbid"):

@@ -6,9 +6,8 @@ brakes a rotor less than the motor drives it. Below the dead zone a rotor makes 
 
 from __future__ import annotations
 
+import casadi as ca
 from pydantic import BaseModel, Field, model_validator
-
-from aeroloop.protocol.lazy import casadi as ca
 
 
 class RotorSettings(BaseModel, extra="forbid"):

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from math import cos, exp, isfinite, nan, pi, sin, sqrt
 from typing import Any, Literal, TypeVar
 
+import casadi as ca
+import numpy as np
 from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.plant import Measurement
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.expressions import as_written
 from aeroloop.protocol.wire.symbolic import Compiled

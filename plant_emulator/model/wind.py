@@ -10,9 +10,8 @@ from __future__ import annotations
 from itertools import accumulate
 from math import exp, hypot, sqrt
 
+import numpy as np
 from pydantic import BaseModel, Field
-
-from aeroloop.protocol.lazy import numpy as np
 
 _BLOCK = 4096  # random numbers are drawn this many periods at a time: one draw costs more than a plant's step
 

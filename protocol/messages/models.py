@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, Field, PlainSerializer, StringConstraints
 
-from aeroloop.protocol.messages.operator import Gains, Message, Reference
+from aeroloop.protocol.messages.operator import Angles, Change, Gains, Message, Reference, Stream
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.spec import WireSpec
 
@@ -63,10 +63,28 @@ class SessionRecord(Message):
     reference_from: Source
     within_s: float = Field(ge=0, description="time in which the reference was to be reached [s]")
     since_tick: int = Field(ge=0, description="the session's tick from which the reference applies")
+    gains_since_tick: int = Field(default=0, ge=0, description="the session's tick from which the gains apply")
+    start: Angles | None = Field(default=None, description="as in the change that set the reference")
+    brake_s: Angles | None = Field(default=None, description="likewise")
+    run_up_s: Angles | None = Field(default=None, description="likewise")
+    here: tuple[Angles, Angles, Angles] | None = Field(default=None, description="likewise")
     ended: TripCause | Literal["released"] | None = Field(
         default=None, description="how the session ended; an operator's stop since then replaces it"
     )
     ended_tick: int | None = Field(default=None, description="the session's last tick")
+
+    @property
+    def in_force(self) -> list[Change]:
+        """The changes that set gains and reference; none without a session, and of a stream, whose set-points it lacks.
+
+        They are those of `operator.in_force` for the trace's changes.
+        """
+        if self.session is None or isinstance(self.reference, Stream):
+            return []
+        gains = Change(session=self.session, tick=self.gains_since_tick, gains=self.gains)
+        times = {name: getattr(self, name) for name in ("within_s", "start", "brake_s", "run_up_s", "here")}
+        reference = Change(session=self.session, tick=self.since_tick, reference=self.reference, **times)
+        return sorted((gains, reference), key=lambda change: change.tick)
 
 
 class Grant(Message):
@@ -95,7 +113,7 @@ class Release(Message):
 class Description(Message):
     """Identity and configuration of a role: all that a log reader needs to read the log."""
 
-    protocol: int = Field(description="version of SPEC.md that the role implements; version 1 did not have this field")
+    protocol: int = Field(description="version of SPEC.md that the role implements")
     role: str
     vehicle: str
     host: str
@@ -131,8 +149,6 @@ class Timing(Message):
     recent_wake: Percentiles | None = Field(description="`wake`, last 10 s")
     recent_busy: Percentiles | None = Field(description="`busy`, last 10 s")
     recent_period: Percentiles | None = Field(description="`period`, last 10 s")
-    minor_faults: int = Field(default=0, description="page faults of the loop's thread without input, since warm-up")
-    major_faults: int = Field(default=0, description="page faults of the loop's thread that read a file, since warm-up")
 
 
 class FaultStatus(Message):
@@ -158,7 +174,10 @@ class Status(Message):
         "written; null otherwise",
     )
     process: str = Field(default="", description="host and process id of the role")
-    since: str | None = Field(default=None, description="plant: when the cause arose, UTC")
+    since: AwareDatetime | None = Field(default=None, description="plant: when the cause arose, UTC")
+    unkept: str | None = Field(
+        default=None, description="plant: why its next process will not know of a trip or a stop; null if it will"
+    )
     datagrams: str = Field(default="", description="plant: where it takes frames as datagrams; empty for nowhere")
     certificate_until: AwareDatetime | None = Field(
         default=None, description="when the role's certificate expires, UTC; null where no link needs one"
@@ -174,6 +193,12 @@ class Status(Message):
     refused: int = Field(default=0, description="malformed frames since start")
     stale: int = Field(default=0, description="stale frames since start, too late to be acted upon")
     saturated: int = Field(default=0, description="values beyond a quantizer's range since start")
+    lost: int = Field(default=0, description="recorder: messages missing in its log since start")
+    lacks_recorder: Literal["gone", "required"] | None = Field(
+        default=None,
+        description="plant, controller: gone: a recorder was there, and disappeared without a last status `stopped`; "
+        "controller: required: none is there, and it claims no vehicle without one",
+    )
     latency_us: Percentiles | None = Field(
         default=None, description="plant: from a measurement sent to the command that answers it, on the plant's clock"
     )
@@ -240,12 +265,19 @@ class Event(Message):
     tick: int | None = Field(default=None, description="the session's tick at which it happened, if any")
 
 
+LossReason = Literal["cache", "gone", "end", "disk"]
+LOSS_REASONS: Final[dict[LossReason, str]] = {
+    "cache": "not received, and no longer in their publisher's cache",
+    "gone": "not received, and their publisher does not answer",
+    "end": "not received, and still in their publisher's cache when recording ended",
+    "disk": "received, and the log could not be written",
+}
+"""Why messages are not in a log."""
+
+
 class Loss(Message):
     """Messages of one key that the recorder found missing in the log."""
 
     key: str
     count: int = Field(ge=1, description="how many are missing")
-    reason: Literal["network", "queue", "disk"] = Field(
-        description="network: published, and neither received nor recovered; disk: the log could not be written; "
-        "queue, in older logs: received faster than they could be written"
-    )
+    reason: LossReason = Field(description="; ".join(f"{name}: {words}" for name, words in LOSS_REASONS.items()))

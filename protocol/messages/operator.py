@@ -6,7 +6,7 @@ rate and acceleration never jump.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import isfinite, pi
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -187,8 +187,18 @@ class Gains(Message, extra="allow"):
         return Gains.model_validate(before.named | self.named)
 
 
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("every character must be printable")
+    return text
+
+
 class Request(Message):
     """A request without arguments: arm, stop, stand down, recall."""
+
+    by: Annotated[str, Field(max_length=64), AfterValidator(_printable)] | None = Field(
+        default=None, description="stop: name for people to read, such as user@host; not authenticated"
+    )
 
 
 class Track(Message):
@@ -225,15 +235,33 @@ class Change(Message):
     run_up_s: Angles | None = Field(
         default=None, description="time of it in which each runs up to the reference's rate at last [s]"
     )
-    ease_s: float = Field(
-        default=0.0,
-        description="time before a single quintic to reduce the acceleration to 0; in older logs, 0 otherwise [s]",
+    here: tuple[Angles, Angles, Angles] | None = Field(
+        default=None,
+        description="roll, pitch, yaw at the tick on the reference before, where the approach starts in motion, with "
+        "their rates and accelerations [rad, rad/s, rad/s²]; null where `start` is given, and for a jump",
     )
 
     @model_serializer(mode="wrap")
     def _without_null_times(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `brake_s` and `run_up_s` where they are null: those are the bytes of a single quintic so far."""
-        return {name: value for name, value in dump(self).items() if value is not None or not name.endswith("_s")}
+        """Leave out what is null of `brake_s`, `run_up_s` and `here`."""
+        optional = ("brake_s", "run_up_s", "here")
+        return {name: value for name, value in dump(self).items() if value is not None or name not in optional}
+
+
+def in_force(changes: Iterable[Change]) -> list[Change]:
+    """The last gains and the last reference that changes set, each as one change, in the order of their ticks.
+
+    With a law's state they determine all later commands: a change of the reference has where its approach starts.
+    """
+    gains: Change | None = None
+    reference: Change | None = None
+    for change in changes:
+        if change.gains is not None:
+            whole = change.gains if gains is None or gains.gains is None else change.gains.over(gains.gains)
+            gains = Change(session=change.session, tick=change.tick, gains=whole)
+        if change.reference is not None:
+            reference = change.model_copy(update={"gains": None})
+    return sorted((one for one in (gains, reference) if one is not None), key=lambda one: one.tick)
 
 
 class Inject(Message):

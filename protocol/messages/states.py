@@ -12,6 +12,8 @@ from typing import Final, Generic, TypeVar
 
 NOT_RECORDING: Final = "not recording"
 """State of a recorder that cannot write."""
+STOPPED: Final = "stopped"
+"""State of a recorder in its last status, when it ends in order."""
 
 
 class PlantState(StrEnum):

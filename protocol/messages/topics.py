@@ -46,6 +46,9 @@ NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 
 FRAME_BYTES: Final = 256
 """More than the longest frame: six elements of 64 bits and a counter."""
+QUERIES_PER_S: Final = 50.0
+"""Most queries a second on a topic that a process takes from one link; what comes sooner after another is dropped. One
+rate for all topics: Zenoh applies any of the rules that a wildcard query meets."""
 MESSAGE_BYTES: Final = 16_384
 """Enough for an event of many lines."""
 STATUS_BYTES: Final = 65_536
@@ -72,7 +75,6 @@ class Topic:
         limit: Most bytes of payload and attachment of what is published or answered. What is longer is neither
             published nor received.
         request: Most bytes of a query, likewise.
-        per_s: Most queries a second that a process takes from one link; what comes sooner after another is dropped.
     """
 
     name: str
@@ -84,7 +86,6 @@ class Topic:
     decoded: Literal["always", "limited"] | None = None
     limit: int = MESSAGE_BYTES
     request: int = MESSAGE_BYTES
-    per_s: float = 50.0
 
     @property
     def recorded(self) -> bool:
@@ -116,7 +117,7 @@ TOPICS: Final = {
         Topic("set_gains", "set-gains", "query", _OPERATOR, _CONTROLLER, Gains),
         Topic("track", "track", "query", _OPERATOR, _CONTROLLER, Track, request=POINTS_BYTES),
         Topic("inject", "inject", "query", _OPERATOR, _PLANT, Inject),
-        Topic("advance", "advance", "query", _OPERATOR, _PLANT, Advance, per_s=1000.0),
+        Topic("advance", "advance", "query", _OPERATOR, _PLANT, Advance),
         Topic("description", "description/{role}", "json", _DAEMONS, _READERS, Description, limit=POINTS_BYTES),
         Topic("measurement", "{session}/measurement", "frame", _PLANT, _CONTROLLER + _READERS, limit=FRAME_BYTES),
         Topic("command", "{session}/command", "frame", _CONTROLLER, _PLANT + _READERS, limit=FRAME_BYTES),

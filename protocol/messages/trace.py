@@ -18,11 +18,11 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, ValidationError
 
-from aeroloop.protocol.lazy import numpy as np
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
-from aeroloop.protocol.messages.operator import Change, Message
+from aeroloop.protocol.messages.operator import Change, Message, in_force
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
@@ -54,6 +54,11 @@ HEADER_BYTES: Final = _HEADER.size
 _FINAL: Final = 1
 _MARGIN_NS: Final = 1_000_000_000
 """A batch's times start this long before its first row: a command may be received before the row begins."""
+
+RECORD_S: Final = 1.0
+"""How often a batch has the session's record [s]."""
+_RECORD_BYTES_PER_S: Final = 16_384
+"""A longer record, of many points, is in as many batches as take this much. A cache of a minute has the longest."""
 
 _MASK: Final = 0xFFFF_FFFF
 """Times wrap after 71 minutes, longer than any batch: `due` is checked after every row."""
@@ -99,19 +104,18 @@ class Outcome(IntEnum):
     """Withheld by an injected fault."""
 
 
-OperationKind = Literal["claim", "release", "arm", "stop", "lost", "expire", "inject", "reconfigure"]
+PlantChangeKind = Literal["claim", "release", "arm", "stop", "lost", "expire", "inject"]
 
 
-class Operation(Message):
+class PlantChange(Message):
     """A change at the plant end between two ticks. With the rows, the end's run can be computed again."""
 
     tick: int = Field(ge=-1, description="the last tick of the plant before it; −1: before the first")
-    kind: OperationKind
+    kind: PlantChangeKind
     claim: Claim | None = Field(default=None, description="claim: as it was granted")
     name: str | None = Field(default=None, description="release: session; lost: controller; inject: fault, null: none")
     cause: TripCause | None = Field(default=None, description="stop, expire: the cause")
     reason: str | None = Field(default=None, description="stop, expire: the reason")
-    settings: dict[str, Any] | None = Field(default=None, description="reconfigure: `watchdog_s` and `limits`")
 
 
 class Tail(Message):
@@ -121,7 +125,12 @@ class Tail(Message):
         default=None, description="controller: its state before the batch's first row; a replay can begin there"
     )
     changes: list[Change] = Field(default_factory=list, description="controller: applied before their ticks' rows")
-    operations: list[Operation] = Field(default_factory=list, description="plant: between its ticks")
+    operations: list[PlantChange] = Field(default_factory=list, description="plant: between its ticks")
+    record: list[Change] = Field(
+        default_factory=list,
+        description="the session's gains and reference in force after the batch's rows, each with the tick since when; "
+        "of the plant as the controller's last record has them",
+    )
 
 
 _COLUMNS: Final[dict[End, dict[str, str]]] = {
@@ -292,6 +301,8 @@ class TraceWriter:
         state: The controller's state before the first row in the buffer, as JSON; None at the plant.
         changes: Changes that belong to the rows in the buffer.
         operations: Operations likewise.
+        record: The session's gains and reference in force, as the JSON of `Tail.record`; empty for none. A controller's
+            is brought up to date by `take`, from the changes.
     """
 
     def __init__(self, end: End, wire: WireSpec, run: int, every_ns: int) -> None:
@@ -300,7 +311,10 @@ class TraceWriter:
         self.session = ""
         self.state: dict[str, Any] | None = None
         self.changes: list[Change] = []
-        self.operations: list[Operation] = []
+        self.operations: list[PlantChange] = []
+        self.record = b""
+        self._in_force: list[Change] = []
+        self._record_due_ns = 0
         self._sizes = wire.measurement.size, wire.command.size
         self._actuators = wire.actuators
         self._dtype = row_dtype(end, *self._sizes, wire.actuators)
@@ -413,8 +427,10 @@ class TraceWriter:
         rows = self.rows
         base_ns = self._base_ns if rows else now_ns
         tail = Tail(state=self.state, changes=self.changes, operations=self.operations)
-        nothing = {name for name, value in tail if not value}
-        text = b"" if len(nothing) == len(Tail.model_fields) else tail.model_dump_json(exclude=nothing).encode()
+        parts = [tail.model_dump_json(include={name})[1:-1].encode() for name, value in tail if value]
+        if record := self._due_record(now_ns):
+            parts.append(b'"record":' + record)
+        text = b"{" + b",".join(parts) + b"}" if parts else b""
         header = _HEADER.pack(
             PROTOCOL_VERSION,
             ENDS.index(self.end),
@@ -443,6 +459,24 @@ class TraceWriter:
         self.rows = 0
         self.state, self.changes, self.operations = None, [], []
         return b"".join([header, *columns, text])
+
+    def _due_record(self, now_ns: int) -> bytes:
+        """Bring the controller's record up to date, and return the record if it is due."""
+        if self.changes:
+            before = [change for change in self._in_force if change.session == self.session]
+            self._in_force = in_force([*before, *self.changes])
+            self.record = record_json(self._in_force)
+            soon = now_ns + round(1e9 * RECORD_S)  # this batch has the changes themselves
+            self._record_due_ns = min(self._record_due_ns or soon, soon)
+        if not (self.session and self.record) or now_ns < self._record_due_ns:
+            return b""
+        self._record_due_ns = now_ns + round(1e9 * max(RECORD_S, len(self.record) / _RECORD_BYTES_PER_S))
+        return self.record
+
+
+def record_json(changes: Sequence[Change]) -> bytes:
+    """Changes in force as `TraceWriter.record` has them; empty for none."""
+    return b"[" + b",".join(change.encode() for change in changes) + b"]" if changes else b""
 
 
 def batches_per_s(loop: LoopSettings) -> float:

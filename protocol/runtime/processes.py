@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
-import re
 from contextlib import suppress
 from glob import iglob
 from pathlib import Path
 from typing import Final, NamedTuple
+
+from aeroloop.protocol.transport.endpoint import Endpoint
 
 _SUFFIX: Final = "@aeroloop"
 _NAME_LENGTH: Final = 15
@@ -43,15 +44,15 @@ def listener(endpoint: str) -> Listener | None:
 
     A process of another user is not found, nor one on another host.
     """
-    port = re.fullmatch(r"(?:tcp|tls)/.*:(\d+)", endpoint)
-    if port is None:
+    place = Endpoint.parse(endpoint)
+    if place.protocol not in ("tcp", "tls"):
         return None
     inodes = set()
     for table in ("tcp", "tcp6"):
         with suppress(OSError):
             for line in Path("/proc/net", table).read_text().splitlines()[1:]:
                 cells = line.split()
-                if cells[3] == _LISTENS and int(cells[1].rpartition(":")[2], 16) == int(port[1]):
+                if cells[3] == _LISTENS and int(cells[1].rpartition(":")[2], 16) == place.port:
                     inodes.add(f"socket:[{cells[9]}]")
     for file in map(Path, iglob("/proc/[0-9]*/fd/*") if inodes else ()):
         with suppress(OSError):  # closed, or ended, in the meantime

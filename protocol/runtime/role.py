@@ -1,4 +1,4 @@
-"""Role: a process's presence on the network, with description, status, events, liveliness and stop signals.
+"""Role: a process's presence on the network, with description, status, events and liveliness.
 
 A Role joins the network and answers queries for its description and status. Its owner declares the liveliness token
 once ready, and publishes through it. It is a context manager: leaving it closes the Zenoh session, without which a
@@ -8,34 +8,33 @@ Python process would not end.
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from datetime import datetime
 from typing import Any, Final, Self, TypeVar
 
 import zenoh
 from pydantic import ValidationError
+from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status, Tenure
 from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.messages.states import STOPPED
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.datagrams import Datagrams
-from aeroloop.protocol.transport.network import VISIT_S, join, unlinked, visit
+from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
+from aeroloop.protocol.transport.network import VISIT_S, join, visit
 from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.publication import ADDED_BYTES, CachedPublisher
-from aeroloop.protocol.transport.refusal import RefusalWatch
 from aeroloop.protocol.transport.router import route
-from aeroloop.protocol.transport.security import TLS, Identity
+from aeroloop.protocol.transport.security import Identity
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 
@@ -88,7 +87,8 @@ class Role:
     """A process's presence on the network.
 
     `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config`
-    its effective configuration, for the description. `name` is its liveliness token's; the role's if None.
+    its effective configuration, for the description. `name` is its liveliness token's; the role's if None. Its owner
+    runs until `stop` is set.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -96,19 +96,25 @@ class Role:
         OccupiedError: It is a plant's, and the vehicle has one.
     """
 
-    _certificate_until: datetime | None = None
-
     def __init__(
-        self, role: str, vehicle: str, network: NetworkSettings, config: dict[str, Any], name: str | None = None
+        self,
+        role: str,
+        vehicle: str,
+        network: NetworkSettings,
+        config: dict[str, Any],
+        name: str | None = None,
+        stop: threading.Event | None = None,
     ) -> None:
         self.role = role
         self.vehicle = vehicle
         self.name = name or role
-        self.stop = threading.Event()
+        self.stop = stop or threading.Event()
         if role == "plant":
             _refuse_second_plant(network, vehicle)
         name_process(role)
         identity = Identity((role,), vehicle)
+        certificate = protected(network, identity).certificate
+        self._certificate_until = certificate.not_after if certificate else None
         self.zenoh = (route if role == "router" else join)(network, identity)
         self.datagrams = Datagrams(network, identity)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
@@ -124,63 +130,19 @@ class Role:
         key = topics.key("description", vehicle, role=role)
         self.answer(key, lambda query: query.reply(key, self._description))
         self.answer(topics.key("status", vehicle, role=role), self._answer_status)
-        self._refusals = self._watch_refusals(network)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         notify_systemd("STOPPING=1")
-        if self._refusals is not None:
-            self._refusals.close()
         self.datagrams.close()
         self.zenoh.close()
-
-    def _watch_refusals(self, network: NetworkSettings) -> RefusalWatch | None:
-        """Publish an event for each peer that refuses this role's certificate, or whose own is refused."""
-        settings, certificate, _ = protected(network, Identity((self.role,), self.vehicle))
-        if certificate is None:
-            return None
-        self._certificate_until = certificate.not_after
-        places = [*settings.places, *settings.connect]
-        watch = RefusalWatch(
-            certificate,
-            self.vehicle,
-            lambda: unlinked(self.zenoh, places),
-            lambda line: self.event("refused", line),
-        )
-
-        def changed(event: zenoh.LinkEvent) -> None:
-            protocol, _, address = str(event.link.dst).partition("/")
-            if event.kind == zenoh.SampleKind.PUT and protocol in TLS:
-                watch.linked(address.rpartition(":")[0], event.link.auth_identifier)
-
-        self.zenoh.info.declare_link_events_listener(changed, history=True)
-        return watch
 
     def announce(self) -> None:
         """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
         notify_systemd("READY=1")
         self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
-
-    def stop_on_signals(self) -> None:
-        """SIGTERM and SIGINT set `stop`; the loop ends at its next tick."""
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self.stop.set())
-
-    def on_hangup(self, reload: Callable[[], Action]) -> None:
-        """On SIGHUP, call `reload` in a thread of its own; the action that it returns runs between two ticks.
-
-        An AeroloopError from `reload` is published as a fault event, and nothing changes.
-        """
-
-        def prepare() -> None:
-            try:
-                self._inbox.append(reload())
-            except AeroloopError as error:
-                self.event("fault", f"not reloaded: {error}")
-
-        signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=prepare, daemon=True).start())
 
     def publish_description(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
         """Publish the role's description: its effective configuration and, from a controller, its certificate."""
@@ -294,7 +256,7 @@ class Role:
         return self.zenoh.liveliness().declare_subscriber(key, seen, history=True).undeclare
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
-        """Declare a topic's publisher before its first message: a cache for many messages a second takes a while."""
+        """Declare a topic's publisher before its first message."""
         carries = topics.TOPICS[topic].carries
         self._publishers[topic] = CachedPublisher(
             self.zenoh,
@@ -355,3 +317,30 @@ class Role:
             taken, status = self._status
             aged = status.model_copy(update={"age_s": round(time.monotonic() - taken, 3)})
             query.reply(topics.key("status", self.vehicle, role=self.role), aged.encode())
+
+
+class RecorderWatch:
+    """Whether the recorder of a role's vehicle is there, or was there and is gone, killed or cut off.
+
+    Attributes:
+        present: Whether its liveliness token is there.
+    """
+
+    def __init__(self, role: Role) -> None:
+        self.present = False
+        self._was_there = self._stopped = False
+        key = topics.key("status", role.vehicle, role="recorder")
+        self._statuses = role.zenoh.declare_subscriber(key, RingChannel(1))
+        role.watch_token("recorder", self._see)
+
+    @property
+    def gone(self) -> bool:
+        """Whether it disappeared and its last status does not say that it stopped."""
+        if (sample := self._statuses.try_recv()) is not None:
+            with suppress(intake.IntakeError):
+                self._stopped = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).state == STOPPED
+        return self._was_there and not self.present and not self._stopped
+
+    def _see(self, appeared: bool) -> None:
+        self.present = appeared
+        self._was_there |= appeared

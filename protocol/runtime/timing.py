@@ -1,8 +1,7 @@
-"""Timing statistics of a loop: wake-up latency, tick duration and period, in histograms of fixed size; page faults."""
+"""Timing statistics of a loop: wake-up latency, tick duration and period, in histograms of fixed size."""
 
 from __future__ import annotations
 
-import resource
 import time
 from collections import deque
 from collections.abc import Callable
@@ -93,7 +92,7 @@ class RollingHistogram:
 
 
 class LoopTiming:
-    """Timing of a loop: wake-up latency, duration of a tick, period between ticks; page faults of its thread.
+    """Timing of a loop: wake-up latency, duration of a tick, period between ticks.
 
     The first `warm_up_ns` [ns] of ticks are left out: caches are cold, and code and memory are used for the first time.
     """
@@ -104,7 +103,6 @@ class LoopTiming:
         self.period = RollingHistogram()
         self._warm_up_ns = warm_up_ns
         self._warm_at: int | None = None
-        self._faults_before: tuple[int, int] | None = None
         self._woke_at = 0
 
     def woke(self, due_ns: int, woke_ns: int | None = None) -> None:
@@ -113,8 +111,6 @@ class LoopTiming:
         if self._warm_at is None:
             self._warm_at = now + self._warm_up_ns
         if now >= self._warm_at:
-            if self._faults_before is None:
-                self._faults_before = _faults()
             self.wake.add(now - due_ns)
             if self._woke_at:
                 self.period.add(now - self._woke_at)
@@ -129,23 +125,10 @@ class LoopTiming:
         """Pause: the time until the next tick is no period."""
         self._woke_at = 0
 
-    @property
-    def faults(self) -> tuple[int, int]:
-        """Minor and major page faults of the calling thread, the loop's, since the warm-up."""
-        if self._faults_before is None:
-            return 0, 0
-        minor, major = _faults()
-        return minor - self._faults_before[0], major - self._faults_before[1]
-
     def turn(self) -> None:
         """End a one-second window."""
         for histogram in (self.wake, self.busy, self.period):
             histogram.turn_when_due()
-
-
-def _faults() -> tuple[int, int]:
-    usage = resource.getrusage(resource.RUSAGE_THREAD)
-    return usage.ru_minflt, usage.ru_majflt
 
 
 def summary(durations: Histogram) -> Percentiles | None:
@@ -164,7 +147,6 @@ def summary(durations: Histogram) -> Percentiles | None:
 def report(timing: LoopTiming) -> Timing:
     """End a one-second window of a loop's timing, and return its percentiles."""
     timing.turn()
-    minor, major = timing.faults
     return Timing(
         wake=summary(timing.wake.total),
         busy=summary(timing.busy.total),
@@ -172,6 +154,4 @@ def report(timing: LoopTiming) -> Timing:
         recent_wake=summary(timing.wake.recent()),
         recent_busy=summary(timing.busy.recent()),
         recent_period=summary(timing.period.recent()),
-        minor_faults=minor,
-        major_faults=major,
     )

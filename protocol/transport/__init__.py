@@ -1,1 +1,1 @@
-"""Links over Zenoh and CAN, the network session, and publication with recovery."""
+"""Links over Zenoh and CAN, the network session, messages and their history."""

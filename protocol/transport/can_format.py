@@ -1,11 +1,10 @@
-"""CAN format: identifiers, heartbeats, fault reports and settings of a bus. Bytes only; `can_link` opens the bus.
+"""CAN format: identifiers, heartbeats and settings of a bus. Bytes only; `can_link` opens the bus.
 
     id            from → to                what
     0x100 + node  plant → controller       measurement frames
     0x200 + node  controller → plant       command frames
     0x300 + node  plant → controller       heartbeat: state, cause of the last trip, fingerprint of the wire
     0x380 + node  controller → plant       heartbeat: state, number of the session, fingerprint
-    0x400 + node  plant → controller       fault report: how far one fault of an emulated plant has got
 
 A CAN bus has no sessions and no names. The controller's heartbeat replaces them: while its state is granted and its
 fingerprint is the plant's own, the plant is in the session whose number it carries.
@@ -15,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 from pydantic import BaseModel, Field
@@ -30,7 +28,6 @@ MEASUREMENT_ID: Final = 0x100
 COMMAND_ID: Final = 0x200
 PLANT_HEARTBEAT_ID: Final = 0x300
 CONTROLLER_HEARTBEAT_ID: Final = 0x380
-FAULT_REPORT_ID: Final = 0x400
 MAX_NODE: Final = 127
 CLASSIC_BYTES: Final = 8
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -39,8 +36,6 @@ HEARTBEAT_S: Final = 0.1
 _STATES: Final = list(PlantState)
 _CAUSES: Final = list(TripCause)
 _FINGERPRINT_BYTES: Final = 7
-_REPORT_BYTES: Final = 8
-_MOST_CHANGED: Final = 2**32 - 1
 
 
 class CanError(AeroloopError):
@@ -136,46 +131,3 @@ class Heartbeat(NamedTuple):
         if len(data) != 1 + _FINGERPRINT_BYTES or data[0] & 0x0F >= len(_STATES):
             return None
         return cls(_STATES[data[0] & 0x0F], data[0] >> 4, bytes(data[1:]), at_ns)
-
-
-class FaultPhase(IntEnum):
-    """How far a fault has got."""
-
-    TO_COME = 0
-    ACTS = 1
-    OVER = 2
-
-
-class FaultReport(NamedTuple):
-    """One fault of an emulated plant, sent when it begins or ends, and with the heartbeats in turn.
-
-    Attributes:
-        place: Its place in the node's `plant.faults`, 0…63.
-        phase: How far it has got.
-        tick: Session tick at which this phase began, modulo 256.
-        check: First two bytes of SHA-256 of the fault's text.
-        changed: Frames, samples or voltages that it has changed, at most 2³² − 1.
-    """
-
-    place: int
-    phase: FaultPhase
-    tick: int
-    check: bytes
-    changed: int
-
-    def pack(self) -> bytes:
-        """Eight bytes: place:6, phase:2, tick:8, check:16, changed:32."""
-        head = bytes([self.place << 2 | self.phase, self.tick])
-        return head + self.check + min(self.changed, _MOST_CHANGED).to_bytes(4, "big")
-
-    @classmethod
-    def unpack(cls, data: bytes) -> FaultReport | None:
-        """A report, or None if it is malformed."""
-        if len(data) != _REPORT_BYTES or data[0] & 3 > FaultPhase.OVER:
-            return None
-        return cls(data[0] >> 2, FaultPhase(data[0] & 3), data[1], bytes(data[2:4]), int.from_bytes(data[4:], "big"))
-
-
-def fault_check(fault: str) -> bytes:
-    """First two bytes of SHA-256 of a fault's text, by which the bridge knows that it has the same fault."""
-    return hashlib.sha256(fault.encode()).digest()[:2]

@@ -1,13 +1,12 @@
-"""CAN link: one end's frames, heartbeats and fault reports on a CAN bus, by python-can. Any interface, classic or FD.
+"""CAN link: one end's frames and heartbeats on a CAN bus, by python-can. Any interface, classic or FD.
 
-A frame's bytes are the CAN payload; `can_format` has identifiers, heartbeats and reports.
+A frame's bytes are the CAN payload; `can_format` has identifiers and heartbeats.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from contextlib import suppress
 from typing import Final, Literal
 
@@ -17,17 +16,15 @@ from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
-    FAULT_REPORT_ID,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
     CanError,
     CanSettings,
-    FaultReport,
     Heartbeat,
     carried_bytes,
     check_widths,
 )
-from aeroloop.protocol.transport.link import Link, Mailbox, Wake
+from aeroloop.protocol.transport.link import Link, Mailbox
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
@@ -37,7 +34,6 @@ _SEND_S: Final = 0.002
 _REOPEN_S: Final = 0.5
 _UNSENT: Final = 20
 """Failed sends in a row after which the bus counts as lost."""
-_REPORTS: Final = 256
 
 End = Literal["plant", "controller"]
 
@@ -45,11 +41,10 @@ End = Literal["plant", "controller"]
 class CanLink(Link):
     """One end's frames and heartbeats on a bus. A thread of its own receives.
 
-    `changed` is set when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
+    `changed` is notified when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
 
     Attributes:
         peer: The other end's last heartbeat, or None.
-        reports: The plant's fault reports that the controller's side has not yet taken.
         fault: Why the bus cannot be used, or None; `reopen` may clear it.
         errors: Error frames, failed sends and receives so far.
         refused: Malformed frames and heartbeats so far.
@@ -65,7 +60,7 @@ class CanLink(Link):
         settings: CanSettings,
         wire: WireSpec,
         end: End,
-        changed: Wake | None = None,
+        changed: threading.Condition | None = None,
         *,
         lockstep: bool = False,
     ) -> None:
@@ -76,12 +71,8 @@ class CanLink(Link):
         self._receive_id = (COMMAND_ID if plant else MEASUREMENT_ID) + settings.node
         self._beat_id = (PLANT_HEARTBEAT_ID if plant else CONTROLLER_HEARTBEAT_ID) + settings.node
         self._peer_beat_id = (CONTROLLER_HEARTBEAT_ID if plant else PLANT_HEARTBEAT_ID) + settings.node
-        self._report_id = FAULT_REPORT_ID + settings.node
-        self._takes_reports = not plant
-        self.reports: deque[FaultReport] = deque(maxlen=_REPORTS)
         self._receives = wire.command if plant else wire.measurement
-        transmit = wire.transmit
-        self._may_be_silent = lockstep and (transmit.command if plant else transmit.measurement) == "on_change"
+        self._lengths = wire.lengths("command" if plant else "measurement", lockstep=lockstep)
         self._mailbox = Mailbox(changed)
         self._unsent = 0
         self._reopen_due = 0.0
@@ -99,10 +90,6 @@ class CanLink(Link):
     def beat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat."""
         self._put(self._beat_id, heartbeat.pack())
-
-    def report(self, report: FaultReport) -> None:
-        """Send a fault report."""
-        self._put(self._report_id, report.pack())
 
     def silent_s(self) -> float:
         """Time since the last reception from the other end [s]; infinite if there was none."""
@@ -200,7 +187,7 @@ class CanLink(Link):
         now = time.monotonic_ns()
         if identifier == self._receive_id:
             size = self._receives.size
-            if data == SILENCE and self._may_be_silent:
+            if data == SILENCE and len(SILENCE) in self._lengths:
                 self.peer_ns = now
                 self._mailbox.put(data)
                 return
@@ -216,10 +203,3 @@ class CanLink(Link):
                 return
             self.peer_ns = now
             self.peer = heartbeat
-        elif identifier == self._report_id and self._takes_reports:
-            report = FaultReport.unpack(data)
-            if report is None:
-                self.refused += 1
-                return
-            self.peer_ns = now
-            self.reports.append(report)

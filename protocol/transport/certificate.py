@@ -153,7 +153,6 @@ def check(file: Path, role: str, vehicle: str | None) -> Certificate:
             directory's authority, expired, not yet valid, or another role's or vehicle's.
     """
     found = read_certificate(file)
-    again = f"`aeroloop host keys renew {file.stem}`"
     if found.role != role or (vehicle and found.vehicle and found.vehicle != vehicle):
         held, wanted = common_name(found.role, found.vehicle), common_name(role, vehicle)
         raise CertificateError(f"{file} is a certificate of {held}, not of {wanted}; {_ISSUE}")
@@ -163,11 +162,11 @@ def check(file: Path, role: str, vehicle: str | None) -> Certificate:
             f"{file} was not issued by {AUTHORITY} beside it: both must be of one authority; {_ISSUE}"
         )
     if found.days_left < 0:
-        raise CertificateError(f"{file} expired at {_utc(found.not_after)}: renew it with {again}")
+        raise CertificateError(f"{file} expired at {_utc(found.not_after)}: {_AGAIN}")
     if found.not_before > datetime.now(UTC):
         raise CertificateError(
             f"{file} is not valid before {_utc(found.not_before)}, and this host's clock shows "
-            f"{_utc(datetime.now(UTC))}: set the clock, or renew it with {again}"
+            f"{_utc(datetime.now(UTC))}: set the clock, or {_AGAIN}"
         )
     return found
 
@@ -184,7 +183,7 @@ def load(file: Path) -> x509.Certificate:
         raise CertificateError(f"{file} is no certificate in PEM") from None
 
 
-def names_of(holder: x509.Certificate | x509.CertificateSigningRequest) -> tuple[str, str]:
+def names_of(holder: x509.Certificate) -> tuple[str, str]:
     """Common name and organizational unit of a subject; empty where there is none."""
     from cryptography.x509.oid import NameOID
 
@@ -211,7 +210,7 @@ def _check_key(certificate: Certificate) -> None:
         mode = stat.S_IMODE(key.stat().st_mode)
         text = key.read_bytes()
     except FileNotFoundError:
-        raise CertificateError(f"{key} is missing: it stands where the certificate was requested; {_ISSUE}") from None
+        raise CertificateError(f"{key} is missing: copy it from where the certificate was issued; {_ISSUE}") from None
     except OSError as error:
         raise CertificateError(f"{key} cannot be read: {error.strerror}") from None
     if mode & 0o077:
@@ -225,6 +224,7 @@ def _check_key(certificate: Certificate) -> None:
 
 
 _ISSUE: Final = "`aeroloop host keys issue` makes one"
+_AGAIN: Final = "move it and its key away, and issue it anew with `aeroloop host keys issue`"
 
 
 def _utc(time: datetime) -> str:

@@ -17,13 +17,14 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import Final
 
 import zenoh
 
+from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import open_session
 from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.places import is_free, leaves_host
 from aeroloop.protocol.transport.security import Identity
 
 LINK_S: Final = 5.0
@@ -61,7 +62,9 @@ class Datagrams:
         if not self.wanted:
             return
         network = protected(self._settings, self._identity)
-        for endpoint in filter(is_free, filter(None, map(_datagrams_of, network.settings.places))):
+        for endpoint in filter(None, map(_datagrams_of, network.settings.places)):
+            if not Endpoint.parse(endpoint).is_free:
+                continue
             with suppress(zenoh.ZError):  # taken in the meantime
                 self.session = open_session(network, listen=[endpoint])
                 self.endpoint = endpoint
@@ -93,7 +96,7 @@ class Datagrams:
 
 def _datagrams_of(place: str) -> str | None:
     """The endpoint of datagrams beside a place: the same address and port, by UDP. None on loopback."""
-    if not leaves_host(place):
+    endpoint = Endpoint.parse(place)
+    if not endpoint.leaves_host:
         return None
-    protocol, _, address = place.partition("/")
-    return f"{_CARRIERS[protocol]}/{address.partition('?')[0]}{_MIXED}"
+    return str(replace(endpoint, protocol=_CARRIERS[endpoint.protocol], words=_MIXED))

@@ -27,12 +27,10 @@ from aeroloop.protocol.transport.can_format import (
     CLASSIC_BYTES,
     COMMAND_ID,
     CONTROLLER_HEARTBEAT_ID,
-    FAULT_REPORT_ID,
     HEARTBEAT_S,
     MAX_NODE,
     MEASUREMENT_ID,
     PLANT_HEARTBEAT_ID,
-    FaultPhase,
     carried_bytes,
 )
 from aeroloop.protocol.wire.frames import FrameFormat
@@ -102,7 +100,6 @@ def dbc(wire: WireSpec, node: int, period_ns: int) -> str:
         command,
         _heartbeat("PlantHeartbeat", PLANT_HEARTBEAT_ID + node, _PLANT, cause),
         _heartbeat("ControllerHeartbeat", CONTROLLER_HEARTBEAT_ID + node, _CONTROLLER, session),
-        _fault_report(FAULT_REPORT_ID + node),
     ]
     database = Database(
         messages,
@@ -148,20 +145,6 @@ def _heartbeat(name: str, identifier: int, sender: str, number: Signal) -> Messa
     fingerprint = _unsigned("fingerprint", 8, _FINGERPRINT_BITS, agreed)
     comment = f"Sign of life of the {sender.lower()}: one every {_HEARTBEAT_MS} ms, and at once on a change."
     return _message(name, identifier, sender, CLASSIC_BYTES, [number, state, fingerprint], _HEARTBEAT_MS, comment)
-
-
-def _fault_report(identifier: int) -> Message:
-    """Report on one fault of an emulated plant."""
-    phases: Choices = OrderedDict((int(phase), phase.name.lower()) for phase in FaultPhase)
-    signals = [
-        _unsigned("fault", 0, 6, "Place of the fault in the node's plant.faults, from 0."),
-        _unsigned("phase", 6, 2, "How far it has got.", phases),
-        _unsigned("tick", 8, 8, "Session tick at which this phase began, modulo 256."),
-        _unsigned("check", 16, 16, "First two bytes of SHA-256 of the fault's text."),
-        _unsigned("changed", 32, 32, "Frames, samples or voltages that it has changed."),
-    ]
-    comment = "A fault of an emulated plant: sent when one begins or ends, and of the next one after each heartbeat."
-    return _message("FaultReport", identifier, _PLANT, CLASSIC_BYTES, signals, _HEARTBEAT_MS, comment)
 
 
 def _codes(layout: FrameFormat, quantities: Iterable[_Quantity]) -> Iterator[Signal]:

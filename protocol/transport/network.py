@@ -22,10 +22,10 @@ from typing import Any, Final
 import zenoh
 
 from aeroloop.protocol.transport.certificate import Certificate
+from aeroloop.protocol.transport.endpoint import Endpoint, accepting
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings, Protected, protected
-from aeroloop.protocol.transport.places import accepting, at_port, is_free, is_own
 from aeroloop.protocol.transport.refusal import refusal
-from aeroloop.protocol.transport.security import READER, Identity, is_plain
+from aeroloop.protocol.transport.security import READER, Identity
 from aeroloop.protocol.transport.session_tree import (
     HANDSHAKE_MS,
     PATIENT_LEASE_MS,
@@ -99,16 +99,17 @@ def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool
         return _join_router(network)
     places, further = network.settings.places, network.settings.listen
     for place in places if listen else []:
-        if is_free(place):
+        if Endpoint.parse(place).is_free:
             with suppress(zenoh.ZError):  # taken in the meantime
                 return _open(network, [place, *further], [other for other in places if other != place])
-    any_port = [at_port(places[0], 0)] if listen and places and is_own(places[0]) else []
+    first = Endpoint.parse(places[0]) if listen and places else None
+    any_port = [str(first.at_port(0))] if first is not None and first.is_own else []
     try:
         return _open(network, [*further, *any_port] if listen else [], places)
     except zenoh.ZError as error:
         raise NetworkError(
             f"cannot listen on {', '.join(further)}: {reason(error)}; give free ones with --set network.listen="
-            f"'{json.dumps([at_port(each, 0) for each in settings.listen])}'"
+            f"'{json.dumps([str(Endpoint.parse(each).at_port(0)) for each in settings.listen])}'"
         ) from None
 
 
@@ -163,7 +164,8 @@ def unlinked(session: zenoh.Session, places: list[str]) -> list[str]:
 
 def warn_of_plain(network: Protected) -> None:
     """Log a warning where links are plain text, because that is allowed."""
-    if network.settings.insecure and (plain := [each for each in network.settings.endpoints if is_plain(each)]):
+    plain = [each for each in network.settings.endpoints if Endpoint.parse(each).is_plain]
+    if network.settings.insecure and plain:
         log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.transport.certificate import Certificate
-from aeroloop.protocol.transport.places import leaves_host, ports_of
+from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.security import Identity, SecurityError, SecuritySettings, certificate_for, secured
 
 
@@ -18,12 +17,12 @@ class NetworkError(AeroloopError):
 
 
 def _endpoint(text: str) -> str:
-    if text and re.fullmatch(r"[a-z][a-z0-9-]*/\S+", text) is None:
-        raise ValueError("must be a Zenoh endpoint, PROTOCOL/ADDRESS:PORT such as tcp/127.0.0.1:7447")
+    if text:
+        Endpoint.parse(text)
     return text
 
 
-Endpoint = Annotated[str, AfterValidator(_endpoint)]
+EndpointText = Annotated[str, AfterValidator(_endpoint)]
 
 
 class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
@@ -34,7 +33,7 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         description="peer: processes link to one another; client: each links to a router at the rendezvous and to "
         "nothing else, as `aeroloop router` is one",
     )
-    rendezvous: list[Endpoint] = Field(
+    rendezvous: list[EndpointText] = Field(
         default=["tcp/127.0.0.1:7447"],
         description="Zenoh endpoints where processes meet, one for each host; a process listens at its own host's and "
         "connects to all; [] for none",
@@ -45,11 +44,11 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         le=64,
         description="consecutive ports from each rendezvous' port on that processes meet at: any of them can be joined",
     )
-    listen: list[Endpoint] = Field(
+    listen: list[EndpointText] = Field(
         default=[],
         description="further Zenoh endpoints this process can be reached at; port 0 is any free one",
     )
-    connect: list[Endpoint] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
+    connect: list[EndpointText] = Field(default=[], description="Zenoh endpoints to connect to besides the rendezvous")
     gossip: bool = Field(
         default=True, description="learn the addresses of further processes from linked ones, and link to them directly"
     )
@@ -83,12 +82,16 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         """Every endpoint at which a process may be met: the rendezvous, port by port; by a client, the routers."""
         if self.mode == "client":
             return self.rendezvous
-        return [place for first in self.rendezvous for place in ports_of(first, self.ports)]
+        return [str(place) for first in self.rendezvous for place in Endpoint.parse(first).ports(self.ports)]
 
     @property
     def mixed(self) -> bool:
         """Whether each kind of traffic has a transport of its own: between peers beyond loopback, if so set."""
-        return self.transport == "mixed" and self.mode == "peer" and any(map(leaves_host, self.rendezvous))
+        return (
+            self.transport == "mixed"
+            and self.mode == "peer"
+            and any(Endpoint.parse(each).leaves_host for each in self.rendezvous)
+        )
 
     @property
     def endpoints(self) -> list[str]:

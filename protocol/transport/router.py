@@ -8,21 +8,15 @@ from __future__ import annotations
 
 import json
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any
 
 import zenoh
 
+from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import warn_of_plain
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings, protected
-from aeroloop.protocol.transport.places import is_own
 from aeroloop.protocol.transport.security import Identity
-from aeroloop.protocol.transport.session_tree import open_tree, reason, session_tree
-
-THREADS: Final = (
-    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
-    "app: (worker_threads: 4))"
-)
-"""A router's, as ZENOH_RUNTIME. A thread that passes on an answer to a client behind a narrow link waits for it."""
+from aeroloop.protocol.transport.session_tree import THREADS, open_tree, reason, session_tree
 
 
 def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
@@ -35,7 +29,7 @@ def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
     warn_of_plain(protected(settings, identity))
     tree = router_tree(settings, identity)
     try:
-        return open_tree(tree, THREADS)
+        return open_tree(tree)
     except zenoh.ZError as error:
         places = ", ".join(tree["listen"]["endpoints"]) or "nothing"
         raise NetworkError(
@@ -48,7 +42,7 @@ def router_tree(settings: NetworkSettings, identity: Identity) -> dict[str, Any]
     """Zenoh's configuration of a router, with certificate and rules as any session's. Raises as `protected`."""
     network = protected(settings, identity)
     rendezvous = network.settings.rendezvous
-    here = [place for place in rendezvous if is_own(place)] or rendezvous
+    here = [place for place in rendezvous if Endpoint.parse(place).is_own] or rendezvous
     others = [place for place in rendezvous if place not in here]
     tree = session_tree(network, "router", [*here, *network.settings.listen], others)
     return {

@@ -7,9 +7,8 @@ hosts do not matter: what a peer may do follows from its certificate's common na
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
-from ipaddress import ip_address
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
@@ -18,12 +17,7 @@ from pydantic import BaseModel, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.topics import NAME
 from aeroloop.protocol.transport.certificate import AUTHORITY, Certificate, own_certificate
-
-TLS: Final = ("tls", "quic")
-"""Protocols whose links are encrypted, both ends with a certificate."""
-_HERE: Final = ("unixsock-stream", "unixpipe", "shm")
-"""Protocols that stay on this host, where the file's mode says who may connect."""
-_PLACE: Final = re.compile(r"(?P<protocol>[a-z][a-z0-9_-]*)/(?P<host>.*?)(:\d+)?([?#].*)?")
+from aeroloop.protocol.transport.endpoint import LOCAL, TLS, Endpoint
 
 
 class SecurityError(AeroloopError):
@@ -67,21 +61,21 @@ READER: Final = Identity(("operator", "observer"))
 """A command or a viewer, of any vehicle."""
 
 
-def secured(endpoint: str, security: SecuritySettings, *, insecure: bool, loopback_secured: bool) -> str:
+def secured(text: str, security: SecuritySettings, *, insecure: bool, loopback_secured: bool) -> str:
     """The endpoint that is opened in place of a configured one.
 
     Raises:
         SecurityError: Its links would be plain text where they must not be, or there are no certificates for them.
     """
-    protocol, _, rest = endpoint.partition("/")
-    must = is_plain(endpoint) or (loopback_secured and protocol not in (*TLS, *_HERE))
+    endpoint = Endpoint.parse(text)
+    must = endpoint.is_plain or (loopback_secured and endpoint.protocol not in (*TLS, *LOCAL))
     if security.directory:
         if not must:
-            return endpoint
-        if protocol == "tcp":
-            return f"tls/{rest}"
+            return text
+        if endpoint.protocol == "tcp":
+            return str(replace(endpoint, protocol="tls"))
         raise SecurityError(f"{endpoint} is plain text: name a tcp or tls endpoint, which mutual TLS protects")
-    if protocol in TLS or (must and loopback_secured):
+    if endpoint.protocol in TLS or (must and loopback_secured):
         raise SecurityError(
             f"{endpoint} needs certificates: make them with `aeroloop host keys`, and set network.security.directory"
         )
@@ -90,25 +84,12 @@ def secured(endpoint: str, security: SecuritySettings, *, insecure: bool, loopba
             f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle: set "
             "network.security.directory (see `aeroloop host keys`), or network.insecure = true on a network of your own"
         )
-    return endpoint
-
-
-def is_plain(endpoint: str) -> bool:
-    """Whether an endpoint's links are plain text that leaves this host, or may."""
-    parts = _PLACE.fullmatch(endpoint)
-    if parts is None:
-        return True
-    if parts["protocol"] in (*TLS, *_HERE) or parts["host"] == "localhost":
-        return False
-    try:
-        return not ip_address(parts["host"].strip("[]")).is_loopback
-    except ValueError:  # a name
-        return True
+    return text
 
 
 def certificate_for(endpoints: Iterable[str], security: SecuritySettings, identity: Identity) -> Certificate | None:
     """This process's own certificate, checked; None where none of its endpoints needs one. Raises CertificateError."""
-    if security.folder is None or not any(endpoint.partition("/")[0] in TLS for endpoint in endpoints):
+    if security.folder is None or not any(Endpoint.parse(each).protocol in TLS for each in endpoints):
         return None
     return own_certificate(security.folder, *identity)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 from typing import Any, Final, Literal
 
 import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.access import access_control
+from aeroloop.protocol.transport.endpoint import Endpoint
+from aeroloop.protocol.transport.history import PAGE_BYTES
 from aeroloop.protocol.transport.network_settings import Protected
-from aeroloop.protocol.transport.publication import PAGE_BYTES
 from aeroloop.protocol.transport.security import tls_tree
 
 Mode = Literal["peer", "client", "router"]
@@ -36,11 +36,11 @@ PATIENT_LEASE_MS: Final = 10_000
 RETRY_MS: Final = (50, 1000)
 """First and longest pause between two attempts to connect to an endpoint [ms]."""
 
-ONE_THREAD: Final = (
-    "(app: (worker_threads: 1), rx: (handover: app), tx: (handover: app), acc: (handover: app), net: (handover: app))"
+THREADS: Final = (
+    "(rx: (worker_threads: 8), tx: (worker_threads: 4), acc: (worker_threads: 2), net: (worker_threads: 4), "
+    "app: (worker_threads: 4))"
 )
-"""All of Zenoh in one thread, as ZENOH_RUNTIME. Each further one adds a wake-up to a frame's way (README.md). Nothing
-may block it, so threads of Python answer queries; `tests/benchmarks/third_parties.py` measures it."""
+"""Zenoh's threads in a daemon, as ZENOH_RUNTIME: a thread that waits for one slow peer holds up no other."""
 
 
 def session_tree(
@@ -57,7 +57,7 @@ def session_tree(
     table = topics.TOPICS.values()
     caches = {topics.cache_key(topics.key(each.name, "*")): each for each in table if each.recorded}
     limits = [(topics.key(each.name, "*"), each.limit, each.request) for each in table]
-    limits += [(key, max(each.limit, 2 * PAGE_BYTES), topics.MESSAGE_BYTES) for key, each in caches.items()]
+    limits += [(key, max(each.limit, PAGE_BYTES), topics.MESSAGE_BYTES) for key, each in caches.items()]
     tree: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": listen, "exit_on_failure": True},
@@ -99,22 +99,18 @@ def session_tree(
     if mode != "client":  # a client's one link carries the queries of all: its router limits each of them
         # By link, whatever a message says of its sender: only a new link, with its handshake, is a new peer.
         queried = {topics.key(each.name, "*"): each for each in table if each.answered} | caches
-        rules = [{"key_expr": key, "freq": each.per_s} for key, each in queried.items()]
+        rules = [{"key_expr": key, "freq": topics.QUERIES_PER_S} for key in queried]
         tree["downsampling"] = [{"id": "queries", "flows": ["ingress"], "messages": ["query"], "rules": rules}]
     if certificate is not None:
         tree["transport"]["link"]["tls"] = tls_tree(certificate)
         # Peers gossip addresses of any kind: none of them leads to a link that the configuration does not have.
-        tree["transport"]["link"]["protocols"] = sorted({each.partition("/")[0] for each in settings.endpoints})
+        tree["transport"]["link"]["protocols"] = sorted({Endpoint.parse(each).protocol for each in settings.endpoints})
         tree["access_control"] = access_control(*vehicles, loopback=not settings.loopback_secured)
     return tree
 
 
-def open_tree(tree: dict[str, Any], threads: str = ONE_THREAD) -> zenoh.Session:
-    """Open a session with a configuration of Zenoh. Raises zenoh.ZError.
-
-    `threads` are Zenoh's, for all sessions of the process, unless one was opened or ZENOH_RUNTIME was set before.
-    """
-    os.environ.setdefault("ZENOH_RUNTIME", threads)
+def open_tree(tree: dict[str, Any]) -> zenoh.Session:
+    """Open a session with a configuration of Zenoh. Raises zenoh.ZError."""
     return zenoh.open(zenoh.Config.from_json5(json.dumps(tree)))
 
 

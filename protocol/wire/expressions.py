@@ -16,7 +16,8 @@ from math import nan
 from threading import RLock
 from typing import Final
 
-from aeroloop.protocol.lazy import casadi as ca
+import casadi as ca
+
 from aeroloop.protocol.wire.hysteresis import SLACK, HysteresisQuantizer
 from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
 from aeroloop.protocol.wire.quantizer import TIE, CodedQuantizer, Continuous, Quantizer, UniformQuantizer

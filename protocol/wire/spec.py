@@ -125,6 +125,12 @@ class WireSpec(BaseModel, frozen=True, extra="forbid"):
         """Format of a command frame: u₁…uₙ, or u₂ u₃ if there are two."""
         return FrameFormat([self.voltage.bits] * self.actuators, self.counter_bits)
 
+    def lengths(self, direction: Literal["measurement", "command"], *, lockstep: bool) -> frozenset[int]:
+        """Lengths of well-formed frames of a direction [bytes]: 0, too, where an empty frame stands for silence."""
+        frame = self.measurement if direction == "measurement" else self.command
+        policy = getattr(self.transmit, direction)
+        return frozenset((frame.size, 0) if lockstep and policy == "on_change" else (frame.size,))
+
     @property
     def motors(self) -> range:
         """Numbers of the motors, as in u₁: of two they are the paper's 2 and 3, else they begin at 1."""

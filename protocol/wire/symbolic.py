@@ -18,7 +18,8 @@ from itertools import accumulate
 from math import prod
 from typing import Any, Final, TypeAlias
 
-from aeroloop.protocol.lazy import casadi as ca
+import casadi as ca
+
 from aeroloop.protocol.wire.expressions import as_written
 
 Buffer: TypeAlias = "memoryview[float]"

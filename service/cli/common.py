@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, No
 import typer
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.cli.entry import INTERRUPTED, end_at_once
+from aeroloop.service.cli.entry import INTERRUPTED, end_unstarted
 
 if TYPE_CHECKING:
     from threading import Event
@@ -131,7 +132,10 @@ def report(message: str) -> None:
 
 def settings_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
     """The effective configuration, with more overrides; a configuration error ends the command."""
-    return reloadable(config, overrides, *more)[0]
+    from aeroloop.service.config import load
+
+    with checked():
+        return load(config, [*(overrides or ()), *more])
 
 
 def loop_of(config: Path | None, overrides: Sequence[str] | None, *more: str) -> Settings:
@@ -150,19 +154,6 @@ def address_of(config: Path | None, overrides: Sequence[str] | None) -> VehicleA
         return load_vehicle_address(config, overrides or ())
 
 
-def reloadable(
-    config: Path | None, overrides: Sequence[str] | None, *more: str
-) -> tuple[Settings, Callable[[], Settings]]:
-    """The effective configuration, with more overrides, and a function that loads it again."""
-    from aeroloop.service.config import load
-
-    def again() -> Settings:
-        return load(config, [*(overrides or ()), *more])
-
-    with checked():
-        return again(), again
-
-
 def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) -> Settings:
     """The settings with the bits given on the command line."""
     from aeroloop.service.config import with_bits
@@ -173,15 +164,10 @@ def with_bits_of(settings: Settings, bits_out: str | None, bits_in: str | None) 
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Turn expected errors into one line and an exit code. ^C is a KeyboardInterrupt; a second one ends at once."""
-
-    def interrupt(*_: object) -> None:
-        signal.signal(signal.SIGINT, end_at_once)
-        raise KeyboardInterrupt
-
+    """Turn expected errors into one line and an exit code; ^C is a KeyboardInterrupt."""
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:  # as in a background job
-        signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
     except (AeroloopError, ValueError) as error:
@@ -214,30 +200,51 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
 def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:
     """Join the network as a role and run until SIGTERM or SIGINT."""
     _follow_parent(options)
-    from aeroloop.protocol.runtime.realtime import share_heap
+    begun, stop = _stop_on_signals()
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.protocol.transport.lingering import no_linger
+    from aeroloop.protocol.transport.session_tree import THREADS
     from aeroloop.service.daemon.claim import controller_name
 
-    share_heap()  # before a session starts threads
+    os.environ.setdefault("ZENOH_RUNTIME", THREADS)
     if (refused := no_linger()) is not None:
         log.warning("%s", refused)
     name = controller_name() if kind == "controller" else None
-    with guarded(), Role(kind, settings.vehicle, settings.network, settings.description(), name) as role:
-        role.stop_on_signals()
+    with guarded(), Role(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
+        begun.set()
         run(role)
 
 
 def run_alone(run: Callable[[Event], None], options: DaemonOptions) -> None:
     """Run a process that is no role on the network until SIGTERM or SIGINT."""
-    from threading import Event
-
     _follow_parent(options)
-    stop = Event()
-    for which in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(which, lambda *_: stop.set())
+    begun, stop = _stop_on_signals()
+    begun.set()
     with guarded():
         run(stop)
+
+
+def _stop_on_signals() -> tuple[Event, Event]:
+    """Events to set once the process has begun, and set by a signal to stop, which before that ends the process.
+
+    Why a thread waits for them: a handler would run in the main thread, where Zenoh may be waiting for a peer, and
+    which may hold the lock of the event that the handler sets: then the process would never end.
+    """
+    from threading import Event, Thread
+
+    begun, stop, signals = Event(), Event(), {signal.SIGTERM, signal.SIGINT}
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; else a closed terminal
+        signals.add(signal.SIGHUP)
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # in each thread that is started from here on
+
+    def wait() -> None:
+        signal.sigwait(signals)
+        if not begun.is_set():
+            end_unstarted()
+        stop.set()
+
+    Thread(target=wait, daemon=True).start()
+    return begun, stop
 
 
 def _follow_parent(options: DaemonOptions) -> None:

@@ -1,18 +1,22 @@
 """First code of the command `aeroloop`: takes ^C over before anything slow is imported.
 
 Until a verb's work begins, and after it ends, ^C ends the process at once, without a traceback. While it works, ^C is a
-KeyboardInterrupt, which cleans up (`common.guarded`); a second one ends the process at once. Daemons and live views
-install handlers of their own.
+KeyboardInterrupt, which cleans up (`common.guarded`). Daemons and live views install handlers of their own; SIGTERM
+before that ends a daemon at once, with a line.
 """
 
 from __future__ import annotations
 
 import _signal  # type: ignore[import-not-found]  # what `signal` wraps: it imports enum, during which ^C is a traceback
+import io
 import os
 import sys
 
 INTERRUPTED = 130
 """Exit code after ^C, as of a process that SIGINT ends in a shell."""
+
+DAEMONS = {"controller", "emulator", "plant", "bridge", "can-node", "router", "recorder"}
+"""Verbs that run until SIGTERM, with exit code 0."""
 
 SWITCHES = {
     "OPENBLAS_NUM_THREADS": "1",  # NumPy would start a thread for each core, which no matrix here is large enough for
@@ -28,14 +32,22 @@ def end_at_once(*_: object) -> None:
     os._exit(INTERRUPTED)
 
 
+def end_unstarted(*_: object) -> None:
+    """Signal handler: end this process, a daemon that has not begun."""
+    os.write(2, b"aeroloop: ended by a signal before it had started\n")
+    os._exit(0)
+
+
 def main() -> None:
     """Entry point of the command."""
+    if not DAEMONS.isdisjoint(sys.argv[1:2]):
+        _signal.signal(_signal.SIGTERM, end_unstarted)
     if _signal.getsignal(_signal.SIGINT) is not _signal.SIG_IGN:  # as in a background job
         _signal.signal(_signal.SIGINT, end_at_once)
     for switch, value in SWITCHES.items():
         os.environ.setdefault(switch, value)
     from aeroloop.service.cli.main import execute
-    from aeroloop.service.terminal.encoding import replace_what_cannot_be_printed
 
-    replace_what_cannot_be_printed()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # of what the terminal's encoding lacks; stderr escapes it
     sys.exit(execute(sys.argv[1:]))

@@ -39,19 +39,16 @@ def experiment(
 ) -> None:
     """Run the closed loop in this process, in lockstep, without a network."""
     settings = with_bits_of(loop_of(config, overrides), bits_out, bits_in)
-    from aeroloop.service.lab.experiment import experiment_figures
+    from aeroloop.service.lab.experiment import run_experiment
     from aeroloop.service.terminal.display import figures_table, progress_bar
 
     with guarded(), progress_bar("experiment", duration, hidden=json) as update:
-        figures = experiment_figures(settings, duration, update)
-    show(figures, json, lambda found: figures_table(found, path=found.path))
+        figures = run_experiment(settings, duration, update)
+    show(figures, json, figures_table)
 
 
 def tables(
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each cell, for a mean and a spread.")] = 1,
-    sensitivity: Annotated[
-        bool, typer.Option("--sensitivity", help="Print how the errors change with what was not fitted; takes minutes.")
-    ] = False,
     engine: EngineOption = "processes",
     markdown: Markdown = False,
     json: Json = False,
@@ -62,17 +59,9 @@ def tables(
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.lab.tables import markdown as as_markdown
-    from aeroloop.service.lab.tables import markdown_table, predict
-    from aeroloop.service.terminal.display import count_bar, paper_tables, rows_table
+    from aeroloop.service.lab.tables import predict
+    from aeroloop.service.terminal.display import count_bar, paper_tables
 
-    if sensitivity:
-        from aeroloop.service.lab.sensitivity import measure_sensitivity, rows
-
-        with guarded(), count_bar("cells", hidden=json) as update:
-            changes = measure_sensitivity(settings, seeds, update, engine)
-        text = rows(changes)
-        show(changes, json, lambda _: typer.echo(markdown_table(text)) if markdown else rows_table(text))
-        return
     with guarded(), count_bar("cells", hidden=json) as update:
         result = predict(settings, seeds, update, engine)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else paper_tables)
@@ -181,14 +170,14 @@ def sweep(
     settings = loop_of(config, overrides)
     check_engine(engine)
     from aeroloop.service.sweep.axes import parse_axes
-    from aeroloop.service.sweep.sweep import plan, rows_file, run_sweep
+    from aeroloop.service.sweep.sweep import plan, run_sweep
     from aeroloop.service.sweep.table import check_table
     from aeroloop.service.terminal.display import count_bar
     from aeroloop.service.terminal.sweep_table import sweep_table
 
     with checked():
-        check_table(out, [config], force=force or rows_file(out).exists())  # the table of these rows may be made anew
         planned = plan(settings, parse_axes(vary or ()), seeds, duration)
+        check_table(out, planned, [config], force=force)
     with guarded(), count_bar("experiments", hidden=json) as update:
         result = run_sweep(planned, out, engine=engine, progress=update)
     show(result, json, sweep_table)

@@ -100,7 +100,6 @@ def laws(
     check_engine(engine)
     from aeroloop.service.sweep.law_choices import compare
     from aeroloop.service.sweep.laws import run_comparison
-    from aeroloop.service.sweep.sweep import rows_file
     from aeroloop.service.sweep.table import check_table
     from aeroloop.service.terminal.display import count_bar
     from aeroloop.service.terminal.laws_table import laws_table
@@ -110,9 +109,9 @@ def laws(
     given = {name: values or () for name, values in axes.items()}
     with checked():
         check_figure(figure, config, force)
-        if out is not None:
-            check_table(out, [config], force=force or rows_file(out).exists())  # as of `sweep`
         comparison = compare(settings, **given, seeds=seeds, duration_s=duration, within_deg=within)
+        if out is not None:
+            check_table(out, comparison.plan, [config], within_deg=within, force=force)
     with guarded(), count_bar("experiments and searches", hidden=json) as update:
         result = run_comparison(comparison, out, engine, update)
     show(result, json, (lambda found: typer.echo(as_markdown(found))) if markdown else laws_table)

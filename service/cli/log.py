@@ -47,9 +47,6 @@ def review(
         Path | None,
         typer.Option("--figures", help="Draw the paper's figures into this folder: PDF, SVG, PNG.", show_default=False),
     ] = None,
-    columns: Annotated[
-        Literal["1", "2"], typer.Option("--columns", help="Width of the figures: 3.5 in, or 7.16 in for two columns.")
-    ] = "1",
     since_s: Annotated[
         float | None, typer.Option("--from", metavar="S", help="Draw from this time on only.", show_default=False)
     ] = None,
@@ -67,7 +64,7 @@ def review(
     json: Json = False,
 ) -> None:
     """Compute every figure of a run from its logs, check limits, and draw the paper's figures."""
-    from aeroloop.service.review.requirements import Limit
+    from aeroloop.service.review.requirements import Limit, broken_limits
 
     with checked():
         limits = [Limit.parse(text) for text in require or []]
@@ -91,15 +88,14 @@ def review(
             from aeroloop.service.report.plots import draw_figures
 
             with writing_into(figures, logs, force=force) as folder:
-                drawn = draw_figures(report, judged.session.settings, folder, 1 if columns == "1" else 2)
+                drawn = draw_figures(report, judged.session.settings, folder)
             names = ", ".join(dict.fromkeys(path.stem for path in drawn))
             typer.echo(f"aeroloop: drew {names} into {figures}, as PDF, SVG and PNG", err=True)
         if html is not None:
             write_html([report], html, logs, force)
         findings = report.findings
     show(findings, json, review_account)
-    broken = [text for limit in limits if (text := limit.broken(findings)) is not None]
-    if broken:
+    if broken := broken_limits(limits, findings):
         fail("; ".join(broken), 1)
 
 
@@ -118,7 +114,7 @@ def replay(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Compute both ends again from their traces and compare byte for byte."""
+    """Compute both ends again from their traces and compare byte for byte; exit with 1 unless all of it is the same."""
     from aeroloop.protocol.messages.trace import ENDS
     from aeroloop.service.logs.replay import replay
     from aeroloop.service.terminal.display import share_bar
@@ -127,7 +123,7 @@ def replay(
     with guarded(), share_bar("replaying", hidden=json) as update:
         replayed = replay(logs, overrides or [], update, ends=[end] if end else ENDS)
     show(replayed, json, replay_table)
-    if not overrides and replayed.differs:
+    if not overrides and (replayed.differs or not replayed.complete):
         raise typer.Exit(1)
 
 
@@ -203,6 +199,8 @@ def export(
             typer.echo(f"{exported.out}: {exported.rows} ticks of {', '.join(exported.sessions)}")
         for line in exported.damages:
             typer.echo(f"not read, {line}")
+        for one in exported.unknown:
+            typer.echo(str(one))
 
     with guarded(), share_bar("exporting", hidden=json) as update:
         exported = export(logs, to, out, session=session, vehicle=vehicle, force=force, progress=update)

@@ -22,7 +22,7 @@ _GROUPS: Final = {
     "lab": "Experiments, tables, calibration and certificates, in lockstep.",
     "log": "Review, compare, replay, recover and export logs; view a live loop.",
     "op": "Operate running roles over the network.",
-    "host": "Check this machine, measure and soak the loop on it, install its daemons, make its keys.",
+    "host": "Check this machine, install its daemons, make its keys.",
     "show": "Print the configuration, the wire, a DBC file, a layout, examples.",
 }
 """Modules of verbs in this folder, with the help of each. Those of `run` stand beside the groups."""

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from aeroloop.protocol.messages.operator import Gains, Message, Reference
-    from aeroloop.service.host.operator import Stopped
     from aeroloop.service.vehicle_address import VehicleAddress
 
 Three = tuple[float, float, float]
@@ -36,7 +35,8 @@ def status(
             "--check",
             help="Print only what is wrong, and exit with 1 if anything is: a plant tripped or a controller faulted; a "
             "role silent for 3 s; a loop late (over 1 % of the last 10 s' ticks skipped, or commands that take over a "
-            "period at the 99th percentile); a controller or plant missing.",
+            "period at the 99th percentile); a controller or plant missing, or a recorder that was there or is "
+            "required; messages that a recorder lost; a plant that cannot keep a stop on disk.",
         ),
     ] = False,
     json: Json = False,
@@ -73,13 +73,13 @@ def status(
 
 @group.command()
 def top(config: Config = None, overrides: Overrides = None) -> None:
-    """Show every vehicle and role on the network, live; s stops, q quits."""
+    """Show every vehicle and role on the network, live; q quits."""
     address = address_of(config, overrides)
     import threading
 
     from aeroloop.service.terminal.display import live_screen
     from aeroloop.service.terminal.keyboard import keyboard
-    from aeroloop.service.terminal.monitor import Footer, watch
+    from aeroloop.service.terminal.monitor import watch
 
     stop, signals = threading.Event(), list[int]()
 
@@ -87,11 +87,10 @@ def top(config: Config = None, overrides: Overrides = None) -> None:
         signals.append(number)
         stop.set()
 
-    footer = Footer(lambda: _stop(address), _stopped_vehicle(address) or "every plant")
     with guarded(), keyboard() as read, live_screen() as show:
         for which in (signal.SIGINT, signal.SIGTERM):
             signal.signal(which, end)
-        watch(address.network, show, stop, read, footer)
+        watch(address.network, show, stop, read)
     if signals:
         raise typer.Exit(128 + signals[0])
 
@@ -132,23 +131,15 @@ def stop(
 ) -> None:
     """Stop the configured vehicle's plant at once, or all plants if none is configured: 0 V until `op arm`."""
     address = address_of(config, overrides)
+    from aeroloop.service.host.operator import stop as stop_plants
+
     with guarded():
-        answers, failures = _stop(address, every=every)
+        configured = "vehicle" in address.model_fields_set
+        answers, failures = stop_plants(address.network, address.vehicle if configured and not every else None)
     for line in answers:
         typer.echo(line)
     if failures:
         fail("; ".join(failures), 1)
-
-
-def _stop(address: VehicleAddress, *, every: bool = False) -> Stopped:
-    from aeroloop.service.host.operator import stop as stop_plants
-
-    return stop_plants(address.network, None if every else _stopped_vehicle(address))
-
-
-def _stopped_vehicle(address: VehicleAddress) -> str | None:
-    """The vehicle that is stopped: the configured one, or every vehicle if none is configured."""
-    return address.vehicle if "vehicle" in address.model_fields_set else None
 
 
 @group.command()

@@ -6,7 +6,7 @@ import sys
 from json import dumps
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,7 +23,6 @@ from aeroloop.service.cli.common import (
     daemon,
     guarded,
     loop_of,
-    reloadable,
     run_alone,
     run_role,
     settings_of,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from threading import Event
 
     from aeroloop.protocol.runtime.role import Role
-    from aeroloop.service.config import Settings
 
 Faults = Annotated[
     list[str] | None,
@@ -57,7 +55,7 @@ def demo(
     lockstep: Annotated[bool, typer.Option("--lockstep", help="Deterministic, as fast as the machine allows.")] = False,
     via: Annotated[
         str | None,
-        typer.Option("--via", metavar="emulator|can|quanser-fake", help="Plant end to run.", show_default=False),
+        typer.Option("--via", metavar="emulator|can", help="Plant end to run.", show_default=False),
     ] = None,
     bits_out: BitsOut = None,
     bits_in: BitsIn = None,
@@ -103,34 +101,16 @@ def controller(
     """Run the controller daemon until SIGTERM."""
     words = [f"controller.duration_s={duration}"] if duration is not None else []
     words += ["controller.auto_arm=true"] if auto_arm else []
-    _, load_open = reloadable(options.config, options.overrides, *words)
     settings = loop_of(options.config, options.overrides, *words)
 
-    def load() -> Settings:
-        from aeroloop.service.config import with_law_settings
-
-        return with_law_settings(load_open())
-
     def run(role: Role) -> None:
-        from aeroloop.service.config import from_description
         from aeroloop.service.control.laws.registry import version_of
         from aeroloop.service.daemon.daemon import Daemon
-        from aeroloop.service.daemon.reload import reload_on_hangup
+        from aeroloop.service.theorem.any_law import described_certificate
 
         daemon = Daemon(role, settings)
         role.own_versions = version_of(settings.law)
-
-        def certificate_of(now: Settings) -> dict[str, Any] | None:
-            return daemon.certificate_of(now.law, now.reference, now.controller)
-
-        role.publish_description(settings.description(), certificate_of(settings))
-        reload_on_hangup(
-            role,
-            settings,
-            load,
-            lambda new: daemon.reconfigure(new.law, new.reference, new.controller),
-            lambda effective: certificate_of(from_description(effective)),
-        )
+        role.publish_description(settings.description(), described_certificate(settings))
         daemon.run()
 
     run_role("controller", settings, run, options)
@@ -164,11 +144,11 @@ def can_node(options: DaemonOptions, faults: Faults = None) -> None:
     settings = settings_of(options.config, options.overrides, *_fault_options(faults))
 
     def run(stop: Event) -> None:
-        from aeroloop.plant_emulator.hosts.can_node import CanFront
+        from aeroloop.plant_emulator.hosts.can_node import CanNetwork
         from aeroloop.plant_emulator.hosts.emulator import Emulator
 
         emulator = Emulator(settings.loop, settings.wire, settings.plant, stop)
-        emulator.run(CanFront(settings.can, settings.loop, emulator.endpoint, emulator.fault_statuses))
+        emulator.run(CanNetwork(settings.can, settings.loop, emulator.endpoint))
 
     run_alone(run, options)
 
@@ -178,12 +158,12 @@ def _fault_options(faults: list[str] | None) -> list[str]:
 
 
 def _run_plant(options: DaemonOptions, *overrides: str) -> None:
-    settings, load = reloadable(options.config, options.overrides, *overrides)
+    settings = settings_of(options.config, options.overrides, *overrides)
 
     def run(role: Role) -> None:
         from aeroloop.service.daemon.plants import run_plant
 
-        run_plant(role, settings, load)
+        run_plant(role, settings)
 
     run_role("plant", settings, run, options)
 
@@ -197,7 +177,7 @@ def router(
     ] = False,
 ) -> None:
     """Run a router for clients (network.mode = "client") until SIGTERM."""
-    settings, load = reloadable(options.config, options.overrides)
+    settings = settings_of(options.config, options.overrides)
     if print_config:
         from aeroloop.protocol.transport.router import zenohd_config
         from aeroloop.protocol.transport.security import Identity
@@ -206,14 +186,9 @@ def router(
             typer.echo(zenohd_config(settings.network, Identity(("router",), settings.vehicle)), nl=False)
         return
 
-    def run(role: Role) -> None:
-        from aeroloop.service.daemon.reload import reload_on_hangup
-        from aeroloop.service.daemon.router import run_router
+    from aeroloop.service.daemon.router import run_router
 
-        reload_on_hangup(role, settings, load, lambda _: None)
-        run_router(role)
-
-    run_role("router", settings, run, options)
+    run_role("router", settings, run_router, options)
 
 
 @group.command()
@@ -224,14 +199,11 @@ def recorder(
 ) -> None:
     """Record the traces and messages of every vehicle on the network into an MCAP log until SIGTERM."""
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
-    settings, load = reloadable(options.config, options.overrides, *words)
+    settings = settings_of(options.config, options.overrides, *words)
 
     def run(role: Role) -> None:
-        from aeroloop.service.daemon.reload import reload_on_hangup
         from aeroloop.service.recording.recorder import Recorder
 
-        recorder = Recorder(role, settings.recorder)
-        reload_on_hangup(role, settings, load, lambda new: recorder.reconfigure(new.recorder))
-        recorder.run()
+        Recorder(role, settings.recorder).run()
 
     run_role("recorder", settings, run, options)

@@ -17,7 +17,6 @@ group = typer.Typer()
 
 @group.command("config")
 def show_config(
-    bare: Annotated[bool, typer.Option("--bare", help="Leave out the comments.")] = False,
     config: Config = None,
     overrides: Overrides = None,
 ) -> None:
@@ -28,7 +27,7 @@ def show_config(
     settings = settings_of(config, overrides)
     with checked(), suppress(PluginError):  # a class that is not on this host: its keys as they are written
         settings = with_law_settings(settings)
-    typer.echo(settings.toml(comments=not bare), nl=False)
+    typer.echo(settings.toml(comments=True), nl=False)
 
 
 @group.command()

@@ -36,18 +36,18 @@ class Approach(NamedTuple):
     """Times of an approach, as in the trace's changes. The default is a jump.
 
     Attributes:
-        within_s: All of it, without `ease_s` [s].
+        within_s: All of it [s].
         start: Roll, pitch, yaw to begin from, at rest, instead of the present reference [deg].
         brake_s: Time in which roll, pitch, yaw each brake to rest at its start; None for a single quintic [s].
         run_up_s: Time in which each runs up to the rate of the target at its end [s].
-        ease_s: Time before a single quintic to reduce the present acceleration to 0 [s]; in older logs only.
+        here: Roll, pitch, yaw to begin from [rad], their rates [rad/s] and accelerations [rad/s²]; None with `start`.
     """
 
     within_s: float = 0.0
     start: Vector | None = None
     brake_s: Vector | None = None
     run_up_s: Vector | None = None
-    ease_s: float = 0.0
+    here: tuple[Vector, Vector, Vector] | None = None
 
     def at_least(self, within_s: float) -> Approach:
         """This shortest approach, extended to `within_s` if that is longer."""
@@ -204,20 +204,18 @@ def approached(target: Plan, here: Angles, t: float, approach: Approach) -> Plan
 
     Args:
         target: What to follow in the end; its own time begins then.
-        here: The state at its start, unless the approach has one. Shapes (1, 3).
+        here: The state at its start, unless the approach has one, as `start` or `here`. Shapes (1, 3).
         t: Time of its start [s].
         approach: Its times.
     """
-    within_s, start, brake, run_up, ease_s = approach
+    within_s, start, brake, run_up, begin = approach
     if start is not None:
         here = at_rest(np.radians(np.array([start])))
+    elif begin is not None:
+        here = Angles(*(np.array([row]) for row in begin))
     there = target.first
     if brake is None or run_up is None:
         states, lengths = [here], []
-        if ease_s:
-            eased = here.angle + here.rate * ease_s + here.acceleration * ease_s**2 / 3
-            states.append(Angles(eased, here.rate + here.acceleration * ease_s / 2, np.zeros((1, 3))))
-            lengths.append(ease_s)
         if within_s:
             states.append(there)
             lengths.append(within_s)

@@ -58,7 +58,7 @@ class Motion:
 
     def follow(self, target: Plan, t: float, approach: Approach = JUMP) -> None:
         """Follow another plan from time t [s] on, by an approach; its own time begins when it is reached."""
-        self.plan = plan = approached(target, self._here(t), t, approach)
+        self.plan = plan = approached(target, self.here(t), t, approach)
         self._load(plan.piece(t))
 
     def change(self, change: Change, period: float) -> None:
@@ -75,21 +75,25 @@ class Motion:
 
     def rest(self, t: float, limits: Limits) -> Hold:
         """The attitude reached by braking from time t [s] on."""
-        here = self._here(t)
+        here = self.here(t)
         brake_s = braking_times(here, limits)
         roll, pitch, yaw = np.degrees(braked(here, brake_s, np.array([brake_s.max()])).angle[0]).tolist()
         return Hold(attitude=(roll, pitch, yaw))
 
     def shortest(self, target: Plan, t: float, limits: Limits, start: Vector | None = None) -> Approach:
         """The shortest approach from time t [s] on, from `start`, if given, at rest [deg]; as the function does."""
-        here = self._here(t) if start is None else at_rest(np.radians(np.array([start])))
-        return shortest(target, here, limits)._replace(start=start)
+        if start is not None:
+            return shortest(target, at_rest(np.radians(np.array([start]))), limits)._replace(start=start)
+        here = self.here(t)
+        return shortest(target, here, limits)._replace(here=here.row)
 
     def to_set_point(self, target: Plan, t: float, within_s: float, limits: Limits) -> Approach:
         """The approach to a set-point from time t [s] on; as the function does."""
-        return to_set_point(target, self._here(t), within_s, limits)
+        here = self.here(t)
+        return to_set_point(target, here, within_s, limits)._replace(here=here.row)
 
-    def _here(self, t: float) -> Angles:
+    def here(self, t: float) -> Angles:
+        """Roll, pitch, yaw, their rates and accelerations at time t [s]. Shapes (1, 3)."""
         i = self.plan.piece(t)
         tau = np.zeros((len(self.plan.starts), 1))
         tau[i] = t - self.plan.starts[i]

@@ -3,14 +3,18 @@
 Every reference is a sequence of pieces, and every piece a quintic plus a sinusoid, of which either may be zero. One
 CasADi function evaluates any piece: the desired quaternion, the angular velocity of (C.12) in the inertial frame and
 its derivative follow by CasADi's own derivatives, so they are exact and consistent.
+
+The extremes of a quintic are those of 65 samples, the extremes of a sinusoid suprema over its phases: `Plan.largest`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import cache
-from itertools import product
-from math import degrees, pi
+from itertools import product as combinations
+from math import asin, degrees, lcm, pi
 from typing import Final, NamedTuple
 
 import casadi as ca
@@ -19,7 +23,8 @@ from numpy.typing import NDArray
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Hold, Points, Reference, Sinusoid
-from aeroloop.protocol.wire import attitude
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.wire.rotations import conjugate, from_euler, product
 from aeroloop.protocol.wire.symbolic import Compiled, in_columns
 
 Floats = NDArray[np.float64]
@@ -27,8 +32,17 @@ Floats = NDArray[np.float64]
 POWERS: Final = 6
 SAMPLES: Final = 65
 """Samples of a quintic. Its rate is a polynomial of degree 4: the largest of so many is within 0.4 % of the maximum."""
-_TURNS: Final = 8
-_MOST_SAMPLES: Final = 100_000
+_CELLS: Final = {1: 512, 2: 96, 3: 36}
+"""Cells of each free phase to begin with, by the number of free phases."""
+_MOST_CELLS: Final = 100_000
+_TOLERANCE: Final = 1e-7
+"""A supremum over phases is at most this share above the largest value found, unless that takes too many cells."""
+_ROUNDED: Final = 1e-12
+"""A value's share by which it may be rounded."""
+_LIMIT_SLACK: Final = 1 + 1e-6
+"""So much may exceed a limit: a reference that just reaches it is within it."""
+_COMMON: Final = 16
+"""Axes are locked to each other if the ratio of their frequencies has integers up to this."""
 
 
 class FollowError(AeroloopError):
@@ -57,6 +71,12 @@ class Angles(NamedTuple):
     angle: Floats
     rate: Floats
     acceleration: Floats
+
+    @property
+    def row(self) -> tuple[Vector, Vector, Vector]:
+        """The first row, as numbers."""
+        angle, rate, acceleration = (tuple(part[0].tolist()) for part in self)
+        return angle, rate, acceleration
 
     def speeds(self) -> Floats:
         """Angular velocities [rad/s]: ‖ω‖² = φ̇² + θ̇² + ψ̇² − 2 φ̇ ψ̇ sin θ, for roll φ, pitch θ, yaw ψ. Shape (n,)."""
@@ -157,57 +177,112 @@ class Plan:
         )
 
     def samples(self) -> Angles:
-        """All pieces, sampled densely enough for their extremes, concatenated. Shapes (n, 3)."""
+        """Samples of the quintics, dense enough for their extremes, concatenated. Shapes (n, 3)."""
         lengths = np.append(np.diff(self.starts), 0.0)
-        every = Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, SAMPLES))))
-        if not self.frequency[-1].any():
-            return every
-        return Angles(*(np.concatenate(both) for both in zip(every, self._swing(), strict=True)))
+        return Angles(*(part.reshape(-1, 3) for part in self.at(lengths[:, None] * np.linspace(0, 1, SAMPLES))))
 
-    def third(self) -> Floats:
-        """The largest third derivative of roll, pitch and yaw [rad/s³]. Shape (3,)."""
+    @property
+    def swings(self) -> bool:
+        """Whether the last piece is a sinusoid."""
+        return bool((self.amplitude[-1] * self.frequency[-1]).any())
+
+    def peaks(self) -> Floats:
+        """The largest |angle|, |rate|, |acceleration| and |jerk| of roll, pitch, yaw [rad/sᵖ]. Shape (4, 3)."""
         ends = np.append(np.diff(self.starts), 0.0)[:, None, None] * np.linspace(0, 1, SAMPLES)[:, None]
         c = self.quintic[:, None]
-        jerk = np.abs(6 * c[:, :, 3] + 24 * c[:, :, 4] * ends + 60 * c[:, :, 5] * ends**2)
-        largest: Floats = (jerk.max(axis=1) + np.abs(self.amplitude * self.frequency**3)).max(axis=0)
-        return largest
+        jerk = np.abs(6 * c[:, :, 3] + 24 * c[:, :, 4] * ends + 60 * c[:, :, 5] * ends**2).reshape(-1, 3)
+        swing, f = np.abs(self.amplitude[-1]) * (self.frequency[-1] > 0), self.frequency[-1]
+        largest = [np.abs(part).max(axis=0) for part in (*self.samples(), jerk)]
+        peaks: Floats = np.maximum(largest, [swing, swing * f, swing * f**2, swing * f**3])
+        return peaks
 
-    def _swing(self) -> Angles:
-        """The last piece's sinusoid over `_TURNS` periods of its slowest axis; its bounds if too many samples."""
-        moving = self.frequency[-1][self.frequency[-1] > 0]
-        count = int(_TURNS * (SAMPLES - 1) * moving.max() / moving.min()) + 1
-        if count <= _MOST_SAMPLES:
-            tau = np.zeros((len(self.starts), count))
-            tau[-1] = np.linspace(0, _TURNS * 2 * pi / moving.min(), count)
-            return Angles(*(part[-1] for part in self.at(tau)))
-        signs = np.array(list(product((-1.0, 1.0), repeat=6)))
-        amplitude, f = self.amplitude[-1], self.frequency[-1]
-        return Angles(signs[:, :3] * amplitude, signs[:, 3:] * amplitude * f, signs[:, :3] * amplitude * f * f)
+    def largest(self, value: Callable[[Angles], Floats], terms: Floats) -> float:
+        """The largest of a value of the angles: of the quintics' samples, and over all phases of the sinusoid.
+
+        Axes whose frequencies have a ratio of small integers are locked to each other. All others come, in the long
+        run, as near as one likes to every combination of phases; so a grid covers these, and each cell that may hold
+        the maximum is halved along each phase until the allowance for what lies between is small. It is derived: the
+        value is ‖v‖, v a sum of products of factors φ of one axis' phase each, with |φ| ≤ K, |φ'| ≤ nK, |φ''| ≤ n²K.
+        Along the line from the maximum to the centre of its cell, up to d away in each phase, a product's second
+        derivative is at most (d Σn)² ΠK. As ‖v‖' = 0 at the maximum, the value at that centre is less by no more than
+        half the sum of these.
+
+        Args:
+            value: ‖v‖ of each state; NaN and infinite ones are passed on. Shapes (n, 3) to (n,).
+            terms: Of each product its size ΠK, and Σn for the phases of roll, pitch and yaw. Shape (m, 4).
+        """
+        most = float(value(self.samples()).max())
+        sizes, degrees = terms[:, 0], terms[:, 1:]
+        locked = _locked(self.amplitude[-1] * degrees.max(axis=0), self.frequency[-1])
+        axes = len(locked)
+        if not axes:
+            return most
+        bend = sizes @ (np.abs(locked) @ degrees.T).sum(axis=0) ** 2 / 2
+        d = pi / _CELLS[axes]
+        phases = np.stack(np.meshgrid(*[np.arange(d, 2 * pi, 2 * d)] * axes), axis=-1).reshape(-1, axes)
+        halves = np.array(list(combinations((-0.5, 0.5), repeat=axes)))
+        while True:
+            found = value(self.swing(phases @ locked))
+            most = max(most, float(found.max()))
+            allowance = float(d**2 * bend) + _ROUNDED * most
+            phases = phases[found >= most - allowance]
+            if not allowance > _TOLERANCE * most or len(phases) * len(halves) > _MOST_CELLS:
+                return most + allowance
+            phases = (phases[:, None] + d * halves).reshape(-1, axes)
+            d /= 2
+
+    def swing(self, phase: Floats) -> Angles:
+        """Angles of the last piece's sinusoid at phases of roll, pitch, yaw [rad]. Shapes (n, 3)."""
+        a, f = self.amplitude[-1], self.frequency[-1]
+        return Angles(a * np.sin(phase), a * f * np.cos(phase), -a * f * f * np.sin(phase))
 
     def fastest(self) -> float:
         """The largest angular velocity [rad/s]."""
-        return float(self.samples().speeds().max())
+        angle, (roll, pitch, yaw), *_ = self.peaks()
+        return self.largest(
+            Angles.speeds, np.array([[roll, 1, 0, 0], [pitch, 0, 1, 0], [yaw, 0, turning(angle)[1], 1]])
+        )
 
     def check(self, limits: Limits) -> None:
         """Raise FollowError if the reference itself, however it is reached, goes beyond the limits."""
         with np.errstate(over="ignore", invalid="ignore"):  # a rate that is not finite counts as too fast
-            fastest = self.fastest()
-        if not fastest <= limits.rate:
+            fastest, angle = self.fastest(), self.peaks()[0]
+            half = self.largest(lambda at: np.sin(at.tilts() / 2), np.array([[0.5, *turning(angle)[:2], 0]]))
+        if not fastest <= limits.rate * _LIMIT_SLACK:
             raise FollowError(
                 f"the reference itself turns at {fastest:.2f} rad/s, more than controller.max_reference_rate = "
                 f"{limits.rate:g} rad/s, however it is approached: make it slower or smaller"
             )
-        samples = self.samples()
-        # A sinusoid with an amplitude beyond the limit passes through it, though its extremes may be level again.
-        swings = (np.abs(self.amplitude) * (self.frequency > 0))[:, :2]
-        tilt = max(float(samples.tilts().max()), float(np.minimum(swings, pi).max()))
-        if tilt > limits.tilt:
+        tilt = 2 * asin(min(1.0, half))
+        if tilt > limits.tilt * _LIMIT_SLACK:
             raise FollowError(
                 f"the reference itself tilts by {degrees(tilt):.1f}°, more than controller.max_reference_tilt_deg = "
                 f"{degrees(limits.tilt):g}°, however it is approached"
             )
-        if not limits.rolls and np.abs(samples.angle[:, 0]).max() > 0:
+        if not limits.rolls and angle[0] > 0:
             raise FollowError("this vehicle has no motor that rolls it: set its roll to 0")
+
+
+def turning(amplitude: Floats) -> Floats:
+    """The degree n of cos and sin of A sin x as factors of x, in `Plan.largest`. Shape as given."""
+    degree: Floats = np.sqrt(np.where(amplitude < 0.5, amplitude, amplitude**2 + 0.25))
+    return degree
+
+
+def _locked(amplitude: Floats, frequency: Floats) -> Floats:
+    """The phases of roll, pitch, yaw as multiples of phases that are free of each other. Shape (m, 3)."""
+    rows, left = list[Floats](), [i for i in range(3) if amplitude[i] and frequency[i]]
+    while left:
+        row, first = np.zeros(3), frequency[left[0]]
+        ratios = {i: (Fraction(frequency[i]) / Fraction(first)).limit_denominator(_COMMON) for i in left}
+        near = {i: r for i, r in ratios.items() if 0 < r.numerator <= _COMMON}
+        near = {i: r for i, r in near.items() if abs(float(r) * first / frequency[i] - 1) < 1e-12}
+        common = lcm(*(r.denominator for r in near.values()))
+        for i, r in near.items():
+            row[i] = r * common
+        rows.append(row)
+        left = [i for i in left if i not in near]
+    return np.array(rows).reshape(-1, 3)
 
 
 def join(here: Angles, there: Angles, length: Floats) -> Floats:
@@ -245,9 +320,9 @@ def reference_function() -> ca.Function:
     angles = ca.SX.zeros(3)
     for n in reversed(range(POWERS)):
         angles = angles * tau + quintic[:, n]
-    q_d = attitude.from_euler(angles + amplitude * ca.sin(frequency * tau))
+    q_d = from_euler(angles + amplitude * ca.sin(frequency * tau))
     q_d_dot = ca.jacobian(q_d, t)
-    omega_d = 2 * attitude.product(q_d_dot, attitude.conjugate(q_d))[1:4]  # (C.12), solved for ω_d
+    omega_d = 2 * product(q_d_dot, conjugate(q_d))[1:4]  # (C.12), solved for ω_d
     omega_d_dot = ca.jacobian(omega_d, t)
     return ca.Function(
         "reference",

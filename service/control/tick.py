@@ -14,9 +14,9 @@ from functools import lru_cache
 from math import nan
 from typing import Any, Final
 
+import casadi as ca
 import numpy as np
 
-from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.protocol.wire.expressions import as_written, encode, level, saturates
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.symbolic import INTEGER, Buffer, Compiled, buffer, parts

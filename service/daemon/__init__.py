@@ -1,1 +1,1 @@
-"""The controller process, and what both daemons share: choice of the plant end and configuration reload."""
+"""The controller process, and what both daemons share: choice of the plant end."""

@@ -32,18 +32,16 @@ class ClaimClient:
     """Claims one vehicle. The role's name must be unique: the plant identifies its holder by it.
 
     Attributes:
-        auto_arm: As given; may change.
         session: The granted session, or None.
         last: Record of the vehicle's last session, from the last grant; None if the plant has none.
         by_datagrams: Whether the last claim's frames travel as datagrams.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool, own_grid: bool) -> None:
+    def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
         self._role = role
-        self._own_grid = own_grid
         self._loop = loop
         self._wire = wire
-        self.auto_arm = auto_arm
+        self._auto_arm = auto_arm
         self._refusal = ""
         self.session: str | None = None
         self.last: SessionRecord | None = None
@@ -58,19 +56,21 @@ class ClaimClient:
             session=uuid.uuid4().hex[:8],
             period_ns=self._loop.period_ns,
             lockstep=self._loop.lockstep,
-            auto_arm=self.auto_arm,
+            auto_arm=self._auto_arm,
             wire=self._wire,
         )
         carrier = self._carrier()
         if carrier is None:
             return None
         self.by_datagrams = carrier is not role.zenoh
+        sparse = self._wire.transmit.measurement == "on_change" and not self._loop.lockstep
         link = ZenohLink(
             carrier,
             send_key=topics.key("command", role.vehicle, session=claim.session),
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
+            lengths=self._wire.lengths("measurement", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
-            mailbox=self._mailbox(),
+            mailbox=Mailbox(depth=MAILBOX if sparse else 1),
         )
         answer = self._query(claim)
         if isinstance(answer, Grant):
@@ -115,14 +115,6 @@ class ClaimClient:
             )
             log_event(lost, self._role.vehicle)  # not published: Zenoh has just failed
         self.session = None
-
-    def _mailbox(self) -> Mailbox | None:
-        """A mailbox, for its times of arrival, where these decide on ticks; None for a loop that only waits."""
-        if self._loop.lockstep:
-            return None
-        if self._wire.transmit.measurement == "on_change":
-            return Mailbox(depth=MAILBOX)
-        return Mailbox() if self._own_grid else None
 
     def _carrier(self) -> zenoh.Session | None:
         """The session of the frames: of datagrams once it has a link to the plant. None while that is undecided."""

@@ -11,32 +11,29 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final, Literal
 
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import SessionRecord, Status, Tenure
-from aeroloop.protocol.messages.operator import Answer, Hold, Reference, Request, in_words
+from aeroloop.protocol.messages.operator import Answer, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
-from aeroloop.protocol.runtime.realtime import prepare_process
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
+from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
-from aeroloop.service.control.laws.interface import LawSettings, PythonLaw
-from aeroloop.service.control.laws.registry import gains_of
+from aeroloop.service.control.laws.interface import PythonLaw
 from aeroloop.service.daemon import operator_requests
-from aeroloop.service.daemon.certificate_gate import CertificateGate
 from aeroloop.service.daemon.claim import ClaimClient, SessionLostError
 from aeroloop.service.daemon.law_watch import LawWatch
 from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.daemon.telemetry import telemetry_of
 from aeroloop.service.daemon.tick_source import PlantTick, TickSource
-from aeroloop.service.settings import ControllerSettings
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 CLAIM_PERIOD_S: Final = 0.25
@@ -76,9 +73,7 @@ class Daemon:
         self._new_controller: Callable[[], Controller] = lambda: Controller(wire, law, reference, loop.period)
         self._controller = self._new_controller()
         self._own_grid = settings.pace == "clock" and not loop.lockstep
-        self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm, own_grid=self._own_grid)
-        begins = reference if settings.after_restart == "configured" else Hold()
-        self._gate = CertificateGate(role, configured, gains_of(law), begins)
+        self._claims = ClaimClient(role, loop, wire, auto_arm=settings.auto_arm)
         self._trace = TraceWriter("controller", wire, secrets.randbits(64), round(loop.trace_s * 1e9))
         self._changes = OperatorChanges(
             role,
@@ -86,18 +81,17 @@ class Daemon:
             reference,
             settings,
             self._trace,
-            self._gate,
             rolls=wire.actuators > 2,
             why_none=self._why_none,
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
-        self._recorded = False
         self._plant: Tenure | None = None
         self._plant_due = 0.0
         self._plants = 0  # how often a plant's token has appeared or disappeared
         self._granted = False  # whether the plant's status has ever named this session
         self._lost = ""
+        self._link: ZenohLink | None = None  # of the session
         self._too_slow: float | None = None  # time of a tick beyond law_timeout_s, before it is a fault
         self._watch = LawWatch(role, f"law {law.kind}")
         self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = self._stale = 0
@@ -108,7 +102,9 @@ class Daemon:
         self._shown: SessionRecord | None = None  # by the last status
         self._status_ticks = 0
         self._status_time = time.monotonic()
-        self._take(settings)
+        self._stale_s = settings.stale_s
+        self._law_timeout_s = settings.law_timeout_s
+        self._telemetry_every = max(1, round(loop.rate_hz / settings.telemetry_rate_hz))
 
     def run(self) -> None:
         """Run until the role's `stop` is set or `duration_s` of the law's time is over."""
@@ -125,7 +121,7 @@ class Daemon:
         self._plant_statuses = role.zenoh.declare_subscriber(
             topics.key("status", role.vehicle, role="plant"), RingChannel(STATUSES)
         )
-        role.watch_token("recorder", self._see_recorder)
+        self._recorder = RecorderWatch(role)
         role.watch_token("plant", self._see_plant)
         role.announce()
         role.event("started", f"{role.name} looks for {role.vehicle}")
@@ -139,6 +135,7 @@ class Daemon:
                     self._publish_when_due()
                     role.stop.wait(CLAIM_PERIOD_S)
                     role.take_inbox()
+                    collect_garbage()
                     continue
                 try:
                     finished = self._run(link)
@@ -193,6 +190,7 @@ class Daemon:
             self._age.add(sent_ns - now.at_ns)
             self._record(now, command, sent_ns)
             self._account(command, now)
+            collect_garbage()
             if timing:
                 timing.done()
         return self._may_continue()
@@ -269,18 +267,14 @@ class Daemon:
     # ── the session ──
 
     def _may_claim(self) -> bool:
-        recorded = self._recorded or not self._settings.require_recorder
-        blocks = self._gate.blocks
-        if recorded or blocks:
-            self._gate.publish()
-        return recorded and not blocks
+        return self._recorder.present or not self._settings.require_recorder
 
     def _claim(self) -> ZenohLink | None:
         if self._controller.tick_index >= 0:  # created before the claim, because ticks start with the grant
             self._refused += self._controller.refused
             self._saturated += self._controller.saturated
             self._controller = self._new_controller()
-        link = self._claims.claim()
+        self._link = link = self._claims.claim()
         if link is None:
             return None
         session = self._claims.session
@@ -318,12 +312,10 @@ class Daemon:
         self._role.publish_bytes("trace", self._trace.take(time.monotonic_ns(), time.time_ns(), final=True))
         self._claims.release()
         link.close()
+        self._link, self._refused = None, self._refused + link.refused
         if self._claims.by_datagrams:
             self._role.datagrams.close()  # the next claim connects anew: the plant may be another one
         self._status_due = 0
-
-    def _see_recorder(self, appeared: bool) -> None:
-        self._recorded = appeared
 
     def _see_plant(self, appeared: bool) -> None:
         self._plants += 1
@@ -376,36 +368,15 @@ class Daemon:
         self._machine.fire(Trigger.RECALL)
         return Answer(done=True, text=f"{self._role.name} looks for {self._role.vehicle} again")
 
-    def certificate_of(
-        self, law: LawSettings, reference: Reference, settings: ControllerSettings
-    ) -> dict[str, Any] | None:
-        """The certificate of a configuration, for the description; in any thread, before `reconfigure`.
-
-        Raises:
-            UncertifiedError: The theorem must hold and would not, and a session runs: a reload never ends a session.
-        """
-        prospect = self._changes.prospect(law, reference)
-        self._gate.verdict_of(*prospect)
-        self._gate.admit(*prospect, required=settings.require_certificate and bool(self._claims.session))
-        return self._gate.certificate_of(gains_of(law), reference)
-
-    def reconfigure(self, law: LawSettings, reference: Reference, settings: ControllerSettings) -> None:
-        """Take over gains, reference and settings between two ticks."""
-        self._gate.required = settings.require_certificate
-        self._changes.configure(settings)
-        self._changes.adopt(law, reference)
-        self._take(settings)
-
-    def _take(self, settings: ControllerSettings) -> None:
-        self._stale_s = settings.stale_s
-        self._law_timeout_s = settings.law_timeout_s
-        self._claims.auto_arm = settings.auto_arm
-        self._telemetry_every = max(1, round(self._loop.rate_hz / settings.telemetry_rate_hz))
-
     @property
     def _last_computed(self) -> int | None:
         """The last tick that was answered; None before the first."""
         return self._controller.tick_index if self._controller.tick_index >= 0 else None
+
+    def _lacks_recorder(self) -> Literal["gone", "required"] | None:
+        if self._recorder.gone:
+            return "gone"
+        return "required" if self._settings.require_recorder and not self._recorder.present else None
 
     # ── publications ──
 
@@ -423,19 +394,23 @@ class Daemon:
                 role=self._role.role,
                 state=self._machine.state,
                 session=self._claims.session,
-                cause=self._lost if self._machine.state is State.FAULTED else self._gate.blocks,
+                cause=self._lost if self._machine.state is State.FAULTED else None,
                 uptime_s=self._role.uptime_s,
                 ticks=self._ticks,
                 rate_hz=(self._ticks - self._status_ticks) / (now - self._status_time),
                 skipped=self._skipped,
                 received=self._received,
                 sent=self._sent,
-                refused=self._refused + self._controller.refused + self._changes.setpoints.refused,
+                refused=self._refused
+                + self._controller.refused
+                + self._changes.setpoints.refused
+                + (self._link.refused if self._link else 0),
                 stale=self._stale,
                 saturated=self._saturated + self._controller.saturated,
                 age_us=summary(self._age.recent()),
                 timing=report(self._timing) if self._timing else None,
                 notes=self._notes,
+                lacks_recorder=self._lacks_recorder(),
                 gains=record.gains,
                 gains_from=record.gains_from,
                 reference=in_words(record.reference),

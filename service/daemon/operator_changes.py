@@ -1,6 +1,6 @@
 """Operator changes: gains and reference of the running controller, and what sets them.
 
-An operator's request, a stream's set-point, a reloaded configuration or the start of a session. What touches the
+An operator's request, a stream's set-point or the start of a session. What touches the
 controller runs in the loop, between two ticks. Every change is in the trace with the tick from which it holds, so that
 a log can be computed again. `controller.after_restart` decides what a session begins with; the plant gets a record of
 both, for the controller after this one.
@@ -31,13 +31,12 @@ from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import LawSettings
 from aeroloop.service.control.laws.registry import LawError, gains_of, with_gains
 from aeroloop.service.control.reference import FollowError, Limits, Plan
-from aeroloop.service.daemon.certificate_gate import CertificateGate, UncertifiedError
 from aeroloop.service.daemon.session_start import found, remaining
 from aeroloop.service.daemon.setpoint_stream import SetpointStream
 from aeroloop.service.settings import ControllerSettings
 
 START_S: Final = 1.0
-"""Least time to reach a reference that no operator gave a time for, at a session's start or a reload [s]."""
+"""Least time to reach a reference that no operator gave a time for, at a session's start [s]."""
 
 
 def _action_text(reference: Reference) -> str:
@@ -63,13 +62,13 @@ class OperatorChanges:
         reference: The initial reference.
         settings: Limits of references.
         trace: Where changes are recorded.
-        gate: Certificates; None requires and publishes none.
         rolls: Whether the vehicle can roll.
         why_none: Says why no session runs and what to do, where none does.
 
     Attributes:
         record: Gains and reference now, of the next session if none runs; a new object with every change, not with
             every set-point of a stream.
+        configured: The configured reference.
         setpoints: What an operator streams.
     """
 
@@ -82,7 +81,6 @@ class OperatorChanges:
         reference: Reference,
         settings: ControllerSettings,
         trace: TraceWriter,
-        gate: CertificateGate | None = None,
         *,
         rolls: bool,
         why_none: Callable[[], str],
@@ -91,12 +89,11 @@ class OperatorChanges:
         self._why_none = why_none
         self.setpoints = SetpointStream(role)
         self._trace = trace
-        self._gate = gate
         self._rolls = rolls
         self._law = law
         self._gains = gains_of(law)
         self._reference: Reference = reference
-        self._adopted = self._gains, reference
+        self.configured = reference
         self._controller: Controller | None = None
         self._session = ""
         self._k = 0
@@ -104,55 +101,19 @@ class OperatorChanges:
         self._stream = reference if isinstance(reference, Stream) else None
         self._gains_from: Source = "configured"
         self._reference_from: Source = "configured"
-        self._within_s = 0.0
-        self._since_tick = 0
+        self._approach = Approach()
+        self._since_tick = self._gains_since_tick = 0
         self._last: SessionRecord | None = None  # this controller's own last session
-        self.configure(settings)
-        self._note()
-
-    def configure(self, settings: ControllerSettings) -> None:
-        """Take over limits, and what the next session begins with."""
         self._settings = settings
         self._limits = Limits(
             rate=settings.max_reference_rate,
             braking=settings.max_reference_braking,
             tilt=radians(settings.max_reference_tilt_deg),
-            rolls=self._rolls,
+            rolls=rolls,
         )
-        if self._controller is None:
-            if settings.after_restart != "configured":
-                self._hold()
-            elif self._reference_from == "held":
-                self._begin_with(self.configured, "configured")
-
-    def prospect(self, law: LawSettings, reference: Reference) -> tuple[Gains, Reference]:
-        """The gains and the reference after `adopt`, without adopting."""
-        (gains, configured), new = self._adopted, gains_of(law)
-        return new if new != gains else self._gains, reference if reference != configured else self._followed
-
-    @property
-    def configured(self) -> Reference:
-        """The configured reference."""
-        return self._adopted[1]
-
-    def adopt(self, law: LawSettings, reference: Reference) -> None:
-        """Take over the gains and the reference that changed in a reloaded configuration; others stay as they are."""
-        (gains, configured), self._adopted = self._adopted, (gains_of(law), reference)
-        self._law = law
-        if self._adopted[0] != gains:
-            self._gains, self._gains_from = self._adopted[0], "configured"
-            if self._controller is not None:
-                self.set_gains(self._gains, "configured")
-        if reference != configured:
-            if self._controller is not None:
-                try:
-                    self.follow(reference, self.plan(reference), source="configured")
-                except FollowError as error:
-                    self._role.event("fault", f"the configured reference is not followed: {error}", self._session)
-            elif self._settings.after_restart == "configured":
-                self._begin_with(reference, "configured")
+        if settings.after_restart != "configured":
+            self._hold()
         self._note()
-        self.certify()
 
     # ── in the loop ──
 
@@ -160,7 +121,7 @@ class OperatorChanges:
         """Begin a session as configured; `last` is the plant's record. A stream starts at its last set-point."""
         self._controller, self._session = controller, session
         self.setpoints.session = session
-        self._k = self._since_tick = 0
+        self._k = self._since_tick = self._gains_since_tick = 0
         if self._settings.after_restart == "resume":
             self._resume(last or self._last)
         controller.set_gains(self._gains)
@@ -169,7 +130,6 @@ class OperatorChanges:
         self.setpoints.discard()
         self._trace.changes.append(Change(session=session, tick=0, gains=self._gains, reference=self._reference))
         self._note()
-        self.certify()
 
     def end(self) -> None:
         """End the session."""
@@ -189,9 +149,7 @@ class OperatorChanges:
             self.plan(reference)
             with_gains(self._law, last.gains)
             gains = last.gains.over(self._gains)
-            if self._gate is not None:
-                self._gate.admit(gains, reference)
-        except (FollowError, UncertifiedError, LawError) as error:
+        except (FollowError, LawError) as error:
             self._role.event("fault", f"the last session is not resumed: {error}", self._session)
             return
         self._gains, self._gains_from = gains, "resumed"
@@ -201,14 +159,14 @@ class OperatorChanges:
             self._stream, self._reference_from = reference, "resumed"
         else:
             self._begin_with(reference, "resumed")
-        self._within_s = last.within_s
+        self._approach = Approach(last.within_s)
 
     def _hold(self) -> None:
         """Begin the next session with the attitude found."""
         self._begin_with(Hold(), "held")
 
     def _begin_with(self, reference: Reference, source: Source) -> None:
-        self._reference, self._reference_from, self._within_s = reference, source, 0.0
+        self._reference, self._reference_from, self._approach = reference, source, Approach()
         self._stream = reference if isinstance(reference, Stream) else None
 
     def before_tick(self, k: int, frame: bytes) -> None:
@@ -247,52 +205,36 @@ class OperatorChanges:
             target = Plan.of(self._reference)
             limits = self._limits._replace(tilt=pi)  # the body may have been found beyond its own limit
             approach = controller.motion.shortest(target, t, limits, nearest_turn(start, target))
-            approach = approach.at_least(max(START_S, self._within_s))
+            approach = approach.at_least(max(START_S, self._approach.within_s))
             text = f"begins {away:.0f}° away from its reference: approaches within {approach.within_s:.1f} s"
         controller.motion.follow(Plan.of(self._reference), t, approach)
-        self._within_s, self._since_tick = approach.within_s, self._k
+        self._approach, self._since_tick = approach, self._k
         self._record(reference=self._reference, **approach._asdict())
         self._note()
         self._role.event("changed", text, self._session, self._k)
 
     # ── changes: admitted in any thread, applied between two ticks ──
 
-    def admit(self, gains: Gains | None = None, reference: Reference | None = None) -> None:
-        """Check a change against the certificate, where one is required; what is None stays as it is.
-
-        Raises:
-            FollowError: No session runs, or the law has no such gain or bounds it.
-            UncertifiedError: The theorem would not hold.
-        """
+    def admit(self, gains: Gains | None = None) -> None:
+        """Raise FollowError if no session runs, or the law has no such gain or bounds it."""
         self._running()
         if gains is not None:
             try:
                 with_gains(self._law, gains)
             except LawError as error:
                 raise FollowError(str(error)) from None
-            gains = gains.over(self._gains)
-        if self._gate is not None:
-            self._gate.admit(gains or self._gains, reference or self._followed)
 
-    def certify(self) -> None:
-        """Publish the certificate of the present gains and reference."""
-        if self._gate is not None:
-            self._gate.take(self._gains, self._followed)
-
-    @property
-    def _followed(self) -> Reference:
-        """The reference to certify: the stream itself, not its last set-point; of what is held no angle matters."""
-        return self._stream or (Hold() if self._reference_from == "held" else self._reference)
-
-    def set_gains(self, gains: Gains, source: Source = "operator") -> str:
-        """Use other gains from this tick on. Returns them in words; empty if there are none."""
+    def set_gains(self, gains: Gains) -> str:
+        """Use other gains from this tick on, in words; empty if there are none. No event if they change nothing."""
         controller = self._running()
+        before = controller.gains
         controller.set_gains(gains)
-        self._gains, self._gains_from = controller.gains, source
-        self._record(gains=gains)
-        self._note()
         text = ", ".join(f"{name} = {list(value)}" for name, value in gains.named.items())
-        self._role.event("changed", f"gains set: {text or 'nothing'}", self._session, self._k)
+        if controller.gains != before:
+            self._gains, self._gains_from, self._gains_since_tick = controller.gains, "operator", self._k
+            self._record(gains=gains)
+            self._note()
+            self._role.event("changed", f"gains set: {text}", self._session, self._k)
         return text
 
     def plan(self, reference: Reference) -> Plan:
@@ -319,7 +261,7 @@ class OperatorChanges:
         approach = approach.at_least(START_S) if within_s is None else approach.lasting(within_s, self._limits)
         motion.follow(target, t, approach)
         self._reference, self._reference_from = held, source
-        self._within_s, self._since_tick = approach.within_s, self._k
+        self._approach, self._since_tick = approach, self._k
         self._stream = reference if isinstance(reference, Stream) else None
         self.setpoints.begin()
         self._record(reference=held, **approach._asdict())
@@ -364,6 +306,7 @@ class OperatorChanges:
             gains_from=self._gains_from,
             reference=self._stream or self._reference,
             reference_from=self._reference_from,
-            within_s=self._within_s,
             since_tick=self._since_tick,
+            gains_since_tick=self._gains_since_tick,
+            **self._approach._asdict(),
         )

@@ -14,16 +14,14 @@ from aeroloop.service.daemon.operator_changes import OperatorChanges
 
 
 def serve(role: Role, changes: OperatorChanges) -> None:
-    """Serve the requests. FollowError or UncertifiedError is the answer where one is refused."""
+    """Serve the requests. FollowError is the answer where one is refused."""
     vehicle = role.vehicle
 
     def prepare_gains(gains: Gains) -> Callable[[], Answer]:
-        changes.admit(gains=gains)
+        changes.admit(gains)
 
         def apply() -> Answer:
-            changes.admit(gains=gains)  # cached, unless more has changed since
             text = changes.set_gains(gains)
-            changes.certify()
             return Answer(done=True, text=f"{vehicle}: {text or 'no gain was given, so none has changed'}")
 
         return apply
@@ -32,12 +30,10 @@ def serve(role: Role, changes: OperatorChanges) -> None:
         source: Source = "operator" if track.reference is not None else "configured"
         reference = track.reference or changes.configured
         plan = changes.plan(reference)
-        changes.admit(reference=reference)
+        changes.admit()
 
         def apply() -> Answer:
-            changes.admit(reference=reference)
             text = changes.follow(reference, plan, track.within_s, source)
-            changes.certify()
             return Answer(done=True, text=f"{vehicle} {text}")
 
         return apply

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.service.config import Settings
-from aeroloop.service.daemon.reload import reload_on_hangup
 
 
-def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> None:
-    """Run the configured plant end until the role's `stop` is set; `load` reads the configuration again, on SIGHUP.
+def run_plant(role: Role, settings: Settings) -> None:
+    """Run the configured plant end until the role's `stop` is set.
 
     Raises:
         AeroloopError: It cannot run, in one line.
@@ -20,20 +17,15 @@ def run_plant(role: Role, settings: Settings, load: Callable[[], Settings]) -> N
     if plant.via == "can":
         from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 
-        bridge = Bridge(role, loop, wire, plant, settings.can)
-        reload_on_hangup(role, settings, load, lambda new: bridge.reconfigure(new.plant))
-        bridge.run()
+        Bridge(role, loop, wire, plant, settings.can).run()
         return
     if plant.via == "emulator":
         from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 
-        emulator = EmulatorOnZenoh(role, loop, wire, plant)
-        reload_on_hangup(role, settings, load, lambda new: emulator.reconfigure(new.plant))
-        emulator.run()
+        EmulatorOnZenoh(role, loop, wire, plant).run()
         return
-    from aeroloop.plant_emulator.hosts.quanser.board import BoardDriver
-    from aeroloop.plant_emulator.hosts.zenoh_front import ZenohFront
+    from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
+    from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 
     driver = BoardDriver(loop, wire, plant, role.stop)
-    reload_on_hangup(role, settings, load, lambda new: driver.reconfigure(new.plant))
-    driver.run(ZenohFront(role, loop, driver.endpoint))
+    driver.run(ZenohNetwork(role, loop, driver.endpoint, plant.state_directory))

@@ -23,4 +23,3 @@ def run_router(role: Role) -> None:
         if stopped:
             return
         role.stop.wait(STATUS_EVERY_S)
-        role.take_inbox()

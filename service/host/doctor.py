@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,10 @@ from aeroloop.protocol.runtime.host_facts import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming, summary
-from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError
+from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
+from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
+from aeroloop.protocol.transport.refusal import PLAIN_S, refusal
+from aeroloop.protocol.transport.security import Identity
 from aeroloop.protocol.wire.loop import LoopSettings
 
 CHECK_S: Final = 5.0
@@ -48,7 +52,10 @@ class Diagnosis(BaseModel, frozen=True):
 
 
 def diagnose(
-    loop: LoopSettings, progress: Callable[[float], None] | None = None, keys: Path | None = None
+    loop: LoopSettings,
+    progress: Callable[[float], None] | None = None,
+    keys: Path | None = None,
+    network: NetworkSettings | None = None,
 ) -> Diagnosis:
     """Check the settings and certificates, then run the trial.
 
@@ -56,8 +63,12 @@ def diagnose(
         loop: The rate, and how the daemons are set up.
         progress: Called five times a second with the trial's elapsed time [s].
         keys: Directory of this host's certificates; None if there is none.
+        network: Where to try the certificates; None: nowhere.
+
+    Raises:
+        SecurityError, CertificateError: The network's links cannot be secured.
     """
-    findings = [*_settings(), *(_certificates(keys) if keys else ())]
+    findings = [*_settings(), *(_certificates(keys) if keys else ()), *(refused(network) if network else ())]
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
     awake = "let the user write to it, or use tuned's profile latency-performance"
     findings += [
@@ -103,8 +114,35 @@ def _certificates(directory: Path) -> Iterator[Finding]:
             what=row.file,
             good=row.problem is None and days is not None and days >= SOON_DAYS,
             found="no certificate of a role" if days is None else f"{days:.0f} days left",
-            advice=row.problem or f"renew it: `aeroloop host keys renew {row.file.removesuffix('.pem')}`, and restart",
+            advice=row.problem or "move it and its key away, `aeroloop host keys issue` it anew, and restart",
         )
+
+
+def refused(network: NetworkSettings) -> list[Finding]:
+    """Try each usable certificate of this host at every endpoint of the network, all at once: where it is refused.
+
+    Raises:
+        SecurityError, CertificateError: The network's links cannot be secured.
+    """
+    from aeroloop.service.host.keys import show
+
+    directory = network.security.folder
+    if directory is None:
+        return [Finding(what="network", good=True, found="no certificates, so none is refused")]
+    found = [read_certificate(directory / row.file) for row in show(directory)[1:] if row.problem is None]
+    tries = [
+        (place, certificate)
+        for certificate in found
+        for settings in [protected(network, Identity((certificate.role,), certificate.vehicle)).settings]
+        for place in [*settings.places, *settings.connect]
+    ]
+    with ThreadPoolExecutor(max(1, len(tries))) as pool:
+        lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))
+    return [
+        Finding(what=each.file.name, good=False, found=f"refused at {place}", advice=line)
+        for (place, each), line in zip(tries, lines, strict=True)
+        if line
+    ] or [Finding(what="network", good=True, found=f"none of {len(found)} certificates is refused")]
 
 
 def _settings() -> list[Finding]:

@@ -14,23 +14,24 @@ SILENT_S: Final = 3.0
 LATE_SHARE: Final = 0.01
 """A loop that skipped more than this share of its ticks in the last 10 s is late."""
 NEEDED: Final = ("controller", "plant")
-"""Roles that every vehicle needs; a recorder may be absent."""
+"""Roles that every vehicle needs; a recorder may be absent, unless it was there or is required."""
 
 
 class Trouble(NamedTuple):
     """Something that is wrong.
 
     Attributes:
-        kind: tripped (a plant), faulted (a controller), not recording (a recorder), silent (no status for `SILENT_S`,
-            or a process that accepts connections and does not answer), late (more than `LATE_SHARE` of the last 10 s'
-            ticks skipped, or commands that take longer than a period at the 99th percentile), missing (a controller or
-            a plant of a vehicle that has another role).
+        kind: tripped (a plant), faulted (a controller), not recording or lossy (a recorder), silent (no status for
+            `SILENT_S`, or a process that accepts connections and does not answer), late (more than `LATE_SHARE` of the
+            last 10 s' ticks skipped, or commands that take longer than a period at the 99th percentile), missing (a
+            controller or a plant of a vehicle that has another role; a recorder that was there or is required), not
+            kept (a stop or a trip of a plant, on its disk).
         vehicle: Its name; None for a process that does not answer.
         role: Its role, likewise.
         text: One line.
     """
 
-    kind: Literal["tripped", "faulted", "not recording", "silent", "late", "missing"]
+    kind: Literal["tripped", "faulted", "not recording", "lossy", "silent", "late", "missing", "not kept"]
     vehicle: str | None
     role: str | None
     text: str
@@ -45,6 +46,13 @@ def troubles(found: Gathered) -> list[Trouble]:
                 wrong.append(Trouble("missing", vehicle, role, f"{vehicle} has no {role}"))
             else:
                 wrong += list(_of_role(vehicle, role, roles[role]))[:1]
+        lacking = {status.lacks_recorder for status in roles.values()}
+        if "gone" in lacking:
+            text = f"{vehicle}'s recorder is gone: it was there, and did not stop in order"
+            wrong.append(Trouble("missing", vehicle, "recorder", text))
+        elif "required" in lacking:
+            text = f"{vehicle} has no recorder, and its controller requires one (controller.require_recorder)"
+            wrong.append(Trouble("missing", vehicle, "recorder", text))
     return wrong + [Trouble("silent", None, None, line) for line in found.silent]
 
 
@@ -53,12 +61,17 @@ def _of_role(vehicle: str, role: str, status: Status) -> Iterator[Trouble]:
     if status.age_s > SILENT_S:
         yield Trouble("silent", vehicle, role, f"{name}: no status for {status.age_s:.0f} s")
     if status.state == PlantState.TRIPPED:
-        yield Trouble("tripped", vehicle, role, f"{name} tripped: {status.cause}; `aeroloop op arm` arms it")
+        forgotten = f"; a restart would forget it: {status.unkept}" if status.unkept else ""
+        yield Trouble("tripped", vehicle, role, f"{name} tripped: {status.cause}; `aeroloop op arm` arms it{forgotten}")
+    if status.unkept:
+        yield Trouble("not kept", vehicle, role, f"{name} would forget a stop at a restart: {status.unkept}")
     if status.state == ControllerState.FAULTED:
         why = f": {status.cause}" if status.cause else ""
         yield Trouble("faulted", vehicle, role, f"{name} faulted{why}; `aeroloop op arm` lets it claim again")
     if status.state == NOT_RECORDING:
         yield Trouble("not recording", vehicle, role, f"{name} records nothing: {status.cause}")
+    if status.lost:
+        yield Trouble("lossy", vehicle, role, f"{name} lost {status.lost} messages: its log lacks them")
     period = status.timing.recent_period if status.timing else None
     if period is None:
         return

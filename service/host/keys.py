@@ -1,40 +1,64 @@
-"""Keys: makes a private authority in a directory and issues, renews and lists the certificates of a host's roles.
+"""Keys: makes a private authority in a directory, and issues and lists the certificates of roles. Keys are EC P-256.
 
-The authority's key stays in the directory where `init` made it. On another host a request is made, and only that
-travels: `request` there, `issue_requested` here, and the certificate back, with `ca.pem`. A key is a new file of mode
-0600, and nothing is overwritten: `renew` keeps what it replaces under a name with the old certificate's fingerprint.
+The authority's key stays in the directory where `init` made it. A key is a new file of mode 0600, and nothing is
+overwritten. Imports `cryptography` at once, so it is itself imported where it is used.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, cast
 from uuid import uuid4
 
-from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePublicKey
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric.ec import (
+    SECP256R1,
+    EllipticCurvePrivateKey,
+    EllipticCurvePublicKey,
+    generate_private_key,
+)
 from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.x509.oid import NameOID
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from pydantic import BaseModel, Field
 
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.certificate import (
     AUTHORITY,
+    OF_ONE_VEHICLE,
     ROLES,
     CertificateError,
     check,
+    common_name,
     file_of,
     load,
     names_of,
     read_certificate,
-    read_common_name,
 )
-from aeroloop.service.host import authority
 
+KEY: Final = "ca.key"
 DAYS: Final = 90
 """Lifetime of a certificate. Why so short: Zenoh has no revocation lists, so a stolen key is good until it expires."""
 AUTHORITY_DAYS: Final = 3650
+_EARLIER: Final = timedelta(hours=1)
+"""A certificate is valid from so long before it is issued: hosts' clocks differ."""
+_LONGEST: Final = 64
+"""Characters of a name in a certificate, by RFC 5280."""
+_USES: Final = (
+    "digital_signature",
+    "content_commitment",
+    "key_encipherment",
+    "data_encipherment",
+    "key_agreement",
+    "key_cert_sign",
+    "crl_sign",
+    "encipher_only",
+    "decipher_only",
+)
 
 
 class KeyFile(BaseModel, frozen=True):
@@ -56,13 +80,13 @@ def init(directory: Path, days: int = AUTHORITY_DAYS) -> Path:
     Raises:
         CertificateError: There is one, or the directory cannot be written.
     """
-    certificate, secret = directory / AUTHORITY, directory / authority.KEY
+    certificate, secret = directory / AUTHORITY, directory / KEY
     _make(directory)
     _refuse_existing(certificate, secret)
-    key = authority.new_key()
-    made = authority.new_authority(key, days)
-    _write(secret, authority.pem(key))
-    _write(certificate, authority.pem(made), 0o644)
+    key = generate_private_key(SECP256R1())
+    made = _new_authority(key, days)
+    _write(secret, _pem(key))
+    _write(certificate, _pem(made), 0o644)
     return certificate
 
 
@@ -79,77 +103,13 @@ def issue(directory: Path, role: str, name: str, vehicle: str | None = None, day
     Raises:
         CertificateError: Role, name or vehicle will not do; a file exists; the authority's key is not here.
     """
-    whose, file = authority.subject(role, name, vehicle), file_of(directory, role, vehicle)
+    whose, file = _subject(role, name, vehicle), file_of(directory, role, vehicle)
     _refuse_existing(file, file.with_suffix(".key"))
-    key = authority.new_key()
-    made = authority.sign(directory, whose, key.public_key(), days)
-    _write(file.with_suffix(".key"), authority.pem(key))
-    _write(file, authority.pem(made), 0o644)
+    key = generate_private_key(SECP256R1())
+    made = _sign(directory, whose, key.public_key(), days)
+    _write(file.with_suffix(".key"), _pem(key))
+    _write(file, _pem(made), 0o644)
     return file
-
-
-def request(directory: Path, role: str, name: str, vehicle: str | None = None) -> Path:
-    """Make a key for a role and a request for its certificate. Returns the request's file, `ROLE.VEHICLE.csr`.
-
-    Arguments and errors are as of `issue`, but for the authority.
-    """
-    whose, file = authority.subject(role, name, vehicle), file_of(directory, role, vehicle)
-    out = file.with_suffix(".csr")
-    _make(directory)
-    _refuse_existing(file, file.with_suffix(".key"), out)
-    key = authority.new_key()
-    _write(file.with_suffix(".key"), authority.pem(key))
-    _write(out, authority.pem(authority.request(whose, key)), 0o644)
-    return out
-
-
-def issue_requested(directory: Path, file: Path, days: int = DAYS) -> Path:
-    """Issue the certificate that a request asks for. Returns its file, beside the request.
-
-    Raises:
-        CertificateError: The file is no request of a role, is named as another role's, or the authority's key is not
-            here.
-    """
-    whose, public = authority.read_request(file)
-    asks = str(whose.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-    out = file.with_suffix(".pem")
-    _refuse_existing(out)
-    if out != file_of(file.parent, *cast(tuple[str, str | None], read_common_name(asks))):
-        raise CertificateError(f"{file} asks for a certificate of {asks}, which its name does not say: not signed")
-    _write(out, authority.pem(authority.sign(directory, whose, public, days)), 0o644)
-    return out
-
-
-def renew(directory: Path, which: Sequence[str] = (), days: int = DAYS, *, new_key: bool = False) -> list[Path]:
-    """Renew certificates for the same keys. Where the authority's key is not, make requests for that instead.
-
-    Args:
-        directory: Where they are.
-        which: Roles, or stems of files such as `plant.aero`; all of the directory if none.
-        days: How long they are valid.
-        new_key: Make new keys, too; only where the authority's key is.
-
-    Returns:
-        The new certificates, or the requests.
-
-    Raises:
-        CertificateError: There is none of a given name, or one cannot be renewed.
-    """
-    names = {file: {file.stem, file.stem.partition(".")[0]} for file in _certificates(directory)}
-    for each in which:
-        if not any(each in own for own in names.values()):
-            have = ", ".join(file.stem for file in names) or "none"
-            raise CertificateError(f"no certificate of {each} in {directory}; there is {have}")
-    chosen = [file for file, own in names.items() if not which or own & set(which)]
-    if not chosen:
-        raise CertificateError(f"no certificates in {directory}: `aeroloop host keys issue` makes one")
-    if (directory / authority.KEY).exists():
-        return [_renew(directory, file, days, new_key=new_key) for file in chosen]
-    if new_key:
-        raise CertificateError(
-            f"{directory / authority.KEY} is not here: for a new key, move certificate and key away and request another"
-        )
-    return [_request_again(file) for file in chosen]
 
 
 def show(directory: Path) -> list[KeyFile]:
@@ -201,25 +161,81 @@ def _certificates(directory: Path) -> Iterator[Path]:
     return (file for file in sorted(directory.glob("*.pem")) if file.stem.partition(".")[0] in ROLES)
 
 
-def _renew(directory: Path, file: Path, days: int, *, new_key: bool) -> Path:
-    old = read_certificate(file)
-    whose, kept = authority.subject(old.role, old.name, old.vehicle), f".{old.fingerprint[:8]}"
-    key = authority.new_key() if new_key else None
-    public = key.public_key() if key else cast(EllipticCurvePublicKey, load(file).public_key())
-    made = authority.sign(directory, whose, public, days)
-    if key:
-        _replace(old.key, authority.pem(key), 0o600, kept)
-    _replace(file, authority.pem(made), 0o644, kept)
-    return file
+def _subject(role: str, name: str, vehicle: str | None) -> x509.Name:
+    if role not in ROLES:
+        raise CertificateError(f"there is no role {role!r}; roles are {', '.join(ROLES)}")
+    if vehicle is None and role in OF_ONE_VEHICLE:
+        raise CertificateError(f"a {role}'s certificate is of one vehicle: name it with --vehicle V")
+    if vehicle is not None and re.fullmatch(topics.NAME, vehicle) is None:
+        raise CertificateError(f"{vehicle!r} cannot name a vehicle: letters, digits, '.', '_' and '-'")
+    cn = common_name(role, vehicle)
+    if len(cn) > _LONGEST:
+        raise CertificateError(f"{cn} is too long for a certificate: {_LONGEST} characters at most")
+    if not (name.isprintable() and 0 < len(name) <= _LONGEST):
+        raise CertificateError(f"NAME is a host or a person, in 1 to {_LONGEST} printable characters")
+    return x509.Name(
+        [x509.NameAttribute(NameOID.COMMON_NAME, cn), x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, name)]
+    )
 
 
-def _request_again(file: Path) -> Path:
-    old = read_certificate(file)
-    out = file.with_suffix(".csr")
-    if not out.exists():  # one that is there is of the same key, and still good
-        whose = authority.subject(old.role, old.name, old.vehicle)
-        _write(out, authority.pem(authority.request(whose, authority.read_key(old.key))), 0o644)
-    return out
+def _new_authority(key: EllipticCurvePrivateKey, days: int) -> x509.Certificate:
+    """An authority under a name of its own: one that replaces another must not be taken for it."""
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"aeroloop authority {uuid4().hex[:8]}")])
+    until = datetime.now(UTC) + timedelta(days=days)
+    return _signed(key, name, name, key.public_key(), until, authority=True)
+
+
+def _sign(directory: Path, whose: x509.Name, public: EllipticCurvePublicKey, days: int) -> x509.Certificate:
+    """A certificate for a key, of the authority in a directory; it ends with the authority's at the latest."""
+    secret = directory / KEY
+    if not secret.exists():
+        raise CertificateError(f"{secret} is not here: it stays where `aeroloop host keys init` made it; issue there")
+    key, authority = _read_key(secret), load(directory / AUTHORITY)
+    if authority.public_key() != key.public_key():
+        raise CertificateError(f"{secret} is not the key of {AUTHORITY} beside it")
+    now = datetime.now(UTC)
+    if authority.not_valid_after_utc <= now:
+        raise CertificateError(f"{directory / AUTHORITY} has expired: make a new authority in another directory")
+    until = min(now + timedelta(days=days), authority.not_valid_after_utc)
+    return _signed(key, authority.subject, whose, public, until)
+
+
+def _signed(
+    key: EllipticCurvePrivateKey,
+    issuer: x509.Name,
+    whose: x509.Name,
+    public: EllipticCurvePublicKey,
+    until: datetime,
+    *,
+    authority: bool = False,
+) -> x509.Certificate:
+    begin = datetime.now(UTC) - _EARLIER
+    uses = dict.fromkeys(_USES, False) | {"key_cert_sign" if authority else "digital_signature": True}
+    both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # a peer connects and listens
+    builder = (
+        x509.CertificateBuilder(issuer, whose, public, x509.random_serial_number(), begin, until)
+        .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
+        .add_extension(x509.KeyUsage(**uses), critical=True)
+    )
+    if not authority:
+        builder = builder.add_extension(x509.ExtendedKeyUsage(both), critical=False)
+    return builder.sign(key, SHA256())
+
+
+def _read_key(file: Path) -> EllipticCurvePrivateKey:
+    """Read a private key. Raises CertificateError."""
+    try:
+        return cast(EllipticCurvePrivateKey, load_pem_private_key(file.read_bytes(), None))
+    except OSError as error:
+        raise CertificateError(f"{file} cannot be read: {error.strerror}") from None
+    except (ValueError, TypeError):  # TypeError: it is encrypted
+        raise CertificateError(f"{file} is no private key in PEM without a password") from None
+
+
+def _pem(made: x509.Certificate | EllipticCurvePrivateKey) -> bytes:
+    if isinstance(made, EllipticCurvePrivateKey):
+        return made.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    return made.public_bytes(Encoding.PEM)
 
 
 def _make(directory: Path) -> None:
@@ -234,7 +250,7 @@ def _make(directory: Path) -> None:
 def _refuse_existing(*files: Path) -> None:
     for file in files:
         if os.path.lexists(file):
-            raise CertificateError(f"{file} exists, and is not overwritten: renew it, or move it away")
+            raise CertificateError(f"{file} exists, and is not overwritten: move it away first")
 
 
 def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
@@ -252,15 +268,3 @@ def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
     except BaseException:
         file.unlink()
         raise
-
-
-def _replace(file: Path, content: bytes, mode: int, kept: str) -> None:
-    """Replace a file at once, and keep the old one beside it under a name with another ending."""
-    new = file.with_name(f"{file.name}.{uuid4().hex[:8]}")
-    _write(new, content, mode)
-    try:
-        os.link(file, file.with_name(f"{file.name}{kept}"))
-        new.replace(file)
-    except OSError as error:
-        new.unlink(missing_ok=True)
-        raise CertificateError(f"cannot replace {file}: {error.strerror}") from None

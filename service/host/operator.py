@@ -7,6 +7,9 @@ is no role delays none of them, and is named by its address and, on this host, b
 
 from __future__ import annotations
 
+import getpass
+import os
+import socket
 import time
 from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
@@ -20,9 +23,9 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
+from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, Visit, visit
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.places import is_own
 from aeroloop.protocol.transport.refusal import refusal
 from aeroloop.protocol.transport.security import READER, Identity
 
@@ -143,7 +146,7 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
                     here.session.get(
                         topics.key("stop", address.vehicle),
                         received,
-                        payload=Request().encode(),
+                        payload=Request(by=_user()).encode(),
                         timeout=wait_s,
                         target=zenoh.QueryTarget.ALL,
                         consolidation=zenoh.ConsolidationMode.NONE,
@@ -159,6 +162,15 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
     if not answers and not failures:
         failures.append(_nobody(network, "no plant" if vehicle == "*" else f"no plant of {vehicle}"))
     return Stopped([text for texts in answers.values() for text in texts], failures)
+
+
+def _user() -> str:
+    """This user, for people to read."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a container's user without a name
+        user = f"uid {os.getuid()}"
+    return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:64]
 
 
 def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str]:
@@ -215,7 +227,7 @@ def _unanswered(here: Visit, but: Sequence[str] = (), *, why: bool = True) -> li
     """
     lines = []
     for place in here.silent():
-        process = listener(place) if is_own(place) else None
+        process = listener(place) if Endpoint.parse(place).is_own else None
         if process is None or process.role not in but:
             name = f"the {process}" if process else "the process"
             refused = refusal(place, here.certificate) if why and here.certificate else None

@@ -40,7 +40,6 @@ Wants=network-online.target
 [Service]
 Type=notify
 ExecStart={command}
-ExecReload=/bin/kill -HUP $MAINPID
 Restart=on-failure
 RestartSec=1
 WatchdogSec=5
@@ -91,8 +90,13 @@ def units_of(settings: Settings) -> list[str]:
 
 def unit(name: str, source: Source) -> str:
     """The unit of one daemon. Raises KeyError for a name that is not in `UNITS`."""
-    words = [*_executable(), name, *source.options]
+    # systemd starts a plant again by itself, so it is unarmed then; a --set of the user's own comes later and wins.
+    unarmed = ["--set", "plant.armed_at_start=false"] if name == "plant" else []
+    words = [*_executable(), name, *unarmed, *source.options]
     rights = _user(source)
+    if name == "plant":
+        configured = source.settings.plant.state_directory
+        rights.append(f"ReadWritePaths={_quoted(str(configured))}" if configured else "StateDirectory=aeroloop")
     if name == "recorder":
         words += ["--set", "recorder.directory=%L/aeroloop"]
         rights += ["LogsDirectory=aeroloop", "CapabilityBoundingSet="]

@@ -1,1 +1,1 @@
-"""Experiments in lockstep: one loop, the paper's tables, calibration, error against bits, the demo, the soak."""
+"""Experiments in lockstep: one loop, the paper's tables, calibration, error against bits, the demo."""

@@ -11,16 +11,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, NamedTuple, get_args
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.transmit import Policy
 from aeroloop.service.config import Settings
-from aeroloop.service.figures import Figures
+from aeroloop.service.figures import Figures, Floats, Integers, StreamFigures
 from aeroloop.service.lab.burden_grid import SENSORS, BurdenCell, BurdenError, cell_settings
-from aeroloop.service.lab.experiment import PATH, LoopEndedError, experiment, heartbeat_of, paths
-from aeroloop.service.lab.traffic import Traffic, codes_of, frames_of, sent_ticks, traffic
+from aeroloop.service.lab.bus import BITRATE, bus_bits, classic_frames
+from aeroloop.service.lab.experiment import LoopEndedError, experiment, heartbeat_of, sent_ticks
 from aeroloop.service.lab.workers import PROCESSES, Workers
-from aeroloop.service.lab.zenoh_bytes import LinkBytes, count_bytes
 
 POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
@@ -36,13 +37,21 @@ class Ratios(BaseModel):
     can_bits_per_s: float
 
 
-class LinkRates(BaseModel):
-    """Bytes a second that a Zenoh link carried, counted; headers of TCP and IP not included."""
+class Traffic(StreamFigures):
+    """Traffic of one direction under one policy, over the whole run."""
 
-    model_config = ConfigDict(frozen=True)
-
-    measurement: float
-    command: float
+    frames_per_s: float
+    bits_per_s: float = Field(description="payload bits, padding included")
+    changes_per_s: float = Field(description="changes of a component's code, of all components together")
+    component_changes_per_s: list[float] = Field(description="the same, one by one: ε₁ ε₂ ε₃ ω₁ ω₂ ω₃, or u in order")
+    mean_interval_ms: float | None = Field(description="from one frame to the next; null for less than two [ms]")
+    least_interval_ms: float | None = Field(description="the least of these times [ms]")
+    can_frames: int = Field(
+        description="classic CAN frames that a frame fills; more than one is a split, without any header, of what "
+        "this project sends as one CAN FD frame"
+    )
+    can_bits_per_s: float = Field(description="bits on a classic CAN bus, with worst-case stuffing")
+    can_load: float = Field(description="share of a classic bus of 1 Mbit/s; above 1 it does not fit")
 
 
 class Point(BaseModel):
@@ -65,7 +74,6 @@ class Point(BaseModel):
     bits_per_s: float | None = Field(default=None, description="payload bits of both directions, padding included")
     can_bits_per_s: float | None = Field(default=None, description="of both directions, as `Traffic` has it")
     can_load: float | None = Field(default=None, description="of both directions; above 1 it does not fit")
-    zenoh_bytes_per_s: LinkRates | None = Field(default=None, description="counted for a few cells only")
     against_float64: Ratios | None = None
     pareto: bool = Field(default=False, description="whether it is on the front of z_track against bits_per_s")
     reason: str | None = Field(default=None, description="why there are no figures")
@@ -96,7 +104,6 @@ class Burden(BaseModel):
     heartbeat_s: float = Field(description="on_change: the longest from one frame to the next [s]")
     counter_bits: int = Field(description="bits of the counter in each frame")
     sensors: dict[str, str] = Field(description="meaning of each name")
-    path: str = Field(description=PATH)
     points: list[Point]
 
     def under(self, sensors: str) -> list[Point]:
@@ -109,8 +116,6 @@ class Observation(NamedTuple):
 
     figures: Figures | None
     traffic: dict[Policy, tuple[Traffic, Traffic]]  # measurements and commands
-    zenoh: dict[Policy, LinkBytes]  # bytes on a Zenoh link, if they were counted
-    path: str
     reason: str | None = None
 
 
@@ -134,7 +139,7 @@ def measure_burden(
         BurdenError: The loop trips with float64, or float64 has no error to compare with; or a cell does not fit the
             configuration.
     """
-    jobs = [(cell_settings(settings, cell).description(), duration_s, cell.counted) for cell in cells]
+    jobs = [(cell_settings(settings, cell).description(), duration_s) for cell in cells]
     report = progress or (lambda _done, _total: None)
     report(0, len(jobs))
     with Workers(engine) as workers:
@@ -147,12 +152,11 @@ def measure_burden(
         heartbeat_s=heartbeat_of(settings) * settings.loop.period,
         counter_bits=settings.wire.counter_bits,
         sensors={name: SENSORS[name].text for name in sensors},
-        path=paths(result.path for result in results),
         points=[point for name in sensors for point in _beside_float64(points, name)],
     )
 
 
-def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observation:
+def observe(config: dict[str, Any], duration_s: float) -> Observation:
     """Run one cell for `duration_s` [s]; `config` dumps a configuration that sends at every tick."""
     settings = Settings.model_validate(config)
     wire, period, heartbeat = settings.wire, settings.loop.period, heartbeat_of(settings)
@@ -161,21 +165,60 @@ def observe(config: dict[str, Any], duration_s: float, counted: bool) -> Observa
     try:
         found = experiment(settings, duration_s, watch=lambda _k, *both: frames.append(both))
     except LoopEndedError as error:
-        return Observation(None, {}, {}, "frames", str(error))
+        return Observation(None, {}, str(error))
     if found.course is not None:
         codes = [found.course.measured, found.course.commanded]
     else:
         codes = [codes_of(each, kind) for each, kind in zip(zip(*frames, strict=True), kinds, strict=True)]
     rates: dict[Policy, tuple[Traffic, Traffic]] = {}
-    zenoh: dict[Policy, LinkBytes] = {}
     for policy in POLICIES:
-        out, inp = sent = [sent_ticks(each, policy, heartbeat) for each in codes]
+        sent = [sent_ticks(each, policy, heartbeat) for each in codes]
         measurement, command = (traffic(*each, period) for each in zip(codes, kinds, sent, strict=True))
         rates[policy] = measurement, command
-        if counted:
-            measurements, commands = (frames_of(each, kind) for each, kind in zip(codes, kinds, strict=True))
-            zenoh[policy] = count_bytes(settings.network, [measurements[k] for k in out], [commands[k] for k in inp])
-    return Observation(found.figures, rates, zenoh, found.path)
+    return Observation(found.figures, rates)
+
+
+def codes_of(frames: Sequence[bytes], kind: FrameFormat) -> Floats:
+    """Codes of frames. Shape (frames, components).
+
+    Raises:
+        ValueError: A frame is malformed.
+    """
+    unpacked = [kind.unpack(frame) for frame in frames]
+    if None in unpacked:
+        raise ValueError("a frame is malformed")
+    return np.array([content[1] for content in unpacked if content is not None], float)
+
+
+def traffic(codes: Floats, kind: FrameFormat, sent: Integers, period: float) -> Traffic:
+    """The traffic of one direction.
+
+    Args:
+        codes: Codes at every tick from 0 on. Shape (ticks, components).
+        kind: Format of the frames.
+        sent: Ticks at which a frame was sent.
+        period: Time between ticks [s].
+
+    Raises:
+        ValueError: There are no ticks.
+    """
+    if not len(codes):
+        raise ValueError("no ticks, no traffic")
+    duration = len(codes) * period
+    changes = np.count_nonzero(np.diff(codes, axis=0), axis=0) / duration
+    intervals = np.diff(sent) * (period * 1e3)
+    on_bus = len(sent) * bus_bits(kind.size) / duration
+    return Traffic(
+        frames_per_s=len(sent) / duration,
+        bits_per_s=len(sent) * kind.size * 8 / duration,
+        changes_per_s=float(changes.sum()),
+        component_changes_per_s=changes.tolist(),
+        mean_interval_ms=float(intervals.mean()) if len(intervals) else None,
+        least_interval_ms=float(intervals.min()) if len(intervals) else None,
+        can_frames=len(classic_frames(kind.size)),
+        can_bits_per_s=on_bus,
+        can_load=on_bus / BITRATE,
+    )
 
 
 def pareto_front(costs: Iterable[tuple[float, float]]) -> list[bool]:
@@ -190,7 +233,6 @@ def _points(cell: BurdenCell, found: Observation) -> list[Point]:
         return [Point(**choice, transmit=policy, reason=found.reason) for policy in POLICIES]
     points = []
     for policy, (measurement, command) in found.traffic.items():
-        counted, seconds = found.zenoh.get(policy), found.figures.duration_s
         points.append(
             Point(
                 **choice,
@@ -202,8 +244,6 @@ def _points(cell: BurdenCell, found: Observation) -> list[Point]:
                 bits_per_s=measurement.bits_per_s + command.bits_per_s,
                 can_bits_per_s=measurement.can_bits_per_s + command.can_bits_per_s,
                 can_load=measurement.can_load + command.can_load,
-                zenoh_bytes_per_s=counted
-                and LinkRates(measurement=counted.measurement / seconds, command=counted.command / seconds),
             )
         )
     return points

@@ -24,8 +24,6 @@ _Bits = tuple[int | None, int | None]  # out and in; None is float64
 
 BITS: Final = ("6/4", "7/5", "8/6", "9/7", "10/8", "12/10")
 FLOAT64: Final = (None, None)
-COUNTED: Final = ((8, 6), FLOAT64)
-"""Bits out and in of the cells counted on a Zenoh link: the paper's case, and the baseline."""
 QUANTIZERS: Final[dict[str, tuple[Kind, Kind, Kind]]] = {
     **{kind: (kind, kind, kind) for kind in get_args(Kind)},
     "hysteresis-rate": ("uniform", "hysteresis-uniform", "uniform"),
@@ -72,7 +70,6 @@ class BurdenCell(NamedTuple):
     bits_in: int | None
     quantizer: str | None
     sensors: str
-    counted: bool
 
 
 def grid(
@@ -94,13 +91,8 @@ def grid(
     pairs = [pair for pair in dict.fromkeys(_pair(text) for text in bits or BITS) if pair != FLOAT64]
     kinds = _chosen("--quantizer", quantizers, QUANTIZERS)
     levels = _chosen("--sensors", sensors, SENSORS)
-    counted_with = "encoders" if "encoders" in levels else levels[0]
     choices: list[tuple[_Bits, str | None]] = [*product(pairs, kinds), (FLOAT64, None)]
-    cells = [
-        BurdenCell(*pair, kind, level, pair in COUNTED and kind in (None, kinds[0]) and level == counted_with)
-        for level in levels
-        for pair, kind in choices
-    ]
+    cells = [BurdenCell(*pair, kind, level) for level in levels for pair, kind in choices]
     for cell in cells:
         cell_settings(settings, cell)
     return cells

@@ -31,8 +31,6 @@ HEADER: Final = (
     "kbit/s",
     "CAN kbit/s",
 )
-STAMP_BYTES: Final = 47
-"""Zenoh's time of publication (26 bytes) and source info (21 bytes); counted with Zenoh 1.10."""
 _PIPE_WIDTH: Final = 160
 _BLOCKS: Final = {"every tick": (0, 1, 2, 3, 5, 6), "on change": (0, 1, 7, 8, 10, 11)}
 """Columns of each block, where not all fit beside each other."""
@@ -54,7 +52,7 @@ def burden_table(burden: Burden) -> None:
             for policy, columns in _BLOCKS.items():
                 console.print(Text(f"\n{policy}", style="bold"))
                 console.print(_table(rows, columns))
-        for line in _counted(burden, name):
+        for line in _reasons(burden, name):
             console.print(Text(line), soft_wrap=not console.is_terminal)
         console.print()
     for line in _notes(burden):
@@ -87,7 +85,7 @@ def markdown(burden: Burden) -> str:
         lines += [f"**Sensors `{name}`**: {text}", "", f"| {' | '.join(HEADER)} |"]
         lines += ["|" + "---|" * 2 + "--:|" * (len(HEADER) - 2)]
         lines += [f"| {' | '.join(row)} |" for row in _rows(burden, name)]
-        lines += ["", *_counted(burden, name), ""]
+        lines += ["", *_reasons(burden, name), ""]
     return "\n".join([*lines, "\n\n".join(_notes(burden))])
 
 
@@ -145,18 +143,9 @@ def _ms(interval: float | None, digits: str = ".1f") -> str:
     return "–" if interval is None else f"{interval:{digits}}"
 
 
-def _counted(burden: Burden, sensors: str) -> Iterator[str]:
-    """Bytes counted on a Zenoh link, and the reason of each empty row."""
-    points = burden.under(sensors)
-    when = {"periodic": "every tick", "on_change": "on change"}
-    counted = [
-        f"{_name(point)} {when[point.transmit]} {rates.measurement / 1e3:.1f} + {rates.command / 1e3:.1f}"
-        for point in points
-        if (rates := point.zenoh_bytes_per_s) is not None
-    ]
-    if counted:
-        yield f"Counted on a Zenoh link, kB/s: {'; '.join(counted)}."
-    for point in points:
+def _reasons(burden: Burden, sensors: str) -> Iterator[str]:
+    """The reason of each empty row."""
+    for point in burden.under(sensors):
         if point.reason is not None and point.transmit == "periodic":
             yield f"{_name(point)}: {point.reason}."
 
@@ -166,9 +155,9 @@ def _name(point: Point) -> str:
 
 
 def _notes(burden: Burden) -> Iterator[str]:
-    rate, bits, saved = burden.rate_hz, burden.counter_bits, STAMP_BYTES * burden.rate_hz / 1e3
+    rate, bits = burden.rate_hz, burden.counter_bits
     yield (
-        f"{burden.duration_s:g} s each, path: {burden.path}; of two numbers the first is measurements, the second "
+        f"{burden.duration_s:g} s each; of two numbers the first is measurements, the second "
         "commands; × and % are of float64 at every tick; ★ is on the Pareto front of z_track against payload bits."
     )
     yield (
@@ -180,10 +169,6 @@ def _notes(burden: Burden) -> Iterator[str]:
     yield (
         f"The counter has {bits} bits: at every tick {rate:g} + {rate:g} frames/s carry {2 * bits * rate / 1e3:g} "
         f"kbit/s of it{shorter if bits > MIN_COUNTER_BITS else ''}, padding apart."
-    )
-    yield (
-        f"A frame carries no time and no sender's number, {STAMP_BYTES} bytes on a Zenoh link: every tick, that saves "
-        f"{saved:.1f} + {saved:.1f} kB/s."
     )
     if any(part and part.can_frames > 1 for point in burden.points for part in (point.measurement, point.command)):
         yield (

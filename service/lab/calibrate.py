@@ -6,14 +6,13 @@ steady torque about pitch and yaw. No other cell is used, and all other paramete
 published measurements and assumptions, and a dead zone of 0 where 2–3 V were measured.
 Each pair of equations is solved by Newton's method with a finite-difference Jacobian.
 
-Two equations always determine two parameters. How well the paper's figures identify them is what `identification.py`
-computes, with the dead zone beside them.
+Two equations always determine two parameters. How well the paper's figures identify them, with the dead zone beside
+them, is what `tests/benchmarks/sensitivity.py` computes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import hypot
 from typing import Final
 
 import numpy as np
@@ -23,18 +22,11 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings
 from aeroloop.service.lab import paper
 from aeroloop.service.lab.cells import Cell, Pool
-from aeroloop.service.lab.experiment import PATH
-from aeroloop.service.lab.identification import Identification, Named, identify
-from aeroloop.service.lab.tables import CASES
 
 MEASURED_YAW_COULOMB: Final = 0.0037
 """Coulomb friction of the yaw axis as measured from spin-downs of another Aero [N·m]."""
 TABLE_C1_HEIGHT: Final = -0.0038
 """Height of the centre of mass in the paper's Table C.1 [m]."""
-MEASURED_DEAD_ZONE: Final = 2.5
-"""Voltage below which the rotors of another Aero made no thrust [V]; 2–3 V."""
-PROBE: Final = 0.1
-"""Finite difference for the identification, as a part of a parameter's scale: far above the encoders' grain."""
 MAX_ROUNDS: Final = 8
 TOLERANCE: Final = 1e-3
 """Relative tolerance of a fitted figure; the published ones have two to four digits."""
@@ -53,9 +45,7 @@ class Calibration(BaseModel):
     calm: dict[str, float] = Field(description="z_track [1e-4 s] and u_total [V²·s] reached in the calm cell")
     windy: dict[str, float] = Field(description="the same in the windy cell")
     residuals: dict[str, float] = Field(description="relative residual of each of the four figures")
-    identification: Identification
     runs: int = Field(description="number of experiments")
-    path: str = Field(description=PATH)
 
 
 class CalibrationError(AeroloopError):
@@ -100,7 +90,6 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
         x, calm = fit(lambda p: _with_body(settings, p), start, (1e-4, 2e-5), "calm")
         body = _with_body(settings, x.tolist())
         w, windy = fit(lambda p: _with_wind(body, p), plant.wind.torque[:2], (5e-4, 5e-4), "wind")
-        identification = identification_at(settings, [*x, *w, plant.rotor.dead_zone_v], evaluate)
     return Calibration(
         yaw_coulomb=x[0],
         centre_of_mass_height=x[1],
@@ -112,41 +101,8 @@ def calibrate(settings: Settings, progress: Callable[[int], None] | None = None)
             for air, pair in (("calm", calm), ("wind", windy))
             for name, reached in zip(("z_track_1e-4", "u_total"), pair, strict=True)
         },
-        identification=identification,
         runs=runs,
-        path=pool.path,
     )
-
-
-def identification_at(
-    settings: Settings, values: Sequence[float], evaluate: Callable[[Sequence[tuple[Settings, Cell]]], np.ndarray]
-) -> Identification:
-    """Identification of yaw friction [N·m], height [m], wind about pitch and yaw [N·m] and dead zone [V] at `values`.
-
-    `evaluate` returns z_track and u_total of each experiment, shape (experiments, 2).
-    """
-    coulomb, height, *wind, dead_zone = values
-    parameters = [
-        Named("Coulomb friction about yaw", "N·m", coulomb, MEASURED_YAW_COULOMB),
-        Named("height of the centre of mass", "m", height, -TABLE_C1_HEIGHT),
-        Named("wind torque about pitch", "N·m", wind[0], hypot(*wind)),
-        Named("wind torque about yaw", "N·m", wind[1], hypot(*wind)),
-        Named("dead zone", "V", dead_zone, MEASURED_DEAD_ZONE),
-    ]
-    cells = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]
-    published = np.array([list(paper.WIND[case][air].values()) for case in CASES for air in ("calm", "wind")])
-    steps = PROBE * np.array([parameter.scale for parameter in parameters])
-    probes = [np.array(values), *(values + step for step in np.diag(steps))]
-    jobs = [(_with_all(settings, probe.tolist()), cell) for probe in probes for cell in cells]
-    reached, *moved = evaluate(jobs).reshape(len(probes), *published.shape)
-    columns = [((figures - reached) / published / paper.SCATTER / PROBE).ravel() for figures in moved]
-    return identify(parameters, np.column_stack(columns))
-
-
-def _with_all(settings: Settings, p: Sequence[float]) -> Settings:
-    changed = _with_wind(_with_body(settings, p[:2]), p[2:4])
-    rotor = changed.plant.rotor.model_copy(update={"dead_zone_v": p[4]})
-    return changed.model_copy(update={"plant": changed.plant.model_copy(update={"rotor": rotor})})
 
 
 def _with_body(settings: Settings, p: Sequence[float]) -> Settings:

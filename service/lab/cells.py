@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from aeroloop.service.config import Settings
-from aeroloop.service.lab.experiment import experiment, paths
+from aeroloop.service.lab.experiment import experiment
 from aeroloop.service.lab.paper import DURATION_S
-from aeroloop.service.lab.workers import PROCESSES, Workers
+from aeroloop.service.lab.workers import Workers
 
 
 class Cell(NamedTuple):
@@ -39,32 +39,21 @@ def with_seed(settings: Settings, seed: int) -> Settings:
     return settings.model_copy(update={"plant": plant.model_copy(update=drawn)})
 
 
-def run_cell(config: dict[str, Any], cell: Cell) -> tuple[Result, str]:
-    """Run one cell of a configuration's dump. Returns its figures and the path that it took."""
+def run_cell(config: dict[str, Any], cell: Cell) -> Result:
+    """Run one cell of a configuration's dump."""
     settings = with_seed(Settings.model_validate(config), cell.seed)
     wind = settings.plant.wind.model_copy(update={"blowing": cell.windy})
     plant = settings.plant.model_copy(update={"wind": wind})
     wire = settings.wire.with_bits(cell.bits_out, cell.bits_in)
-    figures, path, _ = experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S)
+    figures = experiment(settings.model_copy(update={"wire": wire, "plant": plant}), DURATION_S).figures
     assert figures.z_track is not None
     assert figures.u_total is not None
-    return Result(figures.z_track * 1e4, figures.u_total), path
+    return Result(figures.z_track * 1e4, figures.u_total)
 
 
 class Pool(Workers):
     """Processes that run cells, one a core. A context."""
 
-    def __init__(self, engine: str = PROCESSES) -> None:
-        super().__init__(engine)
-        self._paths: set[str] = set()
-
     def run(self, jobs: Iterable[tuple[Settings, Cell]], progress: Callable[[int], None] | None = None) -> list[Result]:
         """Results of cells in their order; `progress` is called with the number done."""
-        done = self.each(run_cell, ((settings.description(), cell) for settings, cell in jobs), progress)
-        self._paths |= {path for _, path in done}
-        return [result for result, _ in done]
-
-    @property
-    def path(self) -> str:
-        """The paths that the cells took so far."""
-        return paths(self._paths)
+        return self.each(run_cell, ((settings.description(), cell) for settings, cell in jobs), progress)

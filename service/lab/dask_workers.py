@@ -43,7 +43,7 @@ class Answer(NamedTuple):
 def answer(expected: str, known: dict[str, str], work: Callable[..., Any], arguments: tuple[Any, ...]) -> Answer:
     """Do a job in a worker, if it has the expected fingerprint; `known` are the versions to compare with."""
     worker = get_worker()
-    if (threads := worker.state.nthreads) > 1:  # they share an interpreter, and the attack's loops
+    if (threads := worker.state.nthreads) > 1:  # they share an interpreter
         return Answer(worker.address, refusal=f"has {threads} threads; start it with --nthreads 1")
     if (mine := fingerprint()) == expected:
         return Answer(worker.address, work(*arguments))

@@ -1,35 +1,31 @@
-"""Experiment: runs controller and plant end in one process, in lockstep, by one of two paths with the same bits.
+"""Experiment: runs controller and plant end in one process, in lockstep, in one of two ways with the same bits.
 
-*compiled*: the whole loop is one function, `loop_function`. *frames*: a `for` loop over the two ends, through real
-frames, for what that function cannot express: faults, a law in Python, a user's own plant, `watch`, a run that trips.
-Without network or clock it repeats bit for bit, and a demo in lockstep over Zenoh gives the same figures.
+The whole loop is one function, `loop_function`; or a `for` loop over the two ends, through real frames, for what that
+function cannot express: faults, a law in Python, a user's own plant, `watch`, a run that trips. Without network or
+clock it repeats bit for bit, and a demo in lockstep over Zenoh gives the same figures.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from pydantic import Field
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Claim, Refusal
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import SILENCE, Policy
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import ExpressionLaw
 from aeroloop.service.control.laws.registry import law_class
-from aeroloop.service.figures import Figures, Score
+from aeroloop.service.figures import Figures, Floats, Integers, Score
 from aeroloop.service.lab.loop_function import Run, loop_of
-from aeroloop.service.lab.traffic import sent_ticks
 
 REASONS = {"latency_us": "lockstep without a network has no latency", "log": "nothing crossed a network"}
-Path: TypeAlias = Literal["compiled", "frames"]
-PATH = "how the loop ran: compiled, as one function; frames, frame by frame; or both, in a batch"
 
 Watch: TypeAlias = Callable[[int, bytes, bytes], None]
 """Called at every tick with k, the measurement and the command that answers it; SILENCE where none is sent."""
@@ -40,10 +36,9 @@ class LoopEndedError(ValueError):
 
 
 class Experiment(NamedTuple):
-    """Figures of an experiment, the path that it took, and the loop's course if that was *compiled*."""
+    """Figures of an experiment, and the loop's course if it ran as one function."""
 
     figures: Figures
-    path: Path
     course: Run | None = None
 
 
@@ -69,7 +64,7 @@ def experiment(
     if ticks and of_expressions and settings.plant.actuators == wire.actuators and not settings.plant.faults:
         course = loop_of(settings).run(settings, ticks, report)
     if course is None:
-        return Experiment(_through_frames(settings, duration_s, progress, watch), "frames")
+        return Experiment(_through_frames(settings, duration_s, progress, watch))
     score = Score(wire, loop.period, settings.plant.watchdog_s)
     score.errors(np.arange(ticks), course.errors)
     score.commands(np.arange(ticks), course.voltages)
@@ -79,26 +74,7 @@ def experiment(
         for codes, policy in ((course.measured, transmit.measurement), (course.commanded, transmit.command))
     )
     score.unsent(*unsent)
-    return Experiment(score.figures(reasons=REASONS), "compiled", course)
-
-
-class ExperimentFigures(Figures):
-    """Figures, and the path that the loop took."""
-
-    path: Path = Field(description=PATH)
-
-
-def experiment_figures(
-    settings: Settings, duration_s: float, progress: Callable[[float], None] | None = None
-) -> ExperimentFigures:
-    """The figures of `experiment`, for a command's output."""
-    found = experiment(settings, duration_s, progress)
-    return ExperimentFigures(**found.figures.model_dump(), path=found.path)
-
-
-def paths(each: Iterable[str]) -> str:
-    """The paths that a batch took, in one line."""
-    return ", ".join(sorted(set(each)))
+    return Experiment(score.figures(reasons=REASONS), course)
 
 
 def heartbeat_of(settings: Settings) -> int:
@@ -148,8 +124,8 @@ def _through_frames(
             return _through_frames(settings, duration_s, progress, watch, made, controller)
     loop, wire = settings.loop, settings.wire
     controller = controller or Controller(wire, settings.law, settings.reference, loop.period)
-    guard = settings.plant.guard(loop.period_ns, wire.voltage.quantizer().outermost)
-    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, guard=guard)
+    limits = settings.plant.limit_monitor(loop.period_ns, wire.voltage.quantizer().outermost)
+    endpoint = Endpoint(plant, wire, loop.period_ns, lockstep=True, watchdog_s=settings.plant.watchdog_s, limits=limits)
     score = Score(wire, loop.period, settings.plant.watchdog_s)
     answer = endpoint.claim(
         Claim(controller="experiment", session="lab", period_ns=loop.period_ns, lockstep=True, auto_arm=True, wire=wire)
@@ -203,3 +179,22 @@ def _undisturbed(ticks: int) -> Iterator[int]:
     finally:
         if collects:
             gc.enable()
+
+
+def sent_ticks(codes: Floats, policy: Policy, heartbeat: int) -> Integers:
+    """The ticks at which a policy sends; as a `Sender` decides where no tick is missed.
+
+    Args:
+        codes: Codes at every tick from 0 on. Shape (ticks, components).
+        policy: The transmit policy.
+        heartbeat: The most ticks from one frame to the next.
+    """
+    ticks = np.arange(len(codes))
+    if policy == "periodic":
+        return ticks
+    now, before = codes[1:], codes[:-1]
+    alike = (now == before) & (np.signbit(now) == np.signbit(before)) | np.isnan(now) & np.isnan(before)
+    changed = np.concatenate([[True], ~alike.all(axis=1)])
+    since = ticks - np.maximum.accumulate(np.where(changed, ticks, 0))
+    sent: Integers = ticks[since % heartbeat == 0]
+    return sent

@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import casadi as ca
 import numpy as np
 
-from aeroloop.plant_emulator.endpoint.envelope import LimitSettings
+from aeroloop.plant_emulator.endpoint.endpoint import LimitSettings
 from aeroloop.plant_emulator.model.emulated import initially, step_function
 from aeroloop.plant_emulator.model.sensors import Sensors, sensor_function
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings

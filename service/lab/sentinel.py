@@ -14,7 +14,8 @@ from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, load_over
-from aeroloop.service.lab.experiment import ExperimentFigures, experiment_figures
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.experiment import run_experiment
 
 _SENTINEL: Final = (
     "plant.wind.blowing=true",
@@ -27,14 +28,14 @@ _SENTINEL_S: Final = 40.0
 """As long as runs that are compiled to C [s]: a worker's compiler counts, too."""
 
 
-def run_each(settings: Sequence[Settings], duration_s: float) -> list[ExperimentFigures | str]:
+def run_each(settings: Sequence[Settings], duration_s: float) -> list[Figures | str]:
     """Figures of an experiment with each configuration, or the reason why it has none, such as a trip."""
     return [_run(each, duration_s) for each in settings]
 
 
-def _run(settings: Settings, duration_s: float) -> ExperimentFigures | str:
+def _run(settings: Settings, duration_s: float) -> Figures | str:
     try:
-        return experiment_figures(settings, duration_s)
+        return run_experiment(settings, duration_s)
     except (AeroloopError, ValueError) as error:  # the plant tripped, a law or plant failed, the ends do not fit
         return str(error).splitlines()[0]
 
@@ -43,6 +44,6 @@ def _run(settings: Settings, duration_s: float) -> ExperimentFigures | str:
 def fingerprint() -> str:
     """The version of aeroloop, and a digest of what it computes here, such as `0.2.0+1f0c83a6be25`."""
     [figures] = run_each([load_over(Settings(), _SENTINEL)], _SENTINEL_S)
-    assert isinstance(figures, ExperimentFigures), figures
+    assert isinstance(figures, Figures), figures
     exact = (figures.z_track, figures.u_total, figures.max_error_deg, figures.final_error_deg)
     return f"{version('aeroloop')}+{sha256(repr(exact).encode()).hexdigest()[:12]}"

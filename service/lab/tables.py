@@ -16,7 +16,6 @@ from aeroloop.service.config import Settings
 from aeroloop.service.lab import paper
 from aeroloop.service.lab.baselines import Baseline, baselines
 from aeroloop.service.lab.cells import Cell, Pool, Result
-from aeroloop.service.lab.experiment import PATH
 from aeroloop.service.lab.workers import PROCESSES
 
 CASES: Final = {"continuous": (None, None), "quantized_8_6": (8, 6)}
@@ -52,7 +51,6 @@ class Tables(BaseModel):
     C2: Table = Field(description="z_track [1e-4 s]; rows: bits of the input, columns: bits of the output")
     C3: Table = Field(description="u_total [V²·s]")
     C4: Table = Field(description="both, calm and windy; mare over the quantized windy cell's two figures")
-    path: str = Field(description=PATH)
 
 
 def predict(
@@ -77,7 +75,7 @@ def predict(
         results = pool.run(jobs, lambda done: progress(done, len(jobs)) if progress else None)
     runs = {cell: results[i * seeds : (i + 1) * seeds] for i, cell in enumerate((*calm, *windy))}
     grids = _grid(runs, "z_track", paper.Z_TRACK), _grid(runs, "u_total", paper.U_TOTAL)
-    return Tables(C2=grids[0], C3=grids[1], C4=_wind(runs), path=pool.path)
+    return Tables(C2=grids[0], C3=grids[1], C4=_wind(runs))
 
 
 _Runs = dict[tuple[int | None, int | None, bool], list[Result]]

@@ -13,7 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.service.config import Settings, as_overrides
 from aeroloop.service.config_text import toml
-from aeroloop.service.lab.experiment import PATH, paths
 from aeroloop.service.lab.law_margins import PUSHED_S, survives
 from aeroloop.service.lab.tune_costs import Limits, Summary, summary, worse
 from aeroloop.service.lab.tune_runs import Case, run_cases, with_case, with_law
@@ -59,7 +58,6 @@ class Tuning(BaseModel):
     candidates: int
     seed: int = Field(description="of the search")
     interrupted: bool
-    path: str = Field(description=PATH)
     worse: str | None = Field(description="in what the held-out set is worse than before; null where it is not")
     exceeded: list[str] = Field(description="limits that the gains after exceed in the held-out set")
 
@@ -114,7 +112,6 @@ def tune(settings: Settings, plan: Plan, workers: Workers, progress: Progress | 
         candidates=len(search.found),
         seed=plan.seed,
         interrupted=interrupted,
-        path=paths(ran.path for rans in search.found.values() for ran in rans),
         worse=worse(before.held_out, after.held_out),
         exceeded=[
             name
@@ -161,6 +158,6 @@ def _judged(
 def verdict(settings: Settings) -> str:
     """The verdict of the configuration's certificate, or why its law has none."""
     try:
-        return certify_any(settings, seek_remedies=False).verdict
+        return certify_any(settings).verdict
     except (NoTheoremError, BoundlessError) as error:
         return str(error)

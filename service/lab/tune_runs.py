@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, with_law_settings
 from aeroloop.service.lab.cells import with_seed
-from aeroloop.service.lab.experiment import Path, experiment
+from aeroloop.service.lab.experiment import experiment
 
 LawValues = dict[str, Any]
 """`[law]` as plain data."""
@@ -41,7 +41,6 @@ class Ran(NamedTuple):
         changes_per_s: Changes of a commanded voltage [1/s].
         settled_deg: Largest error in the second half [deg].
         lasted: Part of the time that it ran: 1, or less where it tripped [1].
-        path: How it ran.
         reason: Why it ended early; None if it did not.
     """
 
@@ -51,7 +50,6 @@ class Ran(NamedTuple):
     changes_per_s: float
     settled_deg: float
     lasted: float = 1.0
-    path: Path = "frames"
     reason: str | None = None
 
 
@@ -98,7 +96,7 @@ def run_case(settings: Settings, duration_s: float) -> Ran:
         largest.append(max(abs(level(code)) for code in read[1]) if read else largest[-1])  # held without a frame
 
     try:
-        figures, path, course = experiment(settings, duration_s, watch=watch)
+        figures, course = experiment(settings, duration_s, watch=watch)
     except (ValueError, AeroloopError) as error:
         return Ran(0, 0, 0, 0, 0, (len(largest) - 1) / ticks, reason=str(error).splitlines()[0])
     voltages = np.abs(course.voltages).max(axis=1) if course else np.array(largest)
@@ -106,5 +104,5 @@ def run_case(settings: Settings, duration_s: float) -> Ran:
     found = figures.z_track, figures.u_total, saturated, figures.command_changes_per_s, figures.second_half_error_deg
     z_track, u_total, saturated, changes, settled = (inf if value is None else value for value in found)
     if not all(map(isfinite, (z_track, u_total, changes, settled))):
-        return Ran(0, 0, 0, 0, 0, 0, path, "it has no figures: it answers nothing, or no number")
-    return Ran(z_track, u_total, saturated, changes, settled, path=path)
+        return Ran(0, 0, 0, 0, 0, 0, "it has no figures: it answers nothing, or no number")
+    return Ran(z_track, u_total, saturated, changes, settled)

@@ -45,6 +45,8 @@ def write_decoded(files: LogFiles, out: Path, progress: Progress) -> tuple[int, 
             done += path.stat().st_size
             damages += [f"{path}: {damage.what}" for damage in found]
         copy.finish()
+    if decoder.malformed:
+        damages.append(f"malformed: {decoder.malformed} of what is decoded")
     return copy.messages, sorted(copy.topics), damages
 
 

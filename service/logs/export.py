@@ -20,9 +20,10 @@ from aeroloop.protocol.runtime.host_facts import versions
 from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.files import LogFiles, Progress
+from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.logs.runs import Block, Run, Taker
-from aeroloop.service.logs.table import Rows, TruthColumns, groups
+from aeroloop.service.logs.table import Rows, TruthColumns, groups, is_of_tick
 from aeroloop.service.logs.table_files import FILES, ExportError, TableFile
 from aeroloop.service.logs.tick_reader import TickReader
 from aeroloop.service.logs.traces import Integers, SessionKey
@@ -44,6 +45,7 @@ class Exported(BaseModel, frozen=True):
     columns: list[str] = Field(description="names of a table's columns, topics of a log's channels")
     bytes: int
     damages: list[str] = Field(description="what of the log could not be read")
+    unknown: list[Unknown] = Field(default=[], description="ticks left out: the log does not hold what was in force")
 
 
 def export(
@@ -74,6 +76,7 @@ def export(
     """
     out = out or beside(paths[0], ENDINGS[to])
     sessions: list[str] | None = None
+    unknown: list[Unknown] = []
     try:
         with writing(out, paths, force=force) as part:
             if to == "mcap":
@@ -85,11 +88,22 @@ def export(
                     )
                 rows, columns, damages = write_decoded(LogFiles(paths), part, progress or (lambda _: None))
             else:
-                sessions, rows, columns, damages = _table(Run(paths, progress), to, part, session, vehicle)
+                run = Run(paths, progress)
+                sessions, rows, columns, damages = _table(run, to, part, session, vehicle)
+                unknown = [one for one in run.unknown if f"{one.vehicle}/{one.session}" in sessions]
             size = part.stat().st_size
     except ConfigError as error:
         raise ExportError(f"{paths[0]} is not a log of this version: {error}") from None
-    return Exported(out=str(out), format=to, sessions=sessions, rows=rows, columns=columns, bytes=size, damages=damages)
+    return Exported(
+        out=str(out),
+        format=to,
+        sessions=sessions,
+        rows=rows,
+        columns=columns,
+        bytes=size,
+        damages=damages,
+        unknown=unknown,
+    )
 
 
 def _table(
@@ -122,7 +136,9 @@ def _table(
             malformed[vehicle] += 1
             return
         writer = writers.get((vehicle, true.session or ""))
-        if writer is not None and true.session_tick is not None:
+        if writer is not None and not is_of_tick(true, writer.actuators):
+            malformed[vehicle] += 1
+        elif writer is not None and true.session_tick is not None:
             writer.truths.append((true.session_tick, *true.attitude, *true.rate, *true.voltages))
 
     def route(address: Address) -> Taker | None:
@@ -146,7 +162,7 @@ class _Writer:
         self.rows = 0
         self._which = which
         self._file = file
-        self._actuators = settings.wire.actuators
+        self.actuators = settings.wire.actuators
         self._lockstep = settings.loop.lockstep
         self._reader = TickReader(settings)
 
@@ -161,7 +177,8 @@ class _Writer:
 
     def _true_at(self, k: Integers) -> TruthColumns:
         """Latest truth at each tick. Shapes (n, columns)."""
-        columns = 8 + self._actuators
+        columns = 8 + self.actuators
+        self.truths.sort()  # a recorder writes late what it recovers
         known = np.array(self.truths, dtype=np.float64).reshape(-1, columns)
         at = np.searchsorted(known[:, 0], k, side="right")
         self.truths = self.truths[max(0, int(at[-1]) - 1) :]

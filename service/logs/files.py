@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -11,10 +12,10 @@ from mcap.records import Channel
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
-from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.trace import ENDS
 from aeroloop.service.logs.mcap_file import Damage, Logged, messages
 from aeroloop.service.logs.prelude import Prelude, ReviewError, address_of
-from aeroloop.service.logs.traces import SessionKey, identified
+from aeroloop.service.logs.traces import identified
 
 __all__ = ["LogFiles", "Progress", "ReviewError"]
 
@@ -33,8 +34,8 @@ class LogFiles:
     Attributes:
         paths: The files, in the order of their first messages.
         descriptions: The last description of each vehicle and role; `first_descriptions` the first.
-        changes: Changes in force when a file began, by vehicle and session.
         damages: What could not be read, by file; of a file with an index, only once its messages have been read.
+        malformed: Messages that are malformed, by topic; whatever publishes them, they cost nothing else.
         metadata: Other metadata, by name without prefix (`aeroloop.recorder` is `recorder`); the last of each.
 
     Raises:
@@ -44,13 +45,15 @@ class LogFiles:
     def __init__(self, paths: Sequence[Path]) -> None:
         self.descriptions: dict[tuple[str, str], Description] = {}
         self.first_descriptions: dict[tuple[str, str], Description] = {}
-        self.changes: dict[SessionKey, list[Change]] = {}
         self.damages: dict[Path, list[Damage]] = {}
+        self.malformed: Counter[str] = Counter()
+        self._unreadable: list[tuple[Path, topics.Address, str]] = []  # descriptions
         self.metadata: dict[str, dict[str, Any]] = {}
         preludes = {path: Prelude(path) for path in _files(paths)}
         self.paths = sorted(preludes, key=lambda path: preludes[path].begins_ns)
         for path in self.paths:
             self._add(path, preludes[path])
+        self._sort_out_descriptions()
         self._size = sum(path.stat().st_size for path in self.paths)
         recordings = {path: preludes[path].recording or path for path in self.paths}
         if len(set(recordings.values())) > 1:
@@ -84,25 +87,40 @@ class LogFiles:
                 self.damages[path] = list(dict.fromkeys([*self.damages.get(path, ()), *damages]))
 
     @property
+    def damaged(self) -> list[str]:
+        """What of the files is cut or damaged, a line each."""
+        return [f"{path}: {damage}" for path, found in self.damages.items() for damage in found]
+
+    @property
     def unread(self) -> list[str]:
-        """What could not be read, a line each."""
-        return [f"{path}: {damage.what}" for path, found in self.damages.items() for damage in found]
+        """What could not be read, a line each: damages, then malformed messages."""
+        return [*self.damaged, *malformed_lines(self.malformed)]
 
     def _add(self, path: Path, prelude: Prelude) -> None:
         """Add what a file holds beside its traces. Raises ReviewError if it has none but unreadable descriptions."""
         found = prelude.descriptions()
         if prelude.unreadable and not found:
             raise ReviewError(f"{path} is not a log of this version: {prelude.unreadable[0]}")
-        prelude.damages += [Damage(0, f"a description: {text}") for text in dict.fromkeys(prelude.unreadable)]
+        self._unreadable += [(path, address, text) for address, text in prelude.malformed]
         for which, copies in found.items():
             self.descriptions[which] = copies[-1]
             self.first_descriptions.setdefault(which, copies[0])
-        for which, changes in prelude.changes.items():
-            known = self.changes.setdefault(which, [])
-            known += [change for change in changes if change not in known]  # every file of a rotated run repeats it
         self.metadata |= prelude.metadata
         if prelude.damages:
             self.damages[path] = prelude.damages
+
+    def _sort_out_descriptions(self) -> None:
+        """Count unreadable descriptions as malformed messages; the only one of an end that is described is a damage.
+
+        Why: without it, the other end's configuration stands for it.
+        """
+        for path, address, text in self._unreadable:
+            which = address.vehicle, address.role or ""
+            others = {role for vehicle, role in self.descriptions if vehicle == which[0]}
+            if which[1] in ENDS and which not in self.descriptions and others & set(ENDS):
+                self.damages.setdefault(path, []).append(Damage(0, f"the description of {'/'.join(which)}: {text}"))
+            else:
+                self.malformed["description"] += 1
 
     def _check_that_all_are_of_one_run(self, recordings: Mapping[Path, Hashable]) -> None:
         """Raise ReviewError unless files of different recordings have traces of the same processes or sessions.
@@ -129,6 +147,11 @@ class LogFiles:
                 f"these are {len(runs)} unrelated runs ({some}): name one of them, or see them side by side with "
                 "`aeroloop log compare`"
             )
+
+
+def malformed_lines(malformed: Mapping[str, int]) -> list[str]:
+    """Malformed messages by topic, a line each."""
+    return [f"malformed: {count} of {topic}" for topic, count in sorted(malformed.items()) if count]
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:

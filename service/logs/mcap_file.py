@@ -34,9 +34,6 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 DESCRIPTION_METADATA: Final = "aeroloop.description"
 """Name of the metadata record with a role's description, as JSON under `json`, and its key under `key`."""
 
-CHANGE_METADATA: Final = "aeroloop.change"
-"""Name of a metadata record with a change in force when the file began: a Change as JSON, and its key."""
-
 RECORDER_METADATA: Final = "aeroloop.recorder"
 """Name of the metadata record about the file itself: its run, the recording's identity, its part, its beginning."""
 
@@ -85,6 +82,9 @@ class Damage(NamedTuple):
 
     offset: int
     what: str
+
+    def __str__(self) -> str:
+        return f"{self.what} (byte {self.offset})" if self.offset else self.what
 
 
 class Logged(NamedTuple, Generic[T]):

@@ -16,10 +16,9 @@ from mcap.records import Channel, Message, Metadata
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description
-from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.topics import Address
+from aeroloop.service.config import ConfigError, from_description
 from aeroloop.service.logs.mcap_file import (
-    CHANGE_METADATA,
     CHECKSUM,
     DESCRIPTION_METADATA,
     Damage,
@@ -27,7 +26,6 @@ from aeroloop.service.logs.mcap_file import (
     records,
     skim,
 )
-from aeroloop.service.logs.traces import SessionKey
 
 
 class ReviewError(AeroloopError):
@@ -37,25 +35,29 @@ class ReviewError(AeroloopError):
 class Prelude:
     """What one file holds beside its traces, when its first message was recorded, and unreadable descriptions.
 
+    `unreadable` has why each of them cannot be read, and `malformed` those that are so by their publisher: what stands
+    under a checksum is no damage of the file.
+
     Raises:
         ReviewError: It is no log, or cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self.begins_ns = 0
-        self.changes: dict[SessionKey, list[Change]] = {}
         self.metadata: dict[str, dict[str, Any]] = {}
         self.damages: list[Damage] = []
         self.unreadable: list[str] = []
+        self.malformed: list[tuple[Address, str]] = []
         self._checked: dict[tuple[str, str], list[Description]] = {}  # copies under a checksum: of a chunk or their own
         self._unchecked: dict[tuple[str, str], list[Description]] = {}
         descriptions: dict[int, Address] = {}
+        described: list[tuple[int, bytes, Address]] = []
         try:
             for record in skim(path, _is_description) or records(path, self.damages):
                 if isinstance(record, Message):
                     self.begins_ns = self.begins_ns or record.log_time
                     if address := descriptions.get(record.channel_id):
-                        self._add_description(record.data, address, self._checked)
+                        described.append((record.publish_time, record.data, address))
                 elif isinstance(record, Channel) and (address := address_of(record.topic, "description")):
                     descriptions[record.id] = address
                 elif isinstance(record, Metadata):
@@ -67,6 +69,8 @@ class Prelude:
             raise ReviewError(f"{error}, so it is no log") from None
         except OSError as error:
             raise ReviewError(f"cannot read {path}: {error.strerror}") from None
+        for _, data, address in sorted(described, key=lambda each: each[0]):  # a file is in the order of arrival
+            self._add_description(data, address, self._checked)
 
     @property
     def recording(self) -> str | None:
@@ -83,9 +87,6 @@ class Prelude:
         if record.name == DESCRIPTION_METADATA:
             copies = self._checked if CHECKSUM in record.metadata else self._unchecked
             self._add_description(text.encode(), address, copies)
-        elif record.name == CHANGE_METADATA:
-            change = Change.model_validate_json(text)
-            self.changes.setdefault((address.vehicle if address else "", change.session), []).append(change)
         elif record.name.startswith("aeroloop."):
             content = json.loads(text)
             self.metadata[record.name.removeprefix("aeroloop.")] = content if isinstance(content, dict) else {}
@@ -97,6 +98,10 @@ class Prelude:
             description = read_description(text, address)
         except ValueError as error:
             self.unreadable.append(str(error).splitlines()[0])
+            if address is not None and copies is self._checked:
+                self.malformed.append((address, self.unreadable[-1]))
+            elif (damage := Damage(0, f"a description: {self.unreadable[-1]}")) not in self.damages:
+                self.damages.append(damage)
         else:
             copies.setdefault((description.vehicle, description.role), []).append(description)
 
@@ -105,7 +110,8 @@ def read_description(text: bytes, address: Address | None) -> Description:
     """Parse a description, recorded under a key.
 
     Raises:
-        ValueError: It is malformed, of another role or vehicle than its key says, or of another protocol version.
+        ValueError: It is malformed, of another role or vehicle than its key says, of another protocol version, or its
+            configuration is.
     """
     try:
         content = json.loads(text)
@@ -113,14 +119,15 @@ def read_description(text: bytes, address: Address | None) -> Description:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(content, dict):
         raise ValueError("a description is no JSON object")
-    old = content.keys() <= Description.model_fields.keys() - {"protocol"}
-    version = 1 if old else content.get("protocol")
-    if version != PROTOCOL_VERSION:
-        written_by = "aeroloop 0.1, which" if version == 1 else "the aeroloop that"
-        raise ValueError(f"it is of protocol version {version}; read it with {written_by} wrote it")
+    if (version := content.get("protocol", PROTOCOL_VERSION)) != PROTOCOL_VERSION:
+        raise ValueError(f"it is of protocol version {version}; read it with the aeroloop that wrote it")
     description = Description.model_validate(content)
     if address is not None and (address.vehicle, address.role) != (description.vehicle, description.role):
         raise ValueError(f"a description of {address.vehicle}'s {address.role} is of another role")
+    try:
+        from_description(description.config)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
     return description
 
 

@@ -1,6 +1,7 @@
 """Recovery of a broken log: copies every whole record into a new log with an index.
 
-A log without its end, as a killed recorder leaves it, is read from the front. Damage is reported.
+With an index, as at the end of a file that was closed, a damaged chunk costs itself. Without one, as a killed recorder
+leaves a file, it is read from the front up to where no record begins. Damage is reported.
 """
 
 from __future__ import annotations

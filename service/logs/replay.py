@@ -8,7 +8,10 @@ the log's plant does not respond to that, so it is no simulation.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
+from contextlib import suppress
+from functools import partial
 from math import sqrt
 from pathlib import Path
 
@@ -16,10 +19,10 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed, why_not
-from aeroloop.plant_emulator.own_plant import PlantError
-from aeroloop.protocol.messages.models import Description
+from aeroloop.plant_emulator.plant import PlantError
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.messages.trace import ENDS, Batch, End, Sent, read_batch
+from aeroloop.protocol.messages.trace import ENDS, End, Sent, read_batch
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.config import Settings, from_description, load_over
 from aeroloop.service.control.controller import Codes
@@ -27,8 +30,10 @@ from aeroloop.service.figures import added, squares
 from aeroloop.service.logs.codes import codes_in, frames_of, levels
 from aeroloop.service.logs.evaluate import Evaluator, held_codes
 from aeroloop.service.logs.files import Progress, ReviewError
+from aeroloop.service.logs.in_force import Unknown
+from aeroloop.service.logs.prelude import read_description
 from aeroloop.service.logs.runs import Block, Run, Taker, TraceJoin
-from aeroloop.service.logs.traces import Array, SessionKey, Source
+from aeroloop.service.logs.traces import Array, Arrived, Missing, SessionKey, Source
 
 
 class TickDifference(BaseModel, frozen=True):
@@ -68,22 +73,35 @@ class Replay(BaseModel, frozen=True):
     controller: EndReplay | None = Field(description="null: it could not be replayed, see `reasons`")
     plant: EndReplay | None
     reasons: dict[str, str] = Field(description="why an end could not be replayed, or not to its end")
+    unknown: list[Unknown] = Field(description="ticks of which the log does not hold what was in force")
     sessions: list[SessionReplay]
     plants: list[PlantReplayed] = Field(description="the plant's processes, in the order of recording")
+    missing: list[Missing] = Field(description="rows of the ends asked for that the log lacks")
+    damages: list[str] = Field(description="unreadable parts of the log")
+    unseen: dict[End, list[str]] = Field(
+        description="by end that was asked for: what was not compared, since the log lacks it, is cut or damaged, or "
+        "cannot be computed again from it"
+    )
 
     @property
     def differs(self) -> bool:
         """Whether any end differs."""
         return any(end is not None and end.differ > 0 for end in (self.controller, self.plant))
 
+    @property
+    def complete(self) -> bool:
+        """Whether every row of the ends asked for was compared, of all that were written."""
+        return not any(self.unseen.values())
+
 
 class Replayer:
-    """Replays one session's controller by an evaluator, whose settings these are."""
+    """Replays one session's controller by an evaluator, whose settings these are; `rows` counts the rows compared."""
 
     def __init__(self, which: SessionKey, evaluator: Evaluator, settings: Settings) -> None:
         self._which = which
         self._evaluator = evaluator
         self._wire, self._period = settings.wire, settings.loop.period
+        self.rows = 0
         self._held: Codes | None = None  # codes of the last command sent
         self._first: TickDifference | None = None
         self._first_tick: int | None = None
@@ -96,6 +114,8 @@ class Replayer:
         used = evaluator.used(block)
         if not rows:
             return
+        if block.state is not None and (sent := block.state.get("sent_codes")) is not None:
+            self._held = tuple(sent)
         commands = evaluator.commands(used, evaluator.compute(used))
         n = len(rows["tick"])
         sent_as = np.full(n, int(Sent.NONE), dtype=np.uint8)
@@ -111,6 +131,7 @@ class Replayer:
             self._first = TickDifference(tick=tick, time_s=round(tick * self._period, 9), logged=was, computed=now)
         self._differ += int(differ.sum())
         self._ticks += len(used.k)
+        self.rows += n
         if self._first_tick is None:
             self._first_tick = int(rows["tick"][0])
         framed = rows["sent_as"] == Sent.FRAME
@@ -161,39 +182,53 @@ class Plants:
     def __init__(self, run: Run) -> None:
         self._descriptions = dict(run.files.first_descriptions)
         self._replays: dict[Source, PlantReplay] = {}
-        self._reason = "the log has no trace of a plant"
+        self._reasons: dict[Source, str] = {}  # of those that cannot be replayed
+        self._rows = Counter[Source]()  # of those that are to be compared
 
     def route(self, address: Address) -> Taker | None:
         """Takes descriptions: a process is replayed with the configuration that it started with."""
-        return self._description if address.topic.name == "description" else None
+        return partial(self._description, address) if address.topic.name == "description" else None
 
-    def take(self, source: Source, batch: Batch) -> None:
+    def take(self, arrived: Arrived) -> None:
         """The next batch of a plant."""
+        source = arrived.source
+        self._rows[source] += arrived.header.rows
         if source not in self._replays:
             description = self._descriptions.get((source.vehicle, "plant"))
             if description is None:
-                self._reason = f"the log has no description of {source.vehicle}'s plant"
+                self._reasons[source] = f"the log has no description of {source.vehicle}'s plant"
                 return
             settings = from_description(description.config)
             if (why := why_not(settings.plant)) is not None:
-                self._reason = why
+                self._reasons[source] = why
+                del self._rows[source]
                 return
             try:
                 self._replays[source] = PlantReplay(settings.loop, settings.wire, settings.plant)
             except PlantError as error:
-                self._reason = str(error)
+                self._reasons[source] = str(error)
                 return
-        self._replays[source].feed(batch)
+        if (batch := read_batch(arrived.payload)) is not None:
+            self._replays[source].feed(batch)
 
-    def results(self) -> tuple[list[PlantReplayed], str | None]:
-        """Result of each process, and the reason if there is none or one ends early."""
-        results = [replay.result() for replay in self._replays.values()]
-        stopped = next((result.stopped for result in results if result.stopped is not None), None)
-        return results, stopped if results else self._reason
+    def results(self) -> tuple[list[PlantReplayed], str | None, list[str]]:
+        """Result of each process, the reason if there is none or one ends early, and which rows are not compared."""
+        results = {source: replay.result() for source, replay in self._replays.items()}
+        reasons = self._reasons | {source: one.stopped for source, one in results.items() if one.stopped is not None}
+        left = {
+            source: rows - (results[source].ticks if source in results else 0) for source, rows in self._rows.items()
+        }
+        cut = "a batch of them cannot be read"
+        unseen = [
+            f"{rows} of the plant's rows: {reasons.get(source, cut)}" for source, rows in left.items() if rows > 0
+        ]
+        none = None if results else "the log has no trace of a plant"
+        return list(results.values()), next(iter(reasons.values()), none), unseen
 
-    def _description(self, payload: bytes, _: int) -> None:
-        description = Description.model_validate_json(payload)
-        self._descriptions[description.vehicle, description.role] = description
+    def _description(self, address: Address, payload: bytes, _: int) -> None:
+        with suppress(ValueError):  # malformed: the files' prelude has counted it
+            description = read_description(payload, address)
+            self._descriptions[description.vehicle, description.role] = description
 
 
 def replay(
@@ -209,7 +244,7 @@ def replay(
         ends: Ends to replay; the plant takes most of the time.
 
     Raises:
-        ReviewError: It cannot be read, or has no controller's configuration.
+        ReviewError: It cannot be read, or has no configuration of any end.
         ConfigError: An override is wrong.
     """
     try:
@@ -225,20 +260,26 @@ def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Repl
     own_reference = any(override.startswith("reference") for override in overrides)
     replayers: dict[SessionKey, Replayer] = {}
     joins: dict[SessionKey, TraceJoin] = {}
+    failed: dict[SessionKey, AeroloopError] = {}
     plants = Plants(run)
     for arrived in run.batches(plants.route):
         source = arrived.source
         which = source.vehicle, arrived.header.session
         if source.end == "plant":
-            batch = None if overrides or "plant" not in ends else read_batch(arrived.payload)
-            if batch is not None:
-                plants.take(source, batch)
+            if "plant" in ends and not overrides:
+                plants.take(arrived)
             continue
-        if which not in run.extents or "controller" not in ends:
+        if which not in run.extents or "controller" not in ends or which in failed:
             continue
         if which not in joins:
-            settings = load_over(run.settings(which), overrides)
-            evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
+            try:
+                settings = load_over(run.settings(which), overrides)
+                evaluator = Evaluator(settings, own_gains=own_gains, own_reference=own_reference, resumes=not overrides)
+            except AeroloopError as error:
+                if overrides:
+                    raise
+                failed[which] = error
+                continue
             replayers[which] = Replayer(which, evaluator, settings)
             joins[which] = run.join(which, alone=True)
         if joins[which].add(arrived):
@@ -248,19 +289,47 @@ def _replayed(run: Run, overrides: Sequence[str], ends: Collection[End]) -> Repl
         for block in join.blocks(finished=True):
             replayers[which].take(block)
     sessions = [replayer.result() for replayer in replayers.values()]
-    results, reason = plants.results()
+    results, reason, plants_unseen = plants.results()
+    if failed and not (sessions or results):
+        raise next(iter(failed.values()))
     reasons = {} if sessions else {"controller": "the log has no trace of a controller"}
+    if failed:
+        reasons["controller"] = "; ".join(f"{'/'.join(which)}: {error}" for which, error in failed.items())
+    left = sum(extent.rows["controller"] for extent in run.extents.values()) - sum(
+        one.rows for one in replayers.values()
+    )
     if overrides:
         reason = "the plant of a log does not follow another configuration"
     if reason is not None:
         reasons["plant"] = reason
     reasons |= {end: "only the other end was replayed" for end in ENDS if end not in ends}
+    missing = [gap for gap in run.missing if gap.end in ends]
+    not_compared: dict[End, list[str]] = {
+        "controller": [
+            *map(str, run.unknown),
+            *([f"{left} of the controller's rows: {reasons['controller']}"] if left and failed else []),
+        ],
+        "plant": plants_unseen,
+    }
+    unseen = {
+        end: [
+            *(f"{gap}, which the log lacks" for gap in missing if gap.end == end and gap.rows),
+            *its,
+            *run.files.damaged,
+        ]
+        for end, its in not_compared.items()
+        if end in ends and not (overrides and end == "plant")
+    }
     return Replay(
         controller=_sum(sessions),
         plant=_sum([result for result in results if result.ticks]),
         reasons=reasons,
+        unknown=run.unknown,
         sessions=sessions,
         plants=results,
+        missing=missing,
+        damages=run.files.unread,
+        unseen=unseen,
     )
 
 

@@ -1,13 +1,13 @@
 """Join of both ends' traces: sessions as blocks of ticks, each tick with the rows of both ends.
 
-The join key is (vehicle, session, session tick). The files are read twice: first the headers of the trace's batches
-(traces.py), then the rows. A block is yielded once both ends have reached its last tick, so memory stays bounded
-however long a session is.
+The join key is (vehicle, session, session tick). The files are read three times: first the headers of the trace's
+batches (traces.py), then the JSON messages that are wanted, which are sorted in memory, then the rows. A block is
+yielded once both ends have reached its last tick.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from math import inf
@@ -23,6 +23,8 @@ from aeroloop.protocol.messages.topics import Address
 from aeroloop.protocol.messages.trace import NEVER, End, Header, Outcome, Received, join_columns
 from aeroloop.service.config import Settings, from_description
 from aeroloop.service.logs.files import LogFiles, Progress, ReviewError
+from aeroloop.service.logs.in_force import Range
+from aeroloop.service.logs.mcap_file import Logged
 from aeroloop.service.logs.prelude import read_description
 from aeroloop.service.logs.traces import (
     NO_TICK,
@@ -42,13 +44,16 @@ ANSWER_S: Final = 1.2
 """Longest time from a measurement until its command acts; a session's first may take a second [s]."""
 
 _INDEXING: Final = 0.15
-"""Share of reading that the first pass takes."""
+"""Share of reading that each of the first two passes takes."""
 
 OWNED: Final = {"plant": ("plant", "can"), "recorder": ("recorder",)}
 """Sections of the configuration by the role that owns them; the others are the controller's."""
 
 Taker = Callable[[bytes, int], None]
 """Callback for a JSON message: its content, and its time of publication [ns]."""
+
+_Beside = tuple[tuple[str, str], Taker]
+"""Vehicle and role of the end that published a message, and what takes it."""
 
 Rows = dict[str, npt.NDArray[Any]]
 """Rows of one end, by column: those of its trace, with times in ns on its monotonic clock, −1 for none; and `wall`, the
@@ -91,8 +96,7 @@ class Run:
     Attributes:
         extents: Recorded extent of each session, in the order of recording.
         missing: Missing rows.
-        reached: The last tick of each session that `read` has reached.
-        open_sessions: The session of each vehicle that is open at that point of the files.
+        unknown: Ticks that `read` leaves out, as the log does not hold what was in force then.
 
     Raises:
         ReviewError: Not a log of this version.
@@ -118,9 +122,8 @@ class Run:
                 now = {role: description for (whose, role), description in known.items() if whose == vehicle}
                 self._described[vehicle, header.session] = now
         self._index.finish()
-        self.extents, self.missing = self._index.extents, self._index.missing
-        self.reached: dict[SessionKey, int] = {}
-        self.open_sessions: dict[str, str] = {}
+        self.extents, self.missing, self.unknown = self._index.extents, self._index.missing, self._index.unknown
+        self.files.malformed["trace"] = self._index.malformed
 
     def choose(self, session: str | None = None, vehicle: str | None = None) -> SessionKey:
         """A session. Raises ReviewError if there is none.
@@ -182,23 +185,49 @@ class Run:
     def batches(self, route: Callable[[Address], Taker | None] = lambda _: None) -> Iterator[Arrived]:
         """Batches of the traces, each end's in the order of its rows and none twice.
 
-        `route` is called once per key that is not a trace's; it returns a callback for its messages, or None.
+        `route` is called once per key that is not a trace's; it returns a callback for its messages, or None. States,
+        statuses and descriptions come before the first batch that was published after them, by the clock of the end
+        that published both; frames, events and losses in the order of recording.
         """
         order = {source: InOrder(source, batches) for source, batches in self._index.sources.items()}
+        beside = self._beside(route)
 
         def of(address: Address) -> tuple[str, Taker | None] | None:
             if address.topic.name == "trace":
                 return address.vehicle, None
-            taker = route(address)
+            taker = None if _is_sorted(address) else route(address)
             return None if taker is None else (address.vehicle, taker)
 
-        for found in self.files.routed(of, self._share(_INDEXING, 1.0)):
+        for found in self.files.routed(of, self._share(2 * _INDEXING, 1.0)):
             vehicle, taker = found.answer
             if taker is not None:
                 taker(found.data, found.publish_time)
             elif known := identified(vehicle, found.data):
                 source, header = known
-                yield from order[source].take(header, found.data)
+                for arrived in order[source].take(header, found.data, found.publish_time):
+                    for waiting in (beside[vehicle, source.end], beside["", ""]):
+                        while waiting and waiting[0].publish_time <= arrived.published_ns:
+                            message = waiting.popleft()
+                            message.answer[1](message.data, message.publish_time)
+                    yield arrived
+        for waiting in beside.values():
+            for message in waiting:
+                message.answer[1](message.data, message.publish_time)
+
+    def _beside(self, route: Callable[[Address], Taker | None]) -> dict[tuple[str, str], deque[Logged[_Beside]]]:
+        """Messages by the end that published them, those of others under no name, by time of publication."""
+        ends = {(source.vehicle, str(source.end)) for source in self._index.sources}
+        beside: dict[tuple[str, str], deque[Logged[_Beside]]] = defaultdict(deque)
+
+        def of(address: Address) -> _Beside | None:
+            taker = route(address) if _is_sorted(address) else None
+            end = address.vehicle, address.role or address.topic.senders[0]
+            return None if taker is None else (end if end in ends else ("", ""), taker)
+
+        found = self.files.routed(of, self._share(_INDEXING, 2 * _INDEXING))
+        for message in sorted(found, key=lambda each: each.publish_time):
+            beside[message.answer[0]].append(message)
+        return beside
 
     def read(
         self, sessions: Collection[SessionKey], route: Callable[[Address], Taker | None] = lambda _: None
@@ -207,7 +236,6 @@ class Run:
         joins = {which: self.join(which) for which in sessions}
         for arrived in self.batches(route):
             which = arrived.source.vehicle, arrived.header.session
-            self._follow(which, arrived)
             if (join := joins.get(which)) is not None and join.add(arrived):
                 yield from join.blocks()
         for join in joins.values():
@@ -216,32 +244,26 @@ class Run:
     def join(self, which: SessionKey, *, alone: bool = False) -> TraceJoin:
         """The join of a session; if `alone`, without the plant's rows."""
         extent = self.extents[which]
-        begins = extent.first["controller"]
-        before = [change for change in self.files.changes.get(which, ()) if change.tick < begins]
+        unknown = [(one.first_tick, one.last_tick) for one in self.unknown if (one.vehicle, one.session) == which]
         margin = self.settings(which).loop.ticks(ANSWER_S)
-        return TraceJoin(which, margin, extent.of("controller") if alone else extent, before)
-
-    def _follow(self, which: SessionKey, arrived: Arrived) -> None:
-        """Track the last tick of the plant's trace; of the controller's, if the log has none of the plant."""
-        vehicle, session = which
-        header = arrived.header
-        if header.end == "controller" and which in self.extents and self.extents[which].rows["plant"]:
-            return
-        if header.rows:
-            self.reached[which], self.open_sessions[vehicle] = arrived.last_tick, session
-        if header.final or not session:
-            self.open_sessions.pop(vehicle, None)
+        changes = self._index.changes[which]
+        return TraceJoin(which, margin, extent.of("controller") if alone else extent, changes, unknown)
 
     def _share(self, begin: float, end: float) -> Progress | None:
         progress = self._progress
         return None if progress is None else lambda share: progress(begin + share * (end - begin))
 
 
+def _is_sorted(address: Address) -> bool:
+    return address.topic.carries == "json" and address.topic.name not in ("event", "loss")
+
+
 class _Segment:
     """Waiting rows of one end, without a gap; `state` is the controller's before them, where rows are missing."""
 
-    def __init__(self, end: End, state: dict[str, Any] | None = None) -> None:
+    def __init__(self, end: End, state: dict[str, Any] | None = None, unknown: Sequence[Range] = ()) -> None:
         self.state = state
+        self._unknown = unknown
         self._column = "tick" if end == "controller" else "session_tick"
         self._batches: list[tuple[Header, bytes]] = []
         self._rows: Rows = {}
@@ -254,10 +276,17 @@ class _Segment:
         """All rows; empty if there are none."""
         if self._batches:
             known = [self._rows] if self._rows else []
-            parts = [*known, _joined(self._batches)]
+            parts = [*known, self._known(_joined(self._batches))]
             self._rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
             self._batches.clear()
         return self._rows
+
+    def _known(self, rows: Rows) -> Rows:
+        ticks = rows[self._column]
+        left = np.ones(len(ticks), dtype=np.bool_)
+        for first, last in self._unknown:
+            left &= (ticks < first) | (ticks > last)
+        return rows if left.all() else {name: column[left] for name, column in rows.items()}
 
     @property
     def ticks(self) -> Integers:
@@ -274,16 +303,25 @@ class _Segment:
 class TraceJoin:
     """Joins the rows of one session's two ends into blocks.
 
-    After a tick it waits for `margin` ticks of the plant, in which the command that answers it may act; `changes` are
-    in force before the first row.
+    After a tick it waits for `margin` ticks of the plant, in which the command that answers it may act. `changes` are
+    all of the session, in order; rows of `unknown` ticks are left out.
     """
 
-    def __init__(self, which: SessionKey, margin: int, extent: Extent, changes: Sequence[Change] = ()) -> None:
+    def __init__(
+        self,
+        which: SessionKey,
+        margin: int,
+        extent: Extent,
+        changes: Sequence[Change] = (),
+        unknown: Sequence[Range] = (),
+    ) -> None:
         self._which = which
         self._margin = margin
         self._controller: deque[_Segment] = deque()
-        self._plant = _Segment("plant")
-        self._changes = list(changes)
+        self._plant = _Segment("plant", unknown=unknown)
+        self._changes = deque(changes)
+        self._unknown = unknown
+        self._left_out = False  # whether the controller's last batch was
         # Up to which tick each end has been read; infinity where nothing more comes.
         self._settled: dict[End, float] = {
             end: extent.first[end] - 1 if extent.rows[end] else inf for end in extent.rows
@@ -293,12 +331,13 @@ class TraceJoin:
     def add(self, arrived: Arrived) -> bool:
         """Add a batch; returns whether a block is complete."""
         end, has_rows = arrived.source.end, arrived.header.rows > 0
-        if end == "controller":
-            if has_rows:
-                if arrived.after_gap or not self._controller:
+        if end == "controller" and has_rows:
+            left_out = any(first <= arrived.last_tick <= last for first, last in self._unknown)
+            if not left_out:
+                if arrived.after_gap or self._left_out or not self._controller:
                     self._controller.append(_Segment(end, arrived.tail.state))
                 self._controller[-1].add(arrived)
-            self._changes += arrived.changes
+            self._left_out = left_out
         elif has_rows:
             self._plant.add(arrived)
         self._settled[end] = inf if arrived.next_tick == NO_TICK else arrived.next_tick - 1
@@ -329,7 +368,9 @@ class TraceJoin:
         n = int(np.searchsorted(segment.ticks, limit, side="right"))
         if n or p:
             controller = {name: column[:n] for name, column in segment.rows.items()}
-            changes, self._changes = self._changes, []
+            changes = []
+            while self._changes and self._changes[0].tick <= limit:
+                changes.append(self._changes.popleft())
             yield _block(self._which, controller, plant, p, changes, segment.state)
             segment.drop(n)
             self._plant.drop(p)

@@ -13,6 +13,8 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from aeroloop.protocol.messages.models import Truth
+from aeroloop.protocol.messages.trace import NEVER
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.control.laws.evaluation import initial_state
 from aeroloop.service.control.laws.interface import Law
@@ -33,6 +35,11 @@ class TruthColumns(NamedTuple):
     attitude: Array
     rate: Array
     voltages: Array
+
+
+def is_of_tick(truth: Truth, actuators: int) -> bool:
+    """Whether a true state can be that of a session's tick; a stranger's may have any tick, and any plant's motors."""
+    return 0 <= (truth.session_tick or 0) < NEVER and len(truth.voltages) == actuators
 
 
 class Rows(NamedTuple):

@@ -102,6 +102,8 @@ class TickReader:
         rows, wire = block.controller, self._wire
         if not rows:
             return np.empty((0, wire.actuators)), np.empty((0, wire.actuators))
+        if block.state is not None and (sent := block.state.get("sent_codes")) is not None:
+            self._commanded = tuple(sent)  # a silent command repeats one of before the log's first row
         framed = rows["sent_as"] == Sent.FRAME
         codes = codes_in(wire.command, rows["command"][framed])
         held, self._commanded = held_codes(framed, codes, self._commanded)

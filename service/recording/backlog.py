@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import Final
 
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import Delivery
 
 MOST_MESSAGES: Final = 200_000
 MOST_BYTES: Final = 128_000_000

@@ -17,11 +17,10 @@ from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.runtime.host_facts import versions
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.mcap_file import CHUNK_BYTES, with_checksum
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape
 
-FRAME_ENCODING: Final = "x-aeroloop-frame"
 TRACE_ENCODING: Final = "x-aeroloop-trace"
 
 NO_LIMIT: Final = 1 << 60
@@ -160,11 +159,8 @@ class LogFile:
         return channel
 
 
-def _raw_shape(topic: topics.Topic) -> Shape:
+def _raw_shape(topic: topics.Topic) -> Shape | None:
     if topic.carries == "trace":
         text = "batch of rows: section 10 of the attachment protocol/SPEC.md; its frames by the plant's description"
         return Shape("aeroloop.Trace", TRACE_ENCODING, text.encode(), TRACE_ENCODING)
-    if topic.model is None:
-        text = f"{topic.title} frame: bits as in the attachment protocol/SPEC.md, by the plant's wire spec"
-        return Shape(f"aeroloop.{topic.title}", FRAME_ENCODING, text.encode(), FRAME_ENCODING)
-    return json_shape(f"aeroloop.{topic.title}", topic.model)
+    return json_shape(f"aeroloop.{topic.title}", topic.model) if topic.model is not None else None

@@ -1,11 +1,12 @@
 """Recorder process: writes what every role publishes into MCAP files.
 
-It only subscribes. Traces, messages and descriptions are published from caches, so a recorder that starts late or is
-restarted recovers the last minute. Twice a second it takes the received messages and writes them, so log times are
-exact to 0.5 s. A channel per key holds the raw payloads, decoded channels are written at a bounded rate, and losses
-are published and recorded.
+It only subscribes. Traces, messages and descriptions are published from caches, so a recorder that starts late, is
+restarted or was cut off recovers the last minute, the newest messages first: a file is in the order of arrival. Twice a
+second it takes the received messages and writes them, so log times are exact to 0.5 s. A channel per key holds the raw
+payloads, decoded channels are written at a bounded rate, and losses are published and recorded.
 
-A crash costs the open chunk and 0.5 s; the restarted recorder recovers them from the caches.
+A crash costs the open chunk and 0.5 s; the restarted recorder recovers them from the caches. One that is stopped first
+takes what caches still hold.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import Description, Loss, Status
-from aeroloop.protocol.messages.states import NOT_RECORDING
+from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Loss, LossReason, Status
+from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import ANSWER_S, SOON_S, Delivery
 from aeroloop.service.recording.backlog import Backlog
 from aeroloop.service.recording.rolling import RollingLog
 from aeroloop.service.recording.subscriptions import Subscriptions
@@ -34,15 +35,10 @@ if TYPE_CHECKING:
 WORK_EVERY_S: Final = 0.5
 """Messages can wait: a chunk is closed only once a second."""
 
-SOON_S: Final = 0.05
-"""While caches are queried: of each, a page is taken at a time. Also after many messages."""
 MANY: Final = 100
-"""So many at once, as of a flood: each may hold 64 KiB of Zenoh's buffers."""
+"""After so many at once, as of a flood, the next are taken `SOON_S` later, as while caches are queried."""
 
 STATUS_EVERY_S: Final = 1.0
-
-TAKEN_BYTES: Final = 8_388_608
-"""Payload taken before the status is published again."""
 
 DESCRIPTION_BYTES: Final = 4_194_304
 """Descriptions read meanwhile: at full length, each takes 20 ms."""
@@ -50,17 +46,11 @@ DESCRIPTION_BYTES: Final = 4_194_304
 AT_ONCE: Final = 2000
 """Messages written before messages are taken from the rings again."""
 
-QUIET_S: Final = 0.3
-"""After this long without a message the network counts as quiet [s]."""
-
-ANSWER_S: Final = 5.0
-"""Longest wait for a role's answer at the end; after it recording ends without the role's last messages [s]."""
+END_S: Final = 8.0
+"""Longest time for what caches hold when recording ends [s]; a service manager kills after 10."""
 
 TRIM_BYTES: Final = 4_000_000
 """After so many bytes are written, freed memory goes back to the system: after a flood, malloc would keep it."""
-
-GOES_ON_S: Final = 1.0
-"""Longest wait for a quiet network at the end [s]."""
 
 _malloc_trim: Final = getattr(ctypes.CDLL(None), "malloc_trim", None)
 """Of glibc; other C libraries have none."""
@@ -73,9 +63,10 @@ class Recorder:
 
     def __init__(self, role: Role, settings: RecorderSettings) -> None:
         self._role = role
-        self._frames = settings.frames
         self._backlog = Backlog()
-        self._lost: Counter[str] = Counter()  # by reason
+        self._lost: Counter[LossReason] = Counter()
+        self._silent: list[str] = []  # what cannot be reached as recording ends
+        self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
         self._status_due = 0.0
         self._written_bytes = 0  # since memory was last given back
         self._status_written = 0
@@ -91,43 +82,42 @@ class Recorder:
                 self._decoder = Decoder(settings.decoded_hz)
 
     def run(self) -> None:
-        """Record until the role's `stop` is set; then take the messages in transit and close the log."""
-        self._subscriptions = Subscriptions(self._role.zenoh, frames=self._frames)
+        """Record until the role's `stop` is set; then take what caches still hold and close the log."""
+        self._subscriptions = Subscriptions(self._role.zenoh)
         self._role.announce()
         self._role.event("started", f"recording to {self.log.path}")
         try:
             taken = 0
             while not self._role.stop.wait(self._pause_s(taken)):
                 taken = self._take()
-                self._role.take_inbox()
                 if time.monotonic() >= self._status_due:
-                    self._publish_losses()
+                    self._publish_losses(self._subscriptions.losses())
                     self._publish_status()
                 self.log.tend()
         finally:
-            self._settle()
+            losses = self._take_last()
             self.log.try_again()
             self._take_all()
-            self._publish_losses()
+            self._publish_losses(losses)
             self._publish_status()
             self._take_all()
             self.log.close(len(self._backlog))
 
-    def reconfigure(self, settings: RecorderSettings) -> None:
-        """Take over the settings that may change while recording."""
-        self.log.settings = settings
-
-    def _settle(self) -> None:
-        """Take messages in transit. A role's answer follows its earlier messages, because a link keeps the order."""
-        for _ in self._role.zenoh.get(topics.key("description", "*"), timeout=ANSWER_S):
-            pass
-        now = last = time.monotonic()
-        deadline = now + GOES_ON_S
-        while now < deadline and (now - last < QUIET_S or self._subscriptions.recovering):
-            time.sleep(0.0 if self._behind else QUIET_S / 10)
+    def _take_last(self) -> list[Loss]:
+        """Take what caches hold, while pages bring something, and return what is lost thereby."""
+        now = begun = time.monotonic()
+        while now < min(begun + END_S, max(begun, self._subscriptions.news) + ANSWER_S):
+            self._take(last=True)
+            if self._subscriptions.complete(begun):
+                break
+            time.sleep(0.0 if self._behind else SOON_S)
             now = time.monotonic()
-            if self._take():
-                last = now
+        for key, age_s in self._subscriptions.silent().items():
+            self._silent.append(
+                f"nothing of {key} was received for {age_s:.0f} s: what it has published since is not in the log"
+            )
+            self._role.event("lost", self._silent[-1])
+        return self._subscriptions.losses(finished=True)
 
     def _pause_s(self, taken: int) -> float:
         if self._behind:
@@ -140,26 +130,23 @@ class Recorder:
         return self.log.writable and len(self._backlog) > 0
 
     def _take_all(self) -> None:
-        self._take(held=True)
+        self._take()
         while self._behind:
             self._write()
 
-    def _take(self, *, held: bool = False) -> int:
+    def _take(self, *, last: bool = False) -> int:
         """Take the received messages and write some of those waiting. Returns the number received."""
-        count, size, described, now = 0, 0, 0, time.time_ns()
-        for received in self._subscriptions.take(held=held):
+        count, described, now = 0, 0, time.time_ns()
+        for received in self._subscriptions.take(last=last):
             count += 1
-            size += len(received.payload)
             address = _address(received.key)
             if address is not None and address.topic.name == "description":
                 described += len(received.payload)
                 if described <= DESCRIPTION_BYTES:
-                    self._configure(received)  # at once: other messages are decoded by it
+                    self._configure(received, now)  # at once: other messages are decoded by it
             if not self._backlog.room(received):
                 self._write()
             self._backlog.put(received, now)
-            if size > TAKEN_BYTES and not held:
-                break  # a flood; the rest waits, or is dropped
         self._write()
         return count
 
@@ -178,34 +165,37 @@ class Recorder:
 
     def _decode(self, received: Delivery, at_ns: int) -> list[Decoded]:
         address = _address(received.key)
-        if address is None or address.topic.carries == "frame":
+        if self._decoder is None or address is None:
             return []
         if address.topic.name == "trace" and (batch := read_batch(received.payload)) is not None:
-            for change in batch.tail.changes:
-                self.log.add_change(received.key, change)
-            return self._decoder.rows(address.vehicle, batch) if self._decoder else []
+            return self._decoder.rows(address.vehicle, batch)
         at_ns = at_ns if received.published_ns is None else max(0, received.published_ns)
-        return self._decoder.take(address, received.payload, at_ns) if self._decoder else []
+        return self._decoder.take(address, received.payload, at_ns)
 
-    def _configure(self, received: Delivery) -> None:
+    def _configure(self, received: Delivery, at_ns: int) -> None:
+        published_ns = received.published_ns or at_ns
+        if published_ns < self._described.get(received.key, 0):
+            return  # recovered after a newer one
         try:
             description = intake.read(Description, received.payload, intake.REFERENCE)
         except intake.IntakeError:
             self._role.warn(received.key, "fault", f"{received.key} carries no description of this version")
             return
+        self._described[received.key] = published_ns
         self.log.add_description(received.key, received.payload)
         if self._decoder is not None:
             self._decoder.configure(description)
 
-    def _publish_losses(self) -> None:
+    def _publish_losses(self, losses: list[Loss]) -> None:
         """Publish, and thereby record, losses; those of the full backlog once the disk accepts writes again."""
-        losses = self._subscriptions.losses()
         if self.log.writable:
             losses += [Loss(key=key, count=count, reason="disk") for key, count in self._backlog.refused.items()]
             self._backlog.refused.clear()
         for loss in losses:
             self._lost[loss.reason] += loss.count
             self._role.publish("loss", loss)
+            text = f"{loss.count} messages of {loss.key} are not in the log: {LOSS_REASONS[loss.reason]}"
+            self._role.warn(f"{loss.key} {loss.reason}", "fault", text)
 
     def _report(self, text: str, bad: bool) -> None:
         if bad:
@@ -216,13 +206,14 @@ class Recorder:
     def _publish_status(self) -> None:
         now = time.monotonic()
         written, log = self.log.written, self.log
-        notes = [f"{count} messages lost: {reason}" for reason, count in sorted(self._lost.items())]
+        notes = [f"{count} messages lost: {LOSS_REASONS[reason]}" for reason, count in sorted(self._lost.items())]
+        notes += self._silent
         if log.trouble:
             notes.append(f"{len(self._backlog)} messages wait in memory")
-        state = "stopped" if self._role.stop.is_set() else "recording" if log.writable else NOT_RECORDING
+        state = STOPPED if self._role.stop.is_set() else "recording" if log.writable else NOT_RECORDING
         rate_hz = (written - self._status_written) / max(now - self._status_at, 1e-3)
         self._role.status(Status(
             role=self._role.role, state=state, cause=log.trouble or None, uptime_s=self._role.uptime_s, ticks=0,
-            rate_hz=rate_hz, skipped=0, received=written, notes=notes,
+            rate_hz=rate_hz, skipped=0, received=written, lost=self._lost.total(), notes=notes,
         ))  # fmt: skip
         self._status_written, self._status_at, self._status_due = written, now, now + STATUS_EVERY_S

@@ -1,9 +1,8 @@
 """Rolling log: the files of a run, one after another, on a disk that may be full.
 
-A file is closed at a size or an age. The next one begins with what a reader of it alone needs: descriptions, and the
-gains and references that the sessions' controllers follow. When the disk refuses, nothing is dropped here: `writable`
-turns false, the caller keeps its messages, and `tend` tries again every second. On a full disk it retries the same
-file, after any other error it begins a new one.
+A file is closed at a size or an age. The next one begins with the descriptions, which a reader of it alone needs. When
+the disk refuses, nothing is dropped here: `writable` turns false, the caller keeps its messages, and `tend` tries again
+every second. On a full disk it retries the same file, after any other error it begins a new one.
 """
 
 from __future__ import annotations
@@ -20,9 +19,8 @@ from pathlib import Path
 from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.transport.publication import Delivery
-from aeroloop.service.logs.mcap_file import CHANGE_METADATA, DESCRIPTION_METADATA, RECORDER_METADATA, opening
+from aeroloop.protocol.transport.history import Delivery
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA, RECORDER_METADATA, opening
 from aeroloop.service.recording.log_file import LogFile
 from aeroloop.service.settings import RecorderSettings
 from aeroloop.service.viewers.schemas import Decoded
@@ -73,7 +71,6 @@ class RollingLog:
         self._base = log_path(place, "aeroloop-%Y%m%d-%H%M%S.mcap")
         self._named_by_time = self._base != place
         self._descriptions: dict[str, bytes] = {}
-        self._changes: dict[str, list[Change]] = {}  # of the last session of each key
         self._unwritten: list[tuple[Delivery, int, list[Decoded]]] = []
         self._part = 0  # of the next file
         self._began = 0.0
@@ -110,13 +107,6 @@ class RollingLog:
         if self._descriptions.get(key) != payload:
             self._descriptions[key] = payload
             _describe(self._file, key, payload)
-
-    def add_change(self, key: str, change: Change) -> None:
-        """Keep a change from the tail of the trace `key` for later files; this file has it in the trace."""
-        changes = self._changes.get(key)
-        if changes is None or changes[0].session != change.session:
-            changes = self._changes[key] = []
-        changes.append(change)
 
     def tend(self) -> None:
         """Do what is due: close a chunk, begin a new file, retry the disk."""
@@ -257,9 +247,6 @@ class RollingLog:
             file.attach_specification(round(started.timestamp() * 1e9))
             for key, description in self._descriptions.items():
                 _describe(file, key, description)
-            for key, changes in self._changes.items():
-                for change in changes:
-                    file.add_metadata(CHANGE_METADATA, {"key": key, "json": change.model_dump_json()})
             file.commit()
         except OSError:
             file.remove()

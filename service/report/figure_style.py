@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -17,9 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from aeroloop.service.logs.outputs import OutputError
 
-Columns = Literal[1, 2]
-
-WIDTH_IN: Final[dict[Columns, float]] = {1: 3.5, 2: 7.16}
+WIDTH_IN: Final[dict[int, float]] = {1: 3.5, 2: 7.16}
 """Width of one column, and of two, in IEEE's journals [in]."""
 
 FORMATS: Final[dict[str, dict[str, Any]]] = {
@@ -67,9 +65,9 @@ def figure_style() -> AbstractContextManager[None]:
     return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]  # its keys are literals in the stubs
 
 
-def stacked(panels: int, columns: Columns, height: float = 0.85) -> tuple[Figure, list[Axes]]:
-    """A figure with panels of this height [in] over one time axis [s]."""
-    figure = Figure(figsize=(WIDTH_IN[columns], 0.45 + height * panels), layout="constrained")
+def stacked(panels: int, height: float = 0.85) -> tuple[Figure, list[Axes]]:
+    """A figure, one column wide, with panels of this height [in] over one time axis [s]."""
+    figure = Figure(figsize=(WIDTH_IN[1], 0.45 + height * panels), layout="constrained")
     axes: list[Axes] = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
     for axis in axes:
         axis.margins(x=0)

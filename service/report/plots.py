@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 
 from aeroloop.service.config import Settings
 from aeroloop.service.logs.files import ReviewError
-from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, Columns, figure_style, save, stacked
+from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, figure_style, save, stacked
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report
 
@@ -37,11 +37,11 @@ _NORMS: Final = {"‖z‖": r"$\|z\|$", "V": "$V$"}
 _AXES: Final = {"₁": "1", "₂": "2", "₃": "3", "1": "1", "2": "2", "3": "3"}
 
 
-def draw_figures(report: Report, settings: Settings, folder: Path, columns: Columns = 1) -> list[Path]:
+def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]:
     """Draw what a report has, each figure as PDF, SVG and PNG, and return the paths.
 
-    The settings are its controller's, `columns` is how many of a journal's columns the figures are wide. Raises
-    ReviewError if the session has no ticks, OSError if the folder cannot be written.
+    The settings are its controller's. Raises ReviewError if the session has no ticks, OSError if the folder cannot be
+    written.
     """
     if not len(report.time):
         raise ReviewError("the log has no answered measurement to draw")
@@ -51,7 +51,7 @@ def draw_figures(report: Report, settings: Settings, folder: Path, columns: Colu
             panels = [panel for group in groups for panel in report.panels if panel.group == group]
             if not panels:
                 continue
-            figure, axes = stacked(len(panels), columns)
+            figure, axes = stacked(len(panels))
             for axis, panel in zip(axes, panels, strict=True):
                 _draw(axis, panel, report)
                 axis.set_ylabel(_label(panel, quantized=case != "continuous"))

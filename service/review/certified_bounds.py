@@ -1,8 +1,8 @@
 """Certificate and bounds that a review checks a session against.
 
-The controller's description has the certificate of its configuration, which is used if the session began with that
-configuration; with other gains or another reference, or in an older log, it is computed from the log. The bounds of
-Lemma 1 are always computed.
+The controller's description has the certificate of its configuration, which is used if the ticks judged begin with that
+configuration; with other gains or another reference it is computed from the log. The bounds of Lemma 1 are always
+computed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pydantic import ValidationError
 
-from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.operator import Change, in_force
 from aeroloop.service.config import Settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.logs.ticks import Ticks
@@ -75,15 +75,16 @@ def certified_bounds(
 
     Args:
         settings: The controller's configuration.
-        changes: The session's changes of gains and reference, in order; one at tick 0 is what it began with.
+        changes: The changes that set the gains and the reference of its first judged tick.
         promised: The certificate in the controller's description, if there is one; unused if of another version.
     """
-    first = changes[0] if changes and changes[0].tick == 0 else None
-    law, reference = settings.law, (first and first.reference) or settings.reference
+    law, reference = settings.law, settings.reference
     own = settings.law if isinstance(settings.law, AdaptiveSettings) else None
+    for change in in_force(changes):
+        reference = change.reference or reference
+        if own is not None and change.gains is not None:
+            law = own = own.model_copy(update=change.gains.named)
     try:
-        if own is not None and first is not None and first.gains is not None:
-            law = own = own.model_copy(update=first.gains.named)
         begun = with_theorem(settings.model_copy(update={"law": law, "reference": reference}))
         bounds = evaluate(begun)
     except NoTheoremError as error:
@@ -96,5 +97,5 @@ def certified_bounds(
     if (law, reference) == (settings.law, settings.reference) and promised is not None:
         with suppress(ValidationError):
             certificate = Certificate.model_validate(promised)
-    certificate = certificate or certify(begun, seek_remedies=False)
+    certificate = certificate or certify(begun)
     return CertifiedBounds(own, certificate, bounds, certificate.verdict)

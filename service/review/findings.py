@@ -11,7 +11,7 @@ from aeroloop.service.figures import Figures
 from aeroloop.service.logs.runs import Run
 from aeroloop.service.logs.traces import SessionKey
 from aeroloop.service.review.events import EventLog
-from aeroloop.service.review.report import Disagreement, Findings, Mark, Recorded, flat
+from aeroloop.service.review.report import Disagreement, Findings, Recorded, flat
 from aeroloop.service.review.session import Session
 
 LOCKSTEP: Final = "in lockstep the plant waits for each command, so no duration is a loop's"
@@ -22,13 +22,8 @@ OWN_AFFAIRS: Final = (
 )  # fmt: skip
 """Keys that each end has for itself, or that a command sets at the plant alone."""
 
-FrameCounts = dict[str, dict[str, int]] | None
-"""Of `WireCheck`."""
 
-
-def findings_of(
-    figures: Figures, which: SessionKey, session: Session, events: EventLog, run: Run, frames: FrameCounts
-) -> Findings:
+def findings_of(figures: Figures, which: SessionKey, session: Session, events: EventLog, run: Run) -> Findings:
     """Findings of a session; its figures of merit are copied unchanged."""
     observer, offset = session.observer, session.reader.offset
     timing, age = observer.timing, events.age_us
@@ -46,11 +41,12 @@ def findings_of(
         few = "too few ticks have all four times of sending and receiving"
         reasons["clock_offset_us"] = LOCKSTEP if lockstep else few
     faults = events.faults.intervals()
-    theorem, unknown = observer.check.findings(faults=bool(faults))
+    theorem, not_judged = observer.check.findings(faults=bool(faults))
+    unknown = [one for one in run.unknown if (one.vehicle, one.session) == which]
     gaps = [gap for gap in run.missing if gap.vehicle == which[0]]
     return Findings(
         **{name: getattr(figures, name) for name in Figures.model_fields if name != "reasons"},
-        reasons=reasons | unknown,
+        reasons=reasons | not_judged,
         vehicle=which[0],
         session=which[1],
         sessions=len(run.sessions_of(which[0])),
@@ -70,10 +66,14 @@ def findings_of(
         losses=events.losses,
         missing_ticks={end: sum(gap.rows for gap in gaps if gap.end == end) for end in ("controller", "plant")},
         missing=gaps,
+        unknown=unknown,
+        unseen={
+            "missing_ticks": [*(str(gap) for gap in gaps if gap.session == which[1] and gap.rows), *map(str, unknown)],
+            "damages": run.files.damaged,
+        },
         lapses={name: count for name, count in session.lapses.items() if count},
-        frames=frames,
         theorem=theorem,
-        marks=[mark for mark in events.marks() if not _repeats(mark, theorem.verdict)],
+        marks=events.marks(),
         faults=faults,
     )
 
@@ -83,11 +83,6 @@ def latency_of(session: Session) -> tuple[Percentiles | None, str]:
     if session.settings.loop.lockstep:
         return None, LOCKSTEP
     return session.observer.latency, "no measurement was answered"
-
-
-def _repeats(mark: Mark, verdict: str) -> bool:
-    """Whether an event of the controller states the certificate that the findings have."""
-    return mark.role == "controller" and mark.kind in ("started", "changed") and mark.text.startswith(verdict[:-1])
 
 
 def disagreements(described: Mapping[str, Description]) -> list[Disagreement]:

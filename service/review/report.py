@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, Field
 
 from aeroloop.service.figures import Figures
+from aeroloop.service.logs.in_force import Unknown
 from aeroloop.service.logs.traces import Array, Missing
 
 
@@ -179,15 +180,19 @@ class Findings(Figures):
         description="rows of either end that were never recorded, in all of the vehicle's sessions"
     )
     missing: list[Missing] = Field(description="where they are, and sessions of whose last batch there is none")
+    unknown: list[Unknown] = Field(
+        default=[],
+        description="ticks that no figure counts: the log does not hold the gains, the reference and the law's state",
+    )
+    unseen: dict[str, list[str]] = Field(
+        default_factory=dict,
+        description="what of the session the figures do not see, by the figure whose limit permits it: ticks that the "
+        "log lacks, and files that are cut or damaged",
+    )
     lapses: dict[str, int] = Field(
         description="deviations from one frame each way per tick. At the controller: measurements received "
         "`late`, ticks `missed`, `malformed` measurements; at the plant: commands `stale`, `repeated`, `refused` "
         "(malformed, or without a valid value), `withheld` by a fault"
-    )
-    frames: dict[str, dict[str, int]] | None = Field(
-        default=None,
-        description="if the recorder recorded frames, too: how many were `recorded` of either kind, and "
-        "how many `differ` from what the ends have in their traces",
     )
     marks: list[Mark]
     faults: list[FaultInterval] = Field(
@@ -283,7 +288,7 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 ADDRESSES: Final = (
     "network.", "recorder.path", "recorder.directory", "can.channel", "can.node", "can.options.",
-    "plant.quanser.card_identifier",
+    "plant.quanser.card_identifier", "plant.state_directory",
 )  # fmt: skip
 """Keys that only say where something is."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from aeroloop.protocol.errors import AeroloopError
@@ -41,6 +42,9 @@ SHORT: Final[dict[str, str]] = {
     **{f"age.{name}": f"age_us.{name}" for name in ("p50", "p99", "max")},
 }
 """Other names for some of them."""
+
+UNSEEN_SHOWN: Final = 3
+"""Of what a figure does not see, so many are listed in its line."""
 
 AT_LEAST: Final = ("theorem.held",)
 """Figures of which more is better."""
@@ -97,12 +101,41 @@ class Limit(NamedTuple):
         kept = value >= self.bound if self._lower else value <= self.bound
         return None if kept else f"{self.figure} is {value:.6g}, {words[1]} {self.bound:g}"
 
-    def check(self, findings: Findings) -> Check:
-        """Whether it holds, and what was found."""
+    def unseen(self, findings: Findings, limits: Sequence[Limit]) -> str | None:
+        """What the figure does not see, in words, if it seems to hold; None where all was seen, or is permitted.
+
+        A limit of `missing_ticks` or `damages` among `limits` permits as many.
+        """
+        if self.broken(findings) is not None:
+            return None
+        permitted = {SHORT.get(limit.figure, limit.figure) for limit in limits if limit.broken(findings) is None}
+        found = {figure: lines for figure, lines in findings.unseen.items() if lines and figure not in permitted}
+        if not found:
+            return None
+        lines = [line for of_one in found.values() for line in of_one]
+        more = f"; and {len(lines) - UNSEEN_SHOWN} more" if len(lines) > UNSEEN_SHOWN else ""
+        permits = " ".join(f"--require {figure}={value_of(findings, figure):g}" for figure in found)
+        return f"but not seen: {'; '.join(lines[:UNSEEN_SHOWN])}{more} ({permits} permits it)"
+
+    def check(self, findings: Findings, limits: Sequence[Limit] = ()) -> Check:
+        """Whether it holds, and what was found, required together with `limits`."""
         name, value = SHORT.get(self.figure, self.figure), self.value(findings)
         unit = UNITS[name]
         space = "" if unit in ("", "°") else " "
         reasons = (why for key, why in findings.reasons.items() if name == key or name.startswith(f"{key}."))
         found = next(reasons, "not known") if value is None else f"{value:.6g}{space}{unit}"
         text = f"{self.figure} {'≥' if self._lower else '≤'} {self.bound:g}{space}{unit}"
-        return Check(text=text, holds=self.broken(findings) is None, found=found)
+        unseen = self.unseen(findings, limits)
+        holds = self.broken(findings) is None and unseen is None
+        return Check(text=text, holds=holds, found=found if unseen is None else f"{found}, {unseen}")
+
+
+def broken_limits(limits: Sequence[Limit], findings: Findings) -> list[str]:
+    """Limits that do not hold, a line each; one that seems to hold of a log that lacks something is one of them."""
+    lines = []
+    for limit in limits:
+        if (why := limit.broken(findings)) is not None:
+            lines.append(why)
+        elif (unseen := limit.unseen(findings, limits)) is not None:
+            lines.append(f"{limit.figure} is {limit.value(findings):.6g}, {unseen}")
+    return lines

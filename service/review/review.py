@@ -20,7 +20,6 @@ from aeroloop.service.logs.files import Progress, ReviewError
 from aeroloop.service.logs.runs import Run, Taker
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import SessionKey
-from aeroloop.service.logs.wire_check import WireCheck
 from aeroloop.service.review.certified_bounds import certified_bounds
 from aeroloop.service.review.events import EventLog
 from aeroloop.service.review.findings import facts_of, findings_of, latency_of, name_of
@@ -52,7 +51,9 @@ class Review(NamedTuple):
             raise ReviewError(f"nothing to draw after {max(0.0, part.since_s):g} s{until}: the session has {lasts:g} s")
         return Report(
             name=self.name,
-            findings=self.findings.model_copy(update={"checks": [limit.check(self.findings) for limit in limits]}),
+            findings=self.findings.model_copy(
+                update={"checks": [limit.check(self.findings, limits) for limit in limits]}
+            ),
             time=time,
             panels=panels,
             thinned=observer.thinned,
@@ -107,18 +108,15 @@ def read(
 
         missing = [gap for gap in run.missing if (gap.vehicle, gap.session) == which]
         judged = Session(settings, check, missing, watch, part)
-        frames = WireCheck(which, settings.wire, run.reached)
-        events = EventLog(which, settings.loop.period, run.reached, run.open_sessions, alone=session is not None)
+        events = EventLog(which, settings.loop.period, run.extents[which], alone=session is not None)
 
         def route(address: Address) -> Taker | None:
             if address.topic.name == "truth":
                 return judged.truth if address.vehicle == which[0] else None
-            return frames.route(address) or events.route(address)
+            return events.route(address)
 
         for block in run.read([which], route):
-            events.changed(block.changes)
-            events.faults.take(block)
-            frames.take(block)
+            events.take(block)
             judged.take(block)
         judged.finish()
     except ConfigError as error:
@@ -135,5 +133,5 @@ def read(
         reasons={} if latency else {"latency_us": reason},
         damages=[*run.files.unread, *damages],
     )
-    findings = findings_of(figures, which, judged, events, run, frames.findings())
+    findings = findings_of(figures, which, judged, events, run)
     return Review(figures, findings, judged, which, name_of(paths), facts_of(run, events, which))

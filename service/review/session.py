@@ -11,11 +11,12 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from aeroloop.protocol.messages.models import Truth
-from aeroloop.protocol.messages.operator import Change
+from aeroloop.protocol.messages.operator import Change, in_force
 from aeroloop.protocol.messages.trace import Outcome, Received
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Score
 from aeroloop.service.logs.runs import Block
+from aeroloop.service.logs.table import is_of_tick
 from aeroloop.service.logs.tick_reader import TickReader
 from aeroloop.service.logs.ticks import Ticks
 from aeroloop.service.logs.traces import Missing
@@ -84,8 +85,14 @@ class Session:
 
     def take(self, block: Block) -> None:
         """Review the next block."""
-        observer = self._observer = self._observer or Observer(self.settings, self._check(block.changes), self.part)
-        observer.check.changed(block.changes)
+        changes = block.changes
+        if self._observer is None:
+            at = int(block.k[0]) if len(block.k) else 0
+            begun, changes = [one for one in changes if one.tick <= at], [one for one in changes if one.tick > at]
+            self._observer = Observer(self.settings, self._check(begun), self.part)
+            changes = [*in_force(begun), *changes]
+        observer = self._observer
+        observer.check.changed(changes)
         self._session = block.which[1]
         self._add_truths(observer.check)
         self._count(block)
@@ -114,8 +121,12 @@ class Session:
             truths = [truth for text in self._truths if (truth := _truth(text)) is not None]
             self.unreadable += len(self._truths) - len(truths)
         for truth in truths:
-            if truth.session == self._session:
+            if truth.session != self._session:
+                continue
+            if is_of_tick(truth, self.settings.wire.actuators):
                 check.truth(truth.session_tick, truth.attitude, truth.rate)
+            else:
+                self.unreadable += 1
         self._truths.clear()
 
     def _count(self, block: Block) -> None:

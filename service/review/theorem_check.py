@@ -11,9 +11,11 @@ changes gains or reference. Why: before and after, another certificate holds.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from math import ceil, degrees, inf, nan
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -128,7 +130,7 @@ class TheoremCheck:
         self._guarantees = Guarantees(certified, settings.loop, settings.plant)
         self._changes: list[Change] = []  # the first few
         self._since, self._until = 0, inf
-        self._truths: deque[tuple[int, Quaternion, Vector]] = deque(maxlen=WAITING)
+        self._truths: deque[tuple[int, Quaternion, Vector]] = deque()
         self._before: tuple[Ticks, Conditions] | None = None  # the last block, for late truths
         self._drawn = np.empty((0, 8))  # the last true state, as of `_judge_truths`
         self._counts: dict[str, InequalityCount] = {}
@@ -141,18 +143,21 @@ class TheoremCheck:
     # ── input ──
 
     def changed(self, changes: Sequence[Change]) -> None:
-        """Add changes of gains and reference, in order, before their ticks.
-
-        The first is the one that the session began with, unless the log lacks it.
-        """
-        self._changes = [*self._changes, *changes][:3]
+        """Add changes of gains and reference, in order, before their ticks; first those in force at the first tick."""
+        self._changes = [*self._changes, *changes][:4]
         self._since, self._until = _judged_ticks(self._changes, self._period)
         self._settled = self._since + transient(self._certified.law) / self._period
 
     def truth(self, tick: int | None, attitude: Quaternion, rate: Vector) -> None:
-        """Add the true state at a tick's measurement; a state without a tick (None) is dropped."""
-        if tick is not None and (not self._truths or tick > self._truths[-1][0]):
-            self._truths.append((tick, attitude, rate))
+        """Add the true state at a tick's measurement, in any order; one without a tick, or repeated, is dropped."""
+        if tick is None:
+            return
+        truths, one = self._truths, (tick, attitude, rate)
+        at = len(truths) if not truths or tick > truths[-1][0] else bisect_left(truths, tick, key=itemgetter(0))
+        if at == len(truths) or truths[at][0] != tick:
+            truths.insert(at, one)
+        if len(truths) > WAITING:
+            truths.popleft()
 
     @property
     def judged_s(self) -> tuple[float, float]:
@@ -350,13 +355,14 @@ def transient(law: AdaptiveSettings | None) -> float:
 
 def _judged_ticks(changes: Sequence[Change], period: float) -> tuple[int, float]:
     """The first tick, and the end, of the span in which a session follows its first reference with its first gains."""
-    if not changes or changes[0].tick:  # the log begins within the session
-        return 0, changes[0].tick if changes else inf
-    since, later = 0, list(changes[1:])
-    if later and later[0].start is not None:  # the approach, which may be faster than the reference
-        way = later.pop(0)
-        since = way.tick + ceil((way.ease_s + way.within_s) / period)
-    return since, later[0].tick if later else inf
+    since, begun = 0, set[str]()
+    for change in changes:
+        # An approach from the attitude found belongs to the beginning; it may be faster than the reference.
+        if change.start is None and begun == {"gains", "reference"}:
+            return since, change.tick
+        begun |= {name for name in ("gains", "reference") if getattr(change, name) is not None}
+        since = max(since, change.tick + ceil(change.within_s / period))
+    return since, inf
 
 
 def _larger(known: tuple[float, float] | None, norms: Array, angles: Array) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from os.path import expanduser, isfile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from aeroloop.plant_emulator.own_plant import EMULATED, class_of
+from aeroloop.plant_emulator.plant import EMULATED, class_of
 from aeroloop.service.config import ConfigError, Settings, load_over
 from aeroloop.service.control.laws.registry import BUILT_IN, OwnLawSettings, law_class
 

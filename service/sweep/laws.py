@@ -6,6 +6,7 @@ first of bits and sensors, until the attitude error leaves a bound or the plant 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -15,13 +16,13 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.service.config import load_over, with_law_settings
-from aeroloop.service.lab.experiment import PATH, paths
 from aeroloop.service.lab.law_margins import PUSHED_S, survives
 from aeroloop.service.lab.workers import PROCESSES, Workers
 from aeroloop.service.logs.outputs import writing
 from aeroloop.service.sweep.axes import Configuration
 from aeroloop.service.sweep.law_choices import WINDS, Choice, Comparison
 from aeroloop.service.sweep.sweep import Plan, run_sweep
+from aeroloop.service.sweep.table import WITHIN_DEG
 
 _MARGINS: Final = ("delay_ms", "lost_frames")
 
@@ -42,7 +43,6 @@ class LawRow(BaseModel):
     second_half_error_deg: float | None = Field(default=None, description="the same in the second half: settled [deg]")
     command_changes_per_s: float | None = Field(default=None, description="chatter: changes of a voltage [1/s]")
     bits_per_s: float | None = Field(default=None, description="payload of both directions, sent on change [bit/s]")
-    path: str | None = Field(default=None, description=PATH)
     reason: str | None = Field(default=None, description="why there are no figures, of the first seed that has none")
 
 
@@ -71,7 +71,6 @@ class Laws(BaseModel):
     margin_duration_s: float = Field(description="length of a run with delay or lost frames [s]")
     margin_at: str = Field(description="bits of these; the sensors are the first of each plant")
     gains: dict[str, dict[str, Any]] = Field(description="settings of each law, for the first plant")
-    path: str = Field(description=PATH)
     rows: list[LawRow]
     margins: list[LawMargin]
     out: str | None = Field(description="table of all experiments")
@@ -113,7 +112,7 @@ def run_comparison(
             )
             for (choice, _), delay, lost in zip(pushed, survived[::2], survived[1::2], strict=True)
         ]
-        rows = with_margins(table, margins)
+        rows = with_margins(table, margins, comparison.within_deg)
     first = choices[0]
     return Laws(
         duration_s=plan.duration_s,
@@ -126,7 +125,6 @@ def run_comparison(
         margin_at=f"{first.bits} bits",
         gains={choice.law: _gains(plan, configuration) for choice, configuration in
                zip(choices, plan.found, strict=True) if choice.plant == first.plant},
-        path=paths(row["path"] or "frames" for row in rows),
         rows=[_row(choice, rows[i * plan.seeds : (i + 1) * plan.seeds]) for i, choice in enumerate(choices)],
         margins=margins,
         out=None if out is None else str(out),
@@ -148,8 +146,8 @@ def _pushed(comparison: Comparison) -> Iterator[tuple[Choice, tuple[str, ...]]]:
             yield choice, (*configuration.overrides, *calm)
 
 
-def with_margins(table: Path, margins: Sequence[LawMargin]) -> list[dict[str, Any]]:
-    """Add columns of the margins to a table of experiments; the rows of the whole."""
+def with_margins(table: Path, margins: Sequence[LawMargin], within_deg: float) -> list[dict[str, Any]]:
+    """Add columns of the margins, and their bound [deg], to a table of experiments; the rows of the whole."""
     import pyarrow as pa
     import pyarrow.parquet as parquet
 
@@ -160,6 +158,7 @@ def with_margins(table: Path, margins: Sequence[LawMargin]) -> list[dict[str, An
         text = LawMargin.model_fields[name].description or ""
         field = pa.field(name, pa.float64(), metadata={"description": text})
         found = found.append_column(field, pa.array([getattr(of[key], name) for key in keys], pa.float64()))
+    found = found.replace_schema_metadata({**found.schema.metadata, WITHIN_DEG: json.dumps(within_deg)})
     with writing(table, force=True) as part:
         parquet.write_table(found, part, compression="zstd")
     rows: list[dict[str, Any]] = found.to_pylist()
@@ -170,11 +169,10 @@ def _row(choice: Choice, rows: Sequence[dict[str, Any]]) -> LawRow:
     """The row of a combination, of those of its seeds."""
     if reasons := [row["reason"] for row in rows if row["reason"] is not None]:
         several = f"{len(reasons)} of {len(rows)} seeds: " if len(rows) > 1 else ""
-        return LawRow(**choice._asdict(), path="frames", reason=f"{several}{reasons[0]}")
+        return LawRow(**choice._asdict(), reason=f"{several}{reasons[0]}")
     figures: dict[str, Any] = {
         name: fmean(row[name] for row in rows) for name in ("z_track", "u_total", "command_changes_per_s")
     }
     figures |= {name: max(row[name] for row in rows) for name in ("max_error_deg", "second_half_error_deg")}
     sent = fmean(row["measurement_bits_per_s"] + row["command_bits_per_s"] for row in rows)
-    path = paths(row["path"] for row in rows)
-    return LawRow(**choice._asdict(), **figures, bits_per_s=sent, path=path)
+    return LawRow(**choice._asdict(), **figures, bits_per_s=sent)

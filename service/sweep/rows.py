@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.service.lab.experiment import ExperimentFigures
+from aeroloop.service.figures import Figures
 
 _HEAD: Final = b'{"aeroloop": "sweep", "layout": 2}\n'
 
@@ -32,7 +32,7 @@ class Key(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What an experiment gave, by the names of `ExperimentFigures`; without figures, the reason."""
+    """What an experiment gave, by the names of `Figures`; without figures, the reason."""
 
     z_track: float | None = None
     u_total: float | None = None
@@ -45,11 +45,10 @@ class Measured(NamedTuple):
     measurement_bits_per_s: float | None = None
     command_frames_per_s: float | None = None
     command_bits_per_s: float | None = None
-    path: str | None = None
     reason: str | None = None
 
 
-def measured(found: ExperimentFigures | str) -> Measured:
+def measured(found: Figures | str) -> Measured:
     """What stands in a row of figures, or of the reason why there are none."""
     if isinstance(found, str):
         return Measured(reason=found)
@@ -61,7 +60,7 @@ def measured(found: ExperimentFigures | str) -> Measured:
     return Measured(**{name: getattr(found, name) for name in _OF_FIGURES}, **of_streams)
 
 
-_OF_FIGURES: Final = [name for name in Measured._fields if name in ExperimentFigures.model_fields]
+_OF_FIGURES: Final = [name for name in Measured._fields if name in Figures.model_fields]
 
 
 class Rows:

@@ -20,7 +20,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.lab.cells import with_seed
-from aeroloop.service.lab.experiment import PATH, paths
 from aeroloop.service.lab.sentinel import fingerprint, run_each
 from aeroloop.service.lab.workers import PROCESSES, Workers
 from aeroloop.service.sweep.axes import Axis, Configuration, configurations
@@ -43,7 +42,6 @@ class Sweep(BaseModel):
     done: int = Field(description="experiments run, this time")
     resumed: int = Field(description="experiments found in the file of rows")
     failed: int = Field(description="rows with a reason instead of figures, such as a trip")
-    path: str = Field(description=PATH)
     out: str = Field(description="the table")
     rows: str = Field(description="the file of rows, from which a sweep resumes")
     version: str = Field(description="of aeroloop, and a digest of what it computes")
@@ -173,7 +171,6 @@ def run_sweep(
         done=spent.experiments,
         resumed=resumed,
         failed=sum(row.reason is not None for row in table),
-        path=paths(row.path for row in table if row.path is not None),
         out=str(out),
         rows=str(rows_file(out)),
         version=version,

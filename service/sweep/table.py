@@ -16,12 +16,16 @@ import pyarrow.parquet
 
 from aeroloop.protocol.wording import Shapes
 from aeroloop.service.config import Settings
-from aeroloop.service.lab.experiment import ExperimentFigures
+from aeroloop.service.figures import Figures
+from aeroloop.service.lab.sentinel import fingerprint
 from aeroloop.service.logs.outputs import OutputError, check_output, writing
 from aeroloop.service.sweep.rows import Key, Measured
 
 if TYPE_CHECKING:
     from aeroloop.service.sweep.sweep import Plan
+
+WITHIN_DEG: Final = b"aeroloop.within_deg"
+"""Key of a table's metadata: bound of the attitude error for its margins [deg]."""
 
 _TEXTS: Final = {
     "seed": "of wind and sensors",
@@ -35,11 +39,45 @@ _TEXTS: Final = {
 }
 
 
-def check_table(out: Path, inputs: Sequence[Path | None] = (), *, force: bool = False) -> None:
-    """Raise OutputError if the table cannot be written there, as `check_output` does."""
+def check_table(
+    out: Path,
+    planned: Plan,
+    inputs: Sequence[Path | None] = (),
+    *,
+    within_deg: float | None = None,
+    force: bool = False,
+) -> None:
+    """Raise OutputError if the table cannot be written there, as `check_output` does.
+
+    Without `force` a sweep replaces a table only if it has each of its rows and varied keys. `within_deg` is the bound
+    of the margins that a comparison of laws adds to its table [deg].
+    """
     if out.suffix != ".parquet":
         raise OutputError(f"--out must name a .parquet file, not {out}")
-    check_output(out, inputs, force=force)
+    check_output(out, inputs, force=True)
+    if out.exists() and not force and not _continues(planned, out, within_deg):
+        raise OutputError(
+            f"{out} exists already and is no table of this sweep; name another file, or replace it with --force"
+        )
+
+
+def _continues(planned: Plan, out: Path, within_deg: float | None) -> bool:
+    """Whether a sweep has each row and each varied key of the table in a file."""
+    try:
+        schema = pyarrow.parquet.read_schema(out)
+        varied = schema.names[: schema.names.index("seed")]
+        names = pyarrow.parquet.read_table(out, columns=["configuration", "seed", "version"])
+    except (OSError, ValueError):  # no table, or none of a sweep
+        return False
+    configurations, seeds, versions = (set(column.unique().to_pylist()) for column in names.columns)
+    bound = json.loads((schema.metadata or {}).get(WITHIN_DEG, b"null"))
+    return (
+        set(varied) <= {axis.key for axis in planned.axes}
+        and configurations <= {each.digest for each in planned.found}
+        and seeds <= set(range(planned.seeds))
+        and versions <= {fingerprint()}
+        and bound in (None, within_deg)
+    )
 
 
 def write_table(out: Path, planned: Plan, keys: Sequence[Key], rows: Sequence[Measured]) -> None:
@@ -52,8 +90,8 @@ def write_table(out: Path, planned: Plan, keys: Sequence[Key], rows: Sequence[Me
     }
     columns["seed"] = pa.array([key.seed for key in keys], pa.int64()), ""
     for i, name in enumerate(Measured._fields):
-        kind = {"reason": pa.string(), "path": pa.string(), "skipped_ticks": pa.int64()}.get(name, pa.float64())
-        field = ExperimentFigures.model_fields.get(name)
+        kind = {"reason": pa.string(), "skipped_ticks": pa.int64()}.get(name, pa.float64())
+        field = Figures.model_fields.get(name)
         columns[name] = pa.array([row[i] for row in rows], kind), (field and field.description) or ""
     columns["configuration"] = pa.array([key.configuration for key in keys]), ""
     columns["version"] = pa.array([key.version for key in keys]), ""

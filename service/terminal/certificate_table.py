@@ -1,4 +1,4 @@
-"""Terminal table of a certificate: verdict, remedies, bounds, assumptions, the terms that decide, or every term."""
+"""Terminal table of a certificate: verdict, bounds, assumptions, the terms that decide, or every term."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import re
 from collections.abc import Container
 from typing import Final
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import labelled
 from aeroloop.service.theorem.any_law import OwnCertificate
 from aeroloop.service.theorem.certificate import Certificate
@@ -26,13 +26,11 @@ def certificate_table(certificate: Certificate, *, verbose: bool = False) -> Non
     console.print(Text(certificate.verdict, style="bold green" if certificate.holds else "bold red"))
     for reason in certificate.violated[1:]:
         console.print(Text(f"  {reason}"))
-    for remedy in certificate.remedies:
-        console.print(Text(f"  {remedy.text}{':' if remedy.overrides else ''}"))
-        if remedy.overrides:  # left whole, to be copied
-            how = " ".join(f"--set {change!r}" for change in remedy.overrides)
-            console.print(Text(f"    {how}"), soft_wrap=True)
     console.print()
     console.print(_bounds(certificate))
+    if certificate.delay_ms is not None:
+        late = f"{certificate.delay_ms:.1f} ms of further delay, or {certificate.lost_frames} frames lost in a row"
+        console.print(Text(f"\nIt still holds with {late}."))
     console.print(Text("\nAssumed:"))
     for assumption in certificate.assumptions:
         console.print(Text(f"  {assumption}"))
@@ -61,8 +59,6 @@ def _bounds(certificate: Certificate) -> Table:
     ):
         shown = "not proven" if radius is None else f"{radius:.4g}"
         table.add_row(what, shown, "" if angle is None else f"{angle:.2f}°")
-    if certificate.largest_found is not None:
-        table.add_row("largest that an attack on that body found", f"{certificate.largest_found:.4g}", "")
     return table
 
 

@@ -12,7 +12,7 @@ from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.columns import Columns
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.layout import Layout
 from rich.live import Live
 from rich.progress import (
@@ -27,16 +27,13 @@ from rich.progress import (
 from rich.table import Column, Table
 from rich.text import Text
 
-from aeroloop.protocol.messages.models import Percentiles
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab import paper
-from aeroloop.service.terminal.console import Console
 
 if TYPE_CHECKING:
     from aeroloop.service.host.doctor import Diagnosis
     from aeroloop.service.lab.calibrate import Calibration
     from aeroloop.service.lab.demo import Progress as DemoProgress
-    from aeroloop.service.lab.soak import Soak
     from aeroloop.service.lab.tables import Tables
 
 LABELS: Final = 22
@@ -45,8 +42,8 @@ LABELS: Final = 22
 _stderr = Console(stderr=True)
 
 
-def figures_table(figures: Figures, **further: str) -> None:
-    """Print figures of merit, and further rows of label and text."""
+def figures_table(figures: Figures) -> None:
+    """Print figures of merit."""
 
     def shown(name: str, text: Callable[[Any], str]) -> str:
         value = getattr(figures, name)
@@ -69,8 +66,6 @@ def figures_table(figures: Figures, **further: str) -> None:
         table.add_row("not read", damage)
     if figures.log:
         table.add_row("log", figures.log)
-    for label, text in further.items():
-        table.add_row(label, text)
     Console().print(table)
 
 
@@ -78,11 +73,6 @@ def labelled() -> Table:
     """An empty table of labels and texts."""
     labels, texts = Column(style="bold", no_wrap=True, min_width=LABELS), Column(overflow="fold")
     return Table(labels, texts, show_header=False, box=None, pad_edge=False)
-
-
-def p50_p99(spread: Percentiles | None) -> str:
-    """Median and 99th percentile [µs]; a dash without any."""
-    return f"{spread.p50:.0f}/{spread.p99:.0f} µs" if spread else "–"
 
 
 @contextmanager
@@ -148,7 +138,6 @@ def paper_tables(tables: Tables) -> None:
     console.print(grid)
     rows_table(comparison(tables), f"\n{ERRORS}")
     console.print(f"\n{NOT_IDENTIFIED}")
-    console.print(f"\npath: {tables.path}")
 
 
 def _beside(mine: float, theirs: float, spread: float | None, digits: int) -> str:
@@ -179,15 +168,7 @@ def calibration_table(fit: Calibration) -> None:
     Console().print(table)
     for name, residual in fit.residuals.items():
         Console().print(f"residual {name}: {residual:+.2%}")
-    found = fit.identification
-    rows = [["parameter", "value", "± if others known", "± jointly"]]
-    for p in found.parameters:
-        jointly = f"{p.jointly:.2g} {p.unit}{'' if p.identified else ': not identified'}"
-        rows.append([p.name, f"{p.value:.3g} {p.unit}", f"{p.alone:.2g} {p.unit}", jointly])
-    rows_table(rows, "\nidentified by the figures of Table C.4, given the published cells' scatter")
-    values = ", ".join(f"{value:.3g}" for value in found.singular_values)
-    Console().print(f"singular values {values}; weakest together: {found.weakest}")
-    Console().print(f"{fit.runs} experiments, path: {fit.path}")
+    Console().print(f"{fit.runs} experiments")
 
 
 @contextmanager
@@ -200,7 +181,7 @@ def live_screen() -> Iterator[Callable[[Callable[[int], RenderableType], Text], 
             drawing = draw(console.width)
             if console.is_terminal:
                 layout = Layout()
-                layout.split_column(Layout(drawing), Layout(footer, size=2))
+                layout.split_column(Layout(drawing), Layout(footer, size=1))
                 drawing = layout
             live.update(drawing, refresh=True)
 
@@ -244,30 +225,3 @@ def live_demo(total_s: float) -> Iterator[Callable[[DemoProgress], None]]:
             live.update(Group(bar, Columns(figures, padding=(0, 3, 0, 0))))
 
         yield update
-
-
-def soak_table(soak: Soak) -> None:
-    """Print the result of a soak."""
-    console = Console()
-    loop = Table("at", "missed ticks", "unanswered", "latency p50/p99", "wake-up p50/p99", box=None)
-    for minute in soak.minutes:
-        counts = str(minute.skipped), str(minute.unanswered)
-        loop.add_row(f"{minute.at_s:.0f} s", *counts, p50_p99(minute.latency_us), p50_p99(minute.wake_us))
-    console.print(loop)
-    console.print()
-    growth = Table("process", "memory", "threads", "open files", "CPU", box=None)
-    first, last = soak.minutes[0], soak.minutes[-1]
-    for role, before in first.usage.items():
-        after = last.usage[role]
-        share = (after.cpu_s - before.cpu_s) / max(1e-9, last.at_s - first.at_s)
-        growth.add_row(
-            role,
-            f"{before.memory_mb:.1f} → {after.memory_mb:.1f} MB",
-            f"{before.threads} → {after.threads}",
-            f"{before.files} → {after.files}",
-            f"{100 * share:.1f} %",
-        )
-    console.print(growth)
-    console.print(f"\n{soak.rate_hz:g} Hz; log {soak.log}, {soak.log_mb:g} MB")
-    for finding in soak.findings or ["nothing grew, and one session held throughout"]:
-        console.print(finding)

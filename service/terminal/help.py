@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, ClassVar, Final
 
+from rich.console import Console
 from rich.highlighter import RegexHighlighter
 from rich.padding import Padding
 from rich.panel import Panel
@@ -15,8 +16,6 @@ from rich.table import Table
 from rich.text import Text
 from rich.theme import Theme
 from typer.core import TyperGroup
-
-from aeroloop.service.terminal.console import Console
 
 if TYPE_CHECKING:
     from typer import Context

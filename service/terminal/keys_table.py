@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.protocol.transport.certificate import SOON_DAYS
-from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.roles import BAD, WAITING
 
 if TYPE_CHECKING:

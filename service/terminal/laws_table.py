@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import groupby
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from aeroloop.service.lab.tables import markdown_table
 from aeroloop.service.sweep.laws import LawMargin, LawRow, Laws
-from aeroloop.service.terminal.console import Console
 
 _HEADER = ["law", "z_track 10⁻⁴ s", "u_total V²·s", "largest", "settled", "changes/s", "kbit/s"]
 Sections = Iterator[tuple[str, list[list[str]]]]
@@ -81,4 +81,5 @@ def _notes(laws: Laws) -> Iterator[str]:
         f"largest error of the second half. Survived for {laws.margin_duration_s:g} s, without a watchdog: commands "
         "that act later, or of which so many in a row never do, again and again, up to 1 s."
     )
-    yield f"path: {laws.path}{'' if laws.out is None else f'; all experiments: {laws.out}'}"
+    if laws.out is not None:
+        yield f"All experiments: {laws.out}"

@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from math import log2
 from typing import TYPE_CHECKING, Final
 
+from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from aeroloop.service.report.page.data import grave
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Spread, TheoremFindings
-from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 
 if TYPE_CHECKING:
+    from aeroloop.protocol.messages.trace import End
     from aeroloop.service.lab.demo import DemoFigures
-    from aeroloop.service.logs.replay import Replay
+    from aeroloop.service.logs.replay import EndReplay, Replay
 
 MARKS_SHOWN: Final = 12
 """Events that do not matter."""
+BEFORE: Final = "before"
+"""In place of its time, of what happened before the session."""
+BEFORE_SHOWN: Final = 4
 DISAGREEMENTS_SHOWN: Final = 5
 SESSIONS_SHOWN: Final = 9
 DAMAGES_SHOWN: Final = 20
+UNSEEN_SHOWN: Final = 3
 _TIMINGS: Final = {
     "period": "period",
     "latency": "latency",
@@ -38,8 +44,11 @@ def review_account(findings: Findings) -> None:
     console = Console()
     marks = timed(findings.marks)
     timed_faults = ("fault begins", "fault ends") if findings.faults else ()  # stand in a table of their own
-    matter = [entry for entry in marks if grave(entry[1]) and not entry[1].text.startswith(timed_faults)]
-    console.print(_grave_table(matter) if matter else "no trip, failure, loss or refusal")
+    before = [entry for entry in marks if entry[0] == BEFORE]
+    since = marks[len(before) :]
+    matter = [entry for entry in since if grave(entry[1]) and not entry[1].text.startswith(timed_faults)]
+    none = "no trip, failure, loss or refusal"
+    console.print(_grave_table(matter) if matter else f"{none} since the session began" if before else none)
     if findings.faults:
         console.print(_faults_table(findings.faults))
     console.print()
@@ -55,9 +64,10 @@ def review_account(findings: Findings) -> None:
     if findings.theorem is not None:
         console.print()
         console.print(theorem_table(findings, findings.theorem))
-    if others := [entry for entry in marks if not grave(entry[1])]:
+    others = [entry for entry in since if not grave(entry[1])]
+    if before or others:
         console.print()
-        console.print(_marks_table(others))
+        console.print(_marks_table(before, others))
     if findings.checks:
         console.print()
         checks = Table(show_header=False, box=None, pad_edge=False)
@@ -120,13 +130,13 @@ def _rows(findings: Findings) -> Iterator[tuple[str, str]]:
     yield "messages lost", lost or "none reported"
     for gap in findings.missing:
         yield "not recorded", str(gap)
+    for unknown in findings.unknown:
+        yield "not known", str(unknown)
     if findings.lapses:
         yield "irregular ticks", ", ".join(f"{count} {name}" for name, count in findings.lapses.items())
     if findings.clock_offset_us is not None:
         first, last = findings.clock_offset_us
         yield "controller's clock ahead", f"{first:,.0f} µs at the first tick, {last:,.0f} µs at the last"
-    for kind, counts in (findings.frames or {}).items():
-        yield f"{kind} frames", f"{counts['recorded']} on the wire, {counts['differ']} differ from the traces"
     for differs in findings.disagreements[:DISAGREEMENTS_SHOWN]:
         yield "ends disagree", f"{differs.key}: controller {differs.controller}, plant {differs.plant}"
     if (more := len(findings.disagreements) - DISAGREEMENTS_SHOWN) > 0:
@@ -234,7 +244,7 @@ def timed(marks: Sequence[Mark]) -> list[tuple[str, Mark]]:
     within = [i for i, mark in enumerate(marks) if mark.time_s is not None] or [len(marks)]
 
     def when(i: int, time_s: float | None) -> str:
-        outside = "before" if i < within[0] else "after"
+        outside = BEFORE if i < within[0] else "after"
         return outside if time_s is None else f"{round(time_s, 3) + 0.0:.3f} s"
 
     return [(when(i, mark.time_s), mark) for i, mark in enumerate(marks)]
@@ -254,9 +264,13 @@ def _grave_table(marks: Sequence[tuple[str, Mark]]) -> Table:
     return table
 
 
-def _marks_table(marks: Sequence[tuple[str, Mark]]) -> Table:
+def _marks_table(before: Sequence[tuple[str, Mark]], marks: Sequence[tuple[str, Mark]]) -> Table:
+    """Events that do not matter, after the last few from before the session; earlier ones are counted in one line."""
     table = _marks()
-    for when, mark in marks[:MARKS_SHOWN]:
+    if earlier := Counter(mark.kind for _, mark in before[:-BEFORE_SHOWN]):
+        counts = ", ".join(f"{count} {kind}" for kind, count in earlier.items())
+        table.add_row(BEFORE, "", "", f"{earlier.total()} events: {counts}; --json has them all")
+    for when, mark in [*before[-BEFORE_SHOWN:], *marks[:MARKS_SHOWN]]:
         table.add_row(when, mark.role, mark.kind, Text(mark.text))
     if (more := len(marks) - MARKS_SHOWN) > 0:
         table.add_row("", "", "", f"… and {more} more such events; --json has them all")
@@ -269,9 +283,9 @@ def _marks() -> Table:
     return Table(times, roles, kinds, texts, show_header=False, box=None, pad_edge=False)
 
 
-def _some(lines: Sequence[str]) -> list[str]:
-    more = len(lines) - DAMAGES_SHOWN
-    return [*lines[:DAMAGES_SHOWN], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
+def _some(lines: Sequence[str], shown: int = DAMAGES_SHOWN) -> list[str]:
+    more = len(lines) - shown
+    return [*lines[:shown], *([f"… and {more} more; --json has them all"] if more > 0 else [])]
 
 
 def replay_table(replay: Replay) -> None:
@@ -298,10 +312,32 @@ def replay_table(replay: Replay) -> None:
                 f"plant: first differs at tick {other.session_tick} of {other.session}: {other.field} {other.logged} "
                 f"logged, {other.computed} computed"
             )
-    for name, end in (("controller", replay.controller), ("plant", replay.plant)):
+    ends: dict[End, EndReplay | None] = {"controller": replay.controller, "plant": replay.plant}
+    for name, end in ends.items():
         if end is None:
-            console.print(f"{name}: not replayed: {replay.reasons[name]}", markup=False)
+            reason, unseen = replay.reasons[name], replay.unseen.get(name, [])
+            more = _some([line for line in unseen if reason not in line], UNSEEN_SHOWN)
+            not_compared = f"; not compared: {'; '.join(more)}" if more else ""
+            console.print(f"{name}: not replayed: {reason}{not_compared}", markup=False, soft_wrap=True)
         else:
-            same = "every tick is the same, byte for byte" if not end.differ else f"{end.differ} differ"
-            why = f"; {replay.reasons[name]}" if name in replay.reasons else ""
-            console.print(f"{name}: {end.ticks} ticks, {same}{why}", markup=False)
+            console.print(f"{name}: {_replayed(replay, name, end)}", markup=False, soft_wrap=True)
+    named = {line for lines in replay.unseen.values() for line in lines}
+    for line in _some([line for line in replay.damages if line not in named]):
+        console.print(f"not read: {line}", markup=False, soft_wrap=True)
+
+
+def _replayed(replay: Replay, name: End, end: EndReplay) -> str:
+    """What a replay found of an end, and in the same line what it did not compare."""
+    unseen = replay.unseen.get(name, [])
+    if end.differ:
+        found = f"{end.ticks} ticks, {end.differ} differ"
+    elif unseen:
+        found = f"the same, byte for byte, at {end.ticks} ticks"
+    else:
+        found = f"{end.ticks} ticks, every tick is the same, byte for byte"
+    if unseen:
+        found += f"; not compared: {'; '.join(_some(unseen, UNSEEN_SHOWN))}"
+    elif name in replay.reasons:
+        found += f"; {replay.reasons[name]}"
+    open_ended = [gap for gap in replay.missing if gap.end == name and not gap.rows]
+    return found + "".join(f"; not in the log: {gap}" for gap in open_ended[:UNSEEN_SHOWN])

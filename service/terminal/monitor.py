@@ -20,7 +20,6 @@ from rich.columns import Columns
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
 from aeroloop.protocol.transport.network import join
@@ -29,7 +28,7 @@ from aeroloop.protocol.wire.attitude import angle, to_euler
 from aeroloop.service.config import ConfigError, Settings, from_description
 from aeroloop.service.host.bandwidth import PayloadRate
 from aeroloop.service.host.health import SILENT_S
-from aeroloop.service.terminal.roles import BAD, GOOD, STALE, WAITING, duration, roles_view
+from aeroloop.service.terminal.roles import STALE, WAITING, duration, roles_view
 
 REFRESH_S: Final = 0.2
 EVENTS: Final = 5
@@ -126,48 +125,11 @@ def _session(statuses: Mapping[str, tuple[float, Status]]) -> str | None:
     return status.session if status is not None and age < SILENT_S else None
 
 
-class Footer:
-    """The keys and what they do: `q` quits; `s`, confirmed by `y`, stops.
-
-    Args:
-        stop: Stops the plants and returns a line for each that answered and for each that did not.
-        what: What it stops, in words.
-    """
-
-    def __init__(self, stop: Callable[[], tuple[list[str], list[str]]], what: str) -> None:
-        self._stop = stop
-        self._what = what
-        self._asked = False
-        self._shown = Text()
-
-    def press(self, key: str) -> bool:
-        """Take a key; whether it quits."""
-        asked, self._asked, self._shown = self._asked, False, Text()
-        if asked and key == "y":
-            self._shown = Text(f"stopping {self._what} …", style=WAITING)
-            threading.Thread(target=self._run, daemon=True).start()  # the view goes on meanwhile
-        elif not asked and key == "s":
-            self._asked, self._shown = True, Text(f"stop {self._what}? y: yes, any other key: no", style=BAD)
-        return not asked and key == "q"
-
-    def _run(self) -> None:
-        try:
-            answers, failures = self._stop()
-        except AeroloopError as error:
-            answers, failures = [], [str(error)]
-        self._shown = Text("; ".join([*failures, *answers]), style=BAD if failures else GOOD)
-
-    def draw(self) -> Text:
-        """The last two lines of the view: the question or the answer, and the keys."""
-        return Text("\n").join([self._shown, Text(f"s: stop {self._what}   q: quit", style=STALE)])
-
-
 def watch(
     network: NetworkSettings,
     show: Callable[[Callable[[int], RenderableType], Text], None],
     stop: threading.Event,
     read: Callable[[float], str] | None,
-    footer: Footer,
 ) -> None:
     """Subscribe, and draw five times a second until `stop` is set or `q` is pressed.
 
@@ -176,7 +138,6 @@ def watch(
         show: Draws a view, given for a width, and a footer.
         stop: Ends it.
         read: Waits for keys up to a time [s]; None without a keyboard.
-        footer: Takes them.
 
     Raises:
         NetworkError: The network cannot be joined.
@@ -199,8 +160,8 @@ def watch(
             if time.monotonic() - queried > 2.0:  # for roles that have joined since
                 queried = time.monotonic()
                 session.get(topics.key("description", "*"), answered, timeout=1.0)
-            show(top.draw, footer.draw() if read else Text())
+            show(top.draw, Text("q: quit" if read else "", style=STALE))
             if read is None:
                 stop.wait(REFRESH_S)
-            elif any(footer.press(key) for key in read(REFRESH_S)):
+            elif "q" in read(REFRESH_S):
                 return

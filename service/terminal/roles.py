@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
-from rich.console import Group
+from rich.console import Console, Group
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -18,7 +18,6 @@ from aeroloop.protocol.messages.states import NOT_RECORDING
 from aeroloop.protocol.transport.certificate import SOON_DAYS
 from aeroloop.service.host.health import NEEDED, SILENT_S, troubles
 from aeroloop.service.host.operator import Gathered
-from aeroloop.service.terminal.console import Console
 
 WIDE: Final = 90
 """Columns of the terminal from which on all columns of the table are drawn."""
@@ -87,7 +86,10 @@ def _lines(role: str, age: float, status: Status, silent: bool) -> Iterator[Text
     if silent:
         yield Text(f"{role}: no status for {duration(age)}, then {status.state}", style=BAD)
     if status.cause:
-        yield Text(f"{role}: {status.cause}", style=_STYLES.get(status.state, WAITING))
+        since = f" ({status.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)" if status.since else ""
+        yield Text(f"{role}: {status.cause}{since}", style=_STYLES.get(status.state, WAITING))
+    if status.unkept:
+        yield Text(f"{role}: would forget a stop at a restart: {status.unkept}", style=BAD)
     if status.certificate_until:
         left = status.certificate_until - datetime.now(UTC)
         if left < timedelta(days=SOON_DAYS):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from aeroloop.service.report.page.setup import shown
 from aeroloop.service.report.rows import figure_rows
 from aeroloop.service.review.report import Report, differences
-from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.log_tables import DAMAGES_SHOWN, timed
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from rich.console import Console
+
 from aeroloop.service.sweep.sweep import Sweep
-from aeroloop.service.terminal.console import Console
 from aeroloop.service.terminal.display import labelled
 
 
@@ -17,7 +18,6 @@ def sweep_table(sweep: Sweep) -> None:
     table.add_row("run now", f"{sweep.done} in {sweep.seconds:.1f} s")
     table.add_row("resumed", str(sweep.resumed))
     table.add_row("failed", f"{sweep.failed}{' (column reason says why)' if sweep.failed else ''}")
-    table.add_row("path", sweep.path)
     if sweep.cpu_s_per_experiment is not None:
         table.add_row("cost of an experiment", f"{sweep.cpu_s_per_experiment:.3g} s of a core")
     if sweep.overhead_ms_per_job is not None:

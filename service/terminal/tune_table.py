@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from aeroloop.service.lab.tune import Tuning
 from aeroloop.service.lab.tune_costs import Summary
 from aeroloop.service.lab.tune_search import Gain
-from aeroloop.service.terminal.console import Console
 
 
 def tune_table(tuning: Tuning) -> None:
@@ -20,7 +20,7 @@ def tune_table(tuning: Tuning) -> None:
     console.print(Text(sentence, style=style))
     console.print(
         f"{tuning.experiments} experiments of {tuning.duration_s:g} s with {tuning.candidates} sets of gains of law "
-        f"{tuning.law} ({tuning.path}); seed {tuning.seed}{'; interrupted' if tuning.interrupted else ''}.\n"
+        f"{tuning.law}; seed {tuning.seed}{'; interrupted' if tuning.interrupted else ''}.\n"
     )
     console.print(_figures(tuning))
     console.print()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
+from rich.console import Console
 from rich.table import Column, Table
 
 from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
 from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
 from aeroloop.protocol.wire.quantizer import Quantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.service.terminal.console import Console
 
 
 def wire_table(wire: WireSpec) -> None:

@@ -30,7 +30,7 @@ from aeroloop.service.testing.hil_log import HilError as HilError
 from aeroloop.service.testing.hil_log import HilLog as HilLog
 from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, private_bus
 
-PLANTS: Final = ("emulator", "can", "can-node", "quanser", "quanser-fake")
+PLANTS: Final = ("emulator", "can", "can-node", "quanser")
 """Plant ends by name; any other name is of a plant, which the emulator runs."""
 
 ROLES: Final[tuple[RoleName, ...]] = ("recorder", "plant")
@@ -319,7 +319,7 @@ class Hil:
         for reply in self.processes.zenoh.get(key, payload=message.encode(), timeout=PATIENCE_S):
             if reply.ok is not None:
                 answer = Answer.model_validate_json(reply.ok.payload.to_bytes())
-                self._may_query[topic] = time.monotonic() + 1 / topics.TOPICS[topic].per_s  # sooner, it is dropped
+                self._may_query[topic] = time.monotonic() + 1 / topics.QUERIES_PER_S  # sooner, it is dropped
                 if not answer.done:
                     raise HilError(answer.text)
                 return

@@ -104,7 +104,10 @@ class HilLog:
         return [change for batch in self.batches("controller") for change in batch.tail.changes]
 
     def messages(self, name: str) -> list[tuple[int, Message | bytes]]:
-        """Time of publication [ns] and content of every message of one topic; frames and traces are bytes."""
+        """Time of publication [ns] and content of every message of one topic, by that time, of equal ones as recorded.
+
+        Frames and traces are bytes.
+        """
         found: list[tuple[int, Message | bytes]] = []
         topic = topics.TOPICS[name]
         with self._existing().open("rb") as file:
@@ -113,7 +116,7 @@ class HilLog:
                 if address is not None and address.topic is topic:
                     content = topic.model.model_validate_json(message.data) if topic.model else message.data
                     found.append((message.publish_time, content))
-        return found
+        return sorted(found, key=lambda each: each[0])
 
     def evidence(self, received: Sequence[Event]) -> Iterator[str]:
         """Write page and events beside the log; yield a line for each file, or the reason why there is none.

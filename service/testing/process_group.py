@@ -25,9 +25,9 @@ import zenoh
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.can_format import CanSettings
+from aeroloop.protocol.transport.endpoint import accepting
 from aeroloop.protocol.transport.network import POLL_S, join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.places import accepting
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
@@ -38,7 +38,6 @@ Child = subprocess.Popen[bytes] | ForkedProcess
 
 _BLOCKS: Final = 10_000, 32_000
 """Ports to choose blocks from: below those that the system gives out by itself."""
-_reserved: Final[list[socket.socket]] = []
 
 START_WAIT_S: Final = 20.0
 STOP_WAIT_S: Final = 10.0
@@ -61,7 +60,7 @@ def free_rendezvous() -> str:
             reservation.bind(("127.0.0.1", first))
             for port in range(first, first + ports):
                 socket.create_server(("127.0.0.1", port)).close()
-            _reserved.append(reservation)
+            reservation.detach()  # stays bound until this process ends
             return f"tcp/127.0.0.1:{first}"
         reservation.close()
 
@@ -103,10 +102,12 @@ class ProcessGroup:
     """
 
     def __init__(self, settings: Settings, folder: Path | None = None) -> None:
-        self._settings = settings
         self._cleanup = ExitStack()
         self._folder = folder or Path(self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="aeroloop-")))
         self._folder.mkdir(parents=True, exist_ok=True)
+        # A stop or a trip outlives its process here, and surprises no other group.
+        plant = settings.plant.model_copy(update={"state_directory": self._folder.absolute() / "state"})
+        self._settings = settings = settings.model_copy(update={"plant": plant})
         self._config = self._folder / "aeroloop.toml"
         self._config.write_text(settings.toml())
         self._children: dict[str, Child] = {}

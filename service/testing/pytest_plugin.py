@@ -15,7 +15,7 @@ import pytest
 if TYPE_CHECKING:
     from aeroloop.service.testing.hil import Hil
 
-SOFTWARE = ("emulator", "can-node", "quanser-fake")
+SOFTWARE = ("emulator", "can-node")
 """Plant ends without hardware: the defaults of the conformance suite."""
 _LOOP: Final = pytest.StashKey["Hil"]()
 
@@ -27,7 +27,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--hil-plant",
         metavar="PLANT",
         help="plant end of `hil`: emulator (default); can, a node on the configured CAN bus; can-node, an emulated "
-        "node on a private bus; quanser, the board, or quanser-fake; or package.module:Class, a plant of your own",
+        "node on a private bus; quanser, the board; or package.module:Class, a plant of your own",
     )
     group.addoption(
         "--hil-lockstep", action="store_true", help="run `hil` in lockstep: repeatable, as fast as the machine allows"
@@ -39,7 +39,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register the marker that the conformance suite uses, and refuse a plant that there is not."""
     config.addinivalue_line("markers", "processes: starts real processes, most of them in real time")
     if plant := config.getoption("--hil-plant"):
-        from aeroloop.plant_emulator.own_plant import class_of
+        from aeroloop.plant_emulator.plant import class_of
         from aeroloop.protocol.errors import AeroloopError
         from aeroloop.service.testing.hil import PLANTS
 

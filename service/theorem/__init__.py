@@ -1,1 +1,1 @@
-"""Bounds of Lemma 1, Theorem 1 and Corollary 1, certificates of a configuration, and remedies."""
+"""Bounds of Lemma 1, Theorem 1 and Corollary 1, and certificates of a configuration."""

@@ -10,6 +10,7 @@ from aeroloop.protocol.wording import problem
 from aeroloop.service.control.laws.registry import law_class, words_of
 from aeroloop.service.theorem.certificate import Certificate, certify
 from aeroloop.service.theorem.configured import NoTheoremError, Sections
+from aeroloop.service.theorem.extremes import BoundlessError
 
 
 class OwnCertificate(BaseModel):
@@ -43,3 +44,11 @@ def certify_any(settings: Sections, **options: Any) -> Certificate | OwnCertific
     except Exception as error:
         raise NoTheoremError(f"no certificate: {words_of(kind, error)}") from None
     return certify(settings, **options)
+
+
+def described_certificate(settings: Sections) -> dict[str, Any] | None:
+    """The certificate as a controller's description carries it; None of a stream, or of a law without a theorem."""
+    try:
+        return certify_any(settings).model_dump(mode="json")
+    except (NoTheoremError, BoundlessError):
+        return None

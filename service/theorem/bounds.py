@@ -116,7 +116,10 @@ class Lemma:
 
 @dataclass(frozen=True)
 class Theorem:
-    """Quantities of Theorem 1 and Corollary 1. The last two are None where condition (C.66) fails."""
+    """Quantities of Theorem 1 and Corollary 1. The last two are None where condition (C.66) fails.
+
+    Without an invariant set what sampling adds is not bounded: a certificate has no radius then.
+    """
 
     c0: Annotated[float, Term("c₀", "C.66, as corrected", "N·m·s/rad", "min{λ_min(C₁)(1 + |η̃|)/2, λ_min(C₂)}")]
     coriolis: Annotated[float, Term("δ_S2 λ_max(J) k_ω_d", "C.67", "N·m·s/rad", "δ_V1's part of S(ω)R ω_d")]
@@ -138,7 +141,7 @@ class Theorem:
             "√(δ_Q/k)",
             "C.68, C.79",
             "1, rad/s",
-            "root of the mean of ‖z‖² in the long run, disturbance included",
+            "root of the mean of ‖z‖² in the long run, disturbance and sampling included",
         ),
     ]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from math import asin, ceil, degrees, hypot, pi, sin
+from math import asin, degrees, floor, hypot
 from typing import Any, Final, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,9 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from aeroloop.protocol.messages.operator import Hold
 from aeroloop.service.theorem.bounds import Known, Lemma, Term, Theorem
 from aeroloop.service.theorem.configured import Configured, Sections, with_theorem
-from aeroloop.service.theorem.evaluation import Evaluated, beyond, evaluate, largest_voltage
+from aeroloop.service.theorem.evaluation import Evaluated, beyond, evaluate
 from aeroloop.service.theorem.invariant import Reach, reach, without_error
-from aeroloop.service.theorem.remedies import Holds, Remedy, remedies
+from aeroloop.service.theorem.margins import largest_delay
 
 
 class CertificateTerm(BaseModel):
@@ -31,7 +31,7 @@ class CertificateTerm(BaseModel):
 
     symbol: str
     equation: str = Field(description="number in the paper, or assumption or remark")
-    value: float | None = Field(description="null where it does not exist because condition (C.66) fails")
+    value: float | None = Field(description="null where it does not exist: without a set, or as (C.66) fails")
     unit: str
     meaning: str
 
@@ -46,11 +46,14 @@ class Certificate(BaseModel):
     c0: float = Field(description="c₀, as corrected [N·m·s/rad]")
     delta_V1: float = Field(description="δ_V1 of (C.67) [N·m·s/rad]")
     delta_V2: float = Field(description="δ_V2 of (C.71) [N·m]")
-    delta_Q: float = Field(description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance [W]")
+    delta_Q: float = Field(
+        description="δ_Q of (C.69); δ_Qdist of (C.80) with a disturbance; of continuous time without a set [W]"
+    )
     k: float | None = Field(description="the largest k of (C.66) [N·m·s/rad]; null where it fails")
-    radius: float | None = Field(description="the same as rms_radius, by its name in the paper")
+    radius: float | None = Field(description="√(δ_Q/k) of (C.79); null where (C.66) fails or no set is proven")
     rms_radius: float | None = Field(
-        description="√(δ_Q/k): bounds the root of the mean of ‖z‖² in the long run [1, rad/s]; null where (C.66) fails"
+        description="bounds the root of the mean of ‖z‖² in the long run: radius, or pointwise_radius if that is less "
+        "[1, rad/s]; null where radius is"
     )
     pointwise_radius: float | None = Field(
         description="bound of ‖z‖ at every instant, in the end, for the paper's body under this wire, law and period "
@@ -61,13 +64,15 @@ class Certificate(BaseModel):
         description="the same for the configured plant: its mechanism, lag, friction, wind, sensors and transport"
     )
     plant_deg: float | None = Field(description="the attitude error within that bound [deg]")
+    delay_ms: float | None = Field(
+        description="largest further delay of commands with which it still holds [ms]; null where it does not hold"
+    )
+    lost_frames: int | None = Field(
+        description="most frames lost in a row, if none is delayed, with which it still holds; null likewise"
+    )
     assumptions: list[str] = Field(description="what is assumed, each with the key or the option that states it")
     violated: list[str] = Field(description="what fails, each with the key that would mend it; empty where it holds")
     terms: list[CertificateTerm]
-    remedies: list[Remedy] = Field(description="changes with which it would hold, the least of each kind")
-    largest_found: float | None = Field(
-        default=None, description="largest ‖z‖ that an attack found against pointwise_radius; null without --attack"
-    )
 
     @property
     def blame(self) -> str | None:
@@ -98,7 +103,6 @@ def certify(
     disturbance: float | None = None,
     attitude_error_deg: float | None = None,
     late_s: float = 0.0,
-    seek_remedies: bool = True,
 ) -> Certificate:
     """The certificate of a configuration.
 
@@ -107,7 +111,6 @@ def certify(
         disturbance: The largest ‖τ_d‖ beyond what the plant's settings say [N·m]; None is 0, and not stated.
         attitude_error_deg: Assumed bound on the attitude error, for Lemma 1; controller.start_within_deg if None.
         late_s: Further age of a command, by delay or lost frames [s].
-        seek_remedies: Whether to search for changes with which it would hold; that takes most of the time, up to 1 s.
 
     Raises:
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
@@ -117,14 +120,13 @@ def certify(
     evaluated = partial(evaluate, disturbance=disturbance, attitude_error_deg=attitude_error_deg, late_s=late_s)
     e = evaluated(settings)
     t = e.theorem
-    violated, ways = _violated(settings, e), list[Remedy]()
-    if violated and seek_remedies:
+    violated = _violated(settings, e)
 
-        def holds(tried: Configured) -> bool:
-            now = evaluated(tried, only_plant=True, desired=e.desired)  # the reference stays
-            return now.plant_reach is not None and not _violated(tried, now)
+    def fails_after(delay: float) -> bool:
+        later = evaluated(settings, late_s=late_s + delay, only_plant=True, desired=e.desired)
+        return bool(_violated(settings, later))
 
-        ways = [*_range_remedies(settings, e, holds), *remedies(settings, holds)]
+    delay = None if violated else largest_delay(fails_after)
     return Certificate(
         holds=not violated,
         margin=t.margin,
@@ -134,15 +136,16 @@ def certify(
         delta_Q=t.delta_Qdist,
         k=t.k,
         radius=t.radius,
-        rms_radius=t.radius,
+        rms_radius=None if t.radius is None or e.body_reach is None else min(t.radius, e.body_reach.radius),
         pointwise_radius=_radius(e.body_reach),
         pointwise_deg=_degrees(e.body_reach),
         plant_radius=_radius(e.plant_reach),
         plant_deg=_degrees(e.plant_reach),
+        delay_ms=None if delay is None else floor(delay * 1e5) / 100,
+        lost_frames=None if delay is None else floor(delay / settings.loop.period),
         assumptions=_assumptions(settings, e, disturbance),
         violated=violated,
         terms=[*(term for part in (e.known, e.lemma, t) for term in _terms(part)), *_reach_terms(e.plant_reach)],
-        remedies=ways,
     )
 
 
@@ -209,7 +212,9 @@ def _assumptions(settings: Configured, e: Evaluated, disturbance: float | None) 
         f"‖θ‖ ≤ {law.damping_bound:g} N·m·s/rad, and θ is constant (law.damping_bound)",
         torque,
         f"for the mean square: the attitude error stays below {start:g}° (--attitude-error)",
-        "for the bound at every instant: a state near enough to the set, once (`log review` finds it)",
+        "for the bound at every instant: a state near enough to the set, once (`log review` finds it), and for the age "
+        "of a command before",
+        "the reference itself is followed: no approach to it is certified, at a start or after an operator's change",
         "the law's J, B, m and r_g are the plant's ([law])",
         *(["the attitude that it finds and holds is level (reference.attitude)"] if found else []),
         *e.bounds.assumed,
@@ -246,20 +251,3 @@ def _radius(at: Reach | None) -> float | None:
 
 def _degrees(at: Reach | None) -> float | None:
     return None if at is None else degrees(2 * asin(at.eps_e))
-
-
-def _range_remedies(settings: Configured, e: Evaluated, holds: Holds) -> Iterator[Remedy]:
-    """Limits of the wire that hold the set, or the reference where no set is proven, and satisfy all else."""
-    at, wire = e.plant_reach or without_error(e.plant), settings.wire
-    for name, reached in (
-        ("rate", at.axis_rate + e.plant.delta_omega),
-        ("attitude", sin(min(pi / 2, at.half_angle))),
-        ("voltage", largest_voltage(settings, e.desired, at)),
-    ):
-        signal = getattr(wire, name)
-        if reached > signal.limit:
-            enough = ceil(110 * reached) / 100  # a wider range has wider steps, and those need some of it
-            wider = wire.model_copy(update={name: signal.model_copy(update={"limit": enough})})
-            if holds(settings.model_copy(update={"wire": wider})):
-                override = f"wire.{name}.limit={enough:g}"
-                yield Remedy(text=f"a range that holds it, wire.{name}", overrides=[override])

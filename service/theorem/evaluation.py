@@ -14,11 +14,9 @@ import numpy as np
 
 from aeroloop.protocol.wire.spec import SignalSpec
 from aeroloop.service.control.laws.adaptive import ESTIMATE_REACH
-from aeroloop.service.control.laws.body import check_invertible
-from aeroloop.service.control.reference import Floats
 from aeroloop.service.theorem.bounds import Known, Lemma, Theorem, lemma_1, theorem_1
 from aeroloop.service.theorem.configured import Configured, Sections, with_theorem
-from aeroloop.service.theorem.extremes import Extremes, chords, extremes, feedforward
+from aeroloop.service.theorem.extremes import Extremes, chords, extremes, motors
 from aeroloop.service.theorem.invariant import Premises, Reach, reach
 from aeroloop.service.theorem.plant_bounds import PlantBounds, paper_body, plant_bounds
 
@@ -68,9 +66,9 @@ def evaluate(
     stated = disturbance or 0.0
     if not 0 <= stated < inf:
         raise ValueError(f"a disturbance is 0 or more, in N·m, not {stated}")
-    desired = desired or extremes(settings.reference)
+    desired = desired or extremes(settings)
     bounds = plant_bounds(settings, disturbance is not None)
-    if bounds.held_roll and desired.samples.angle[:, 0].any():
+    if bounds.held_roll and desired.rolls:
         bounds = replace(bounds, unproven=[*bounds.unproven, "reference: it rolls, and the plant's roll is held"])
     body = premises(settings, desired, paper_body(settings), stated, late_s)
     plant = premises(settings, desired, bounds, stated, late_s)
@@ -83,7 +81,10 @@ def evaluate(
     if body_reach is not None:  # the noise, too, is of a state that has changed since
         noise = theorem_1(p, lemma).delta_V1 * body.age * body_reach.z_dot
         p = replace(p, hold=p.hold + noise)
-    return Evaluated(desired, p, lemma, theorem_1(p, lemma), body, plant, body_reach, plant_reach, bounds)
+    theorem = theorem_1(p, lemma)
+    if body_reach is None:  # what sampling adds is bounded within a set only
+        theorem = replace(theorem, radius=None)
+    return Evaluated(desired, p, lemma, theorem, body, plant, body_reach, plant_reach, bounds)
 
 
 def premises(
@@ -110,7 +111,7 @@ def premises(
         k_theta_hat=law.damping_bound * ESTIMATE_REACH,
         weight=float(np.linalg.norm(law.centre_of_mass)) * gravity,
         weight_roll=abs(law.centre_of_mass[1]) * gravity,
-        norm_B=float(np.linalg.norm(_motors(settings), 2)),
+        norm_B=float(np.linalg.norm(motors(settings), 2)),
         delta_omega=_error(wire.rate, 3) + plant.delta_omega,
         delta_u=_error(wire.voltage, wire.actuators),
         k_omega_d=desired.rate,
@@ -118,7 +119,7 @@ def premises(
         k_omega_d_ddot=desired.jerk,
         axis_rate=desired.axis_rate,
         half_angle_d=desired.half_angle,
-        delta_q=chords(desired.samples, _error(wire.attitude, 1) + plant.delta_eps),
+        delta_q=chords(desired, _error(wire.attitude, 1) + plant.delta_eps),
         age=plant.age + late_s,
         rate_lag=plant.rate_lag,
         k_tau_d=plant.torque + disturbance,
@@ -153,17 +154,6 @@ def _known(settings: Configured, desired: Extremes, body: Premises, within: Reac
     )
 
 
-def _motors(settings: Configured) -> Floats:
-    """B of the motors present. Raises ValueError if it cannot be inverted. Shape (m, m)."""
-    # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
-    if settings.wire.actuators not in (2, 3):
-        raise ValueError(f"the theorem is about two or three motors, and wire.actuators is {settings.wire.actuators}")
-    first = 3 - settings.wire.actuators
-    B: Floats = np.array(settings.law.allocation)[first:, first:]
-    check_invertible(B)
-    return B
-
-
 @lru_cache(maxsize=64)
 def _error(signal: SignalSpec, elements: int) -> float:
     """‖δ_y‖ of (C.15) for a vector with equal quantizers for all elements [signal's unit]."""
@@ -172,10 +162,8 @@ def _error(signal: SignalSpec, elements: int) -> float:
 
 def largest_voltage(settings: Sections, desired: Extremes, at: Reach) -> float:
     """The largest |u_k| that the law commands within a set [V]."""
-    settings = with_theorem(settings)
-    inverse = np.linalg.inv(_motors(settings))
-    along = np.abs(feedforward(desired.samples, settings.law)[:, -len(inverse) :] @ inverse.T).max(axis=0)
-    return float((along + np.linalg.norm(inverse, axis=1) * at.deviation).max())
+    inverse = np.linalg.inv(motors(settings))
+    return float((desired.voltages + np.linalg.norm(inverse, axis=1) * at.deviation).max())
 
 
 def beyond(settings: Sections, desired: Extremes, p: Premises, at: Reach) -> list[tuple[str, float, str, float, str]]:

@@ -1,25 +1,31 @@
-"""Extremes of a reference: the bounds k_ω_d and k_ω̇_d of Assumption 1, and the largest angle.
+"""Extremes of a reference: the bounds k_ω_d and k_ω̇_d of Assumption 1, its largest angles, rates and voltages.
 
-They are maxima over the samples that also check an operator's references. Samples are within half a percent of the
-extremes, and Assumption 1 requires bounds that are not reached: half a percent is added. A sinusoid is sampled over
-eight periods of its slowest axis, which is all of it where the frequencies have small common multiples.
+Of a sinusoid they are suprema over its phases (`Plan.largest`): over every combination, but for axes that commensurate
+frequencies lock to each other. Of points they are the largest of 65 samples a quintic, which also check an operator's
+references; those are within half a percent, which is added.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite, pi, sin, sqrt
+from math import asin, isfinite, pi, sin, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages.operator import Reference, Stream
+from aeroloop.protocol.messages.operator import Stream
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.reference import Angles, Floats, Plan
+from aeroloop.service.control.laws.body import check_invertible
+from aeroloop.service.control.reference import Angles, Floats, Plan, turning
 from aeroloop.service.theorem.bounds import attitude_error
+from aeroloop.service.theorem.configured import Sections, with_theorem
 
 _SLACK: Final = 1.005
+"""Of the samples of a quintic."""
+_WEIGHTS: Final = (0.0, 1.0, 2.0, 4.0)
+_STEPS: Final = 257
+"""Of ‖ε_d‖, in `chords`."""
 
 
 class BoundlessError(AeroloopError):
@@ -36,7 +42,9 @@ class Extremes(NamedTuple):
         axis_rate: Largest element of ω_d in the desired body frame [rad/s].
         half_angle: Half the largest angle of q_d from [1, 0], at most π/2 [rad].
         tilt: Largest pitch, at most π/2 [rad].
-        samples: The samples that these are the maxima of.
+        eps: w and the largest Σ|ε_d,k| + w ‖ε_d‖, for some w: both are large together at few attitudes [1].
+        voltages: Largest |u_k| of each motor present that the law commands without error and with θ̂ = 0 [V].
+        rolls: Whether its roll is ever anything but 0.
     """
 
     rate: float
@@ -45,56 +53,94 @@ class Extremes(NamedTuple):
     axis_rate: float
     half_angle: float
     tilt: float
-    samples: Angles
+    eps: tuple[tuple[float, float], ...]
+    voltages: tuple[float, ...]
+    rolls: bool
 
 
-def extremes(reference: Reference) -> Extremes:
-    """The extremes of a reference from its first tick on.
+def extremes(settings: Sections) -> Extremes:
+    """The extremes of a configuration's reference from its first tick on, for the body that its law assumes.
 
     Raises:
         BoundlessError: A stream, as its set-points have no bounds, or a reference too fast for floats.
+        ValueError: B cannot be inverted.
     """
-    if isinstance(reference, Stream):
+    settings = with_theorem(settings)
+    law, inverse = settings.law, np.linalg.inv(motors(settings))
+    if isinstance(settings.reference, Stream):
         raise BoundlessError(
             "a stream's set-points are not known beforehand: certify a reference like them, by --set reference.kind=…"
         )
-    plan = Plan.of(reference)
+    plan = Plan.of(settings.reference)
+    slack = 1.0 if plan.swings else _SLACK
     with np.errstate(over="ignore", invalid="ignore"):
-        samples = plan.samples()
-        rate, acceleration = plan.fastest(), float(np.linalg.norm(accelerations(samples), axis=1).max())
-        half_angle = float(half_angles(samples).max())
-        jerk = jerk_bound(samples, plan.third())
-        axis_rate = float(np.abs(body_rates(samples)[0]).max())
-    if not isfinite(rate + acceleration + half_angle + jerk):
+        angle, rate, acceleration, jerk = plan.peaks()
+        half, rates, changes, torques = _products(plan, law)
+
+        def voltage(row: Floats) -> float:
+            return plan.largest(
+                lambda at: np.abs(feedforward(at, law)[:, -len(row) :] @ row), torques * [np.linalg.norm(row), 1, 1, 1]
+            )
+
+        def weighed(w: float) -> float:
+            return plan.largest(lambda at: _weighed(at, w), half * [sqrt(3) + w, 1, 1, 1])
+
+        found = Extremes(
+            rate=slack * plan.fastest(),
+            acceleration=slack * plan.largest(lambda at: np.linalg.norm(body_rates(at)[1], axis=1), changes),
+            jerk=slack * jerk_bound(rate, acceleration, jerk),
+            axis_rate=slack * plan.largest(lambda at: np.abs(body_rates(at)[0]).max(axis=1), rates),
+            half_angle=min(pi / 2, slack * asin(min(1.0, plan.largest(lambda at: np.sin(half_angles(at)), half)))),
+            tilt=min(pi / 2, slack * float(angle[1])),
+            eps=tuple((w, slack * weighed(w)) for w in _WEIGHTS),
+            voltages=tuple(slack * voltage(row) for row in inverse),
+            rolls=bool(angle[0]),
+        )
+    if not isfinite(found.rate + found.acceleration + found.half_angle + found.jerk):
         raise BoundlessError("the reference is too fast for floating-point numbers: nothing can be certified")
-    return Extremes(
-        _SLACK * rate,
-        _SLACK * acceleration,
-        _SLACK * jerk,
-        _SLACK * axis_rate,
-        min(pi / 2, _SLACK * half_angle),
-        min(pi / 2, _SLACK * float(np.abs(samples.angle[:, 1]).max())),
-        samples,
-    )
+    return found
 
 
-def jerk_bound(angles: Angles, third: Floats) -> float:
-    """A bound of ‖ω̈_d‖, from the largest of each angle's derivatives [rad/s³].
+def _products(plan: Plan, law: AdaptiveSettings) -> tuple[Floats, Floats, Floats, Floats]:
+    """The products that q_d, ω_d, ω̇_d and the feedforward's torque are sums of, for `Plan.largest`. Shapes (m, 4).
 
-    Args:
-        angles: Samples. Shapes (n, 3).
-        third: Largest third derivatives of roll, pitch, yaw [rad/s³]. Shape (3,).
+    ω_d is a sum of an angle's rate times a unit vector that turns with roll and pitch, ω̇_d its derivative. Of ω × Jω
+    counts ω × (J − jI)ω, with the mean j of the largest and the least moment.
     """
-    (d_roll, d_pitch, d_yaw), (dd_roll, dd_pitch, dd_yaw) = (
-        np.abs(part).max(axis=0) for part in (angles.rate, angles.acceleration)
-    )
-    turn, turn_dot = (
-        d_yaw + d_pitch,
-        dd_yaw + dd_pitch + d_yaw * d_pitch,
-    )  # of the roll's axis
-    of_pitch = third[1] + 2 * dd_pitch * d_yaw + d_pitch * (dd_yaw + d_yaw**2)
-    of_roll = third[0] + 2 * dd_roll * turn + d_roll * (turn_dot + turn**2)
-    return float(np.hypot(third[2], of_pitch) + of_roll)
+    angle, (r, p, y), (dr, dp, dy), _ = plan.peaks()
+    a, b, _ = turning(angle)
+    half = np.array([[1.0, *turning(angle / 2)]])
+    rates = np.array([[r, 1, 0, 0], [p, a, 1, 0], [y, a, b, 1]])
+    changes = np.array([
+        [dr, 1, 0, 0], [dp, a, 1, 0], [dy, a, b, 1],
+        [r * p, 1 + a, 1, 0], [r * y, 1 + a, b, 1], [p * y, a, 1 + b, 1],
+    ])  # fmt: skip
+    spread = (max(law.inertia) - min(law.inertia)) / 2
+    squares = [[spread * one[0] * other[0], *(one + other)[1:]] for one in rates for other in rates]
+    weight = law.mass * law.gravity * float(np.linalg.norm(law.centre_of_mass))
+    torques = np.concatenate([changes * [max(law.inertia), 1, 1, 1], squares, [[weight, a, b, 0]]])
+    return half, rates, changes, torques
+
+
+def motors(settings: Sections) -> Floats:
+    """B of the motors present. Raises ValueError if it cannot be inverted. Shape (m, m)."""
+    settings = with_theorem(settings)
+    # With two motors the mechanism holds the roll, and the first row and column of B are fictitious.
+    if settings.wire.actuators not in (2, 3):
+        raise ValueError(f"the theorem is about two or three motors, and wire.actuators is {settings.wire.actuators}")
+    first = 3 - settings.wire.actuators
+    B: Floats = np.array(settings.law.allocation)[first:, first:]
+    check_invertible(B)
+    return B
+
+
+def jerk_bound(rate: Floats, acceleration: Floats, jerk: Floats) -> float:
+    """A bound of ‖ω̈_d‖, from the largest of each angle's derivatives [rad/s³]. Shapes (3,)."""
+    (d_roll, d_pitch, d_yaw), (dd_roll, dd_pitch, dd_yaw) = rate, acceleration
+    turn, turn_dot = d_yaw + d_pitch, dd_yaw + dd_pitch + d_yaw * d_pitch  # of the roll's axis
+    of_pitch = jerk[1] + 2 * dd_pitch * d_yaw + d_pitch * (dd_yaw + d_yaw**2)
+    of_roll = jerk[0] + 2 * dd_roll * turn + d_roll * (turn_dot + turn**2)
+    return float(np.hypot(jerk[2], of_pitch) + of_roll)
 
 
 def body_rates(angles: Angles) -> tuple[Floats, Floats]:
@@ -124,22 +170,6 @@ def feedforward(angles: Angles, law: AdaptiveSettings) -> Floats:
     return torque
 
 
-def accelerations(angles: Angles) -> Floats:
-    """ω̇_d in a frame that yaws with the body; its norm is the same in every frame [rad/s²]. Shape (n, 3).
-
-    ω_d = ψ̇ z + θ̇ y + φ̇ x for roll φ, pitch θ, yaw ψ about axes of which y turns with the yaw and x with both.
-    """
-    _, pitch, _ = angles.angle.T
-    d_roll, d_pitch, d_yaw = (rate[:, None] for rate in angles.rate.T)
-    dd_roll, dd_pitch, dd_yaw = (acceleration[:, None] for acceleration in angles.acceleration.T)
-    z, y = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 1.0, 0.0]])
-    x = np.stack([np.cos(pitch), np.zeros_like(pitch), -np.sin(pitch)], axis=1)
-    turning = d_yaw * z + d_pitch * y  # of x; the yaw alone turns y
-    turned = d_pitch * d_yaw * np.cross(z, y) + d_roll * np.cross(turning, x)
-    omega_d_dot: Floats = dd_yaw * z + dd_pitch * y + dd_roll * x + turned
-    return omega_d_dot
-
-
 def half_angles(angles: Angles) -> Floats:
     """Half the angle of each q_d from [1, 0], for the nearer of ±q_d, 0…π/2 [rad]. Shape (n,)."""
     (a, b, c) = angles.angle.T / 2
@@ -148,24 +178,31 @@ def half_angles(angles: Angles) -> Floats:
     return nearest
 
 
-def chords(angles: Angles, delta: float) -> Callable[[float], float]:
+def chords(desired: Extremes, delta: float) -> Callable[[float], float]:
     """‖q^Q − q‖ as a function of half the attitude error [rad], for |ε_k^Q − ε_k| ≤ delta.
 
     The difference of η is at most δ ‖ε‖₁/η on the way from ε to ε^Q, and ‖ε − ε_d‖ at most twice the sine of half the
     half angle. Where η may vanish on the way, it is the bound of `attitude_error`, as for every attitude.
     """
-    half = _SLACK * half_angles(angles)
-    eps = _SLACK * np.abs(vectors(angles)).sum(axis=1)
     length = sqrt(3) * delta
+    norms = np.linspace(0, sin(desired.half_angle), _STEPS)
+    sums = np.min([most - w * norms[:-1] for w, most in desired.eps], axis=0)
+    halves = np.arcsin(norms[1:])
 
     def chord(error: float) -> float:
-        outer = np.sin(np.minimum(pi / 2, half + error)) + length
-        if outer.max() >= 1:
-            return attitude_error(length, min(pi / 2, float(half.max()) + error))
-        slope = (eps + sqrt(3) * (2 * sin(error / 2) + length)) / np.sqrt(1 - outer**2)
+        outer = np.sin(np.minimum(pi / 2, halves + error)) + length
+        if outer[-1] >= 1:
+            return attitude_error(length, min(pi / 2, desired.half_angle + error))
+        slope = (sums + sqrt(3) * (2 * sin(error / 2) + length)) / np.sqrt(1 - outer**2)
         return delta * sqrt(3 + float(slope.max()) ** 2)
 
     return chord
+
+
+def _weighed(angles: Angles, w: float) -> Floats:
+    eps = vectors(angles)
+    weighed: Floats = np.abs(eps).sum(axis=1) + w * np.linalg.norm(eps, axis=1)
+    return weighed
 
 
 def vectors(angles: Angles) -> Floats:

@@ -223,16 +223,20 @@ def _disturbances(
         delta_omega = p.delta_omega + p.rate_lag * omega_dot
         delta_omega_e = delta_omega + delta_R * p.k_omega_d
         delta_z2 = delta_omega_e + c1 * delta_q
+        if (c1, c2) == (min(p.C1), min(p.C2)):  # ε̃ and C₂ z₂; parts of one error at right angles to each other
+            of_state = delta_q * hypot(1 + c1 * c2, (1 + c1 * c2) * eps_e + 2 * c2 * p.k_omega_d)
+            of_state += delta_q**2 * ((1 + c1 * c2) * eps_e / 2 + 2 * c2 * p.k_omega_d)
+        else:
+            of_state = delta_q * (1 + c1 * c2 + 2 * c2 * p.k_omega_d)
         noise = (
-            delta_q * hypot(1 + c1 * c2, (1 + c1 * c2) * eps_e + 2 * c2 * p.k_omega_d)  # ε̃, C₂ z₂
-            + delta_q**2 * ((1 + c1 * c2) * eps_e / 2 + 2 * c2 * p.k_omega_d) + c2 * delta_omega
+            of_state + c2 * delta_omega
             + p.k_theta_hat * delta_omega  # Φ^Q θ̂
             + p.weight * delta_R + spread * (2 * omega * delta_omega + delta_omega**2)  # Ψ
             + j * ((omega * delta_R + delta_omega) * p.k_omega_d + delta_R * p.k_omega_d_dot)
             + j * c1 / 2 * (delta_omega_e + delta_q * omega_e)  # ᾱ
             + p.norm_B * p.delta_u
         )  # fmt: skip
-        theta_dot = max(p.Gamma) * sqrt(max(p.Gamma) / min(p.Gamma)) * (axis_omega + delta_omega) * (z2 + delta_z2)
+        theta_dot = fastest_estimate(p, axis_omega + delta_omega, z2 + delta_z2)
         hold = stale_torque(p, omega, axis_omega, omega_e, z2_dot, theta_dot)
         fast = noise + hold + theta * turned + p.k_tau_d
         if held:  # what u₁ should have added to the yaw, beyond the slow part and the feedback that φ counts
@@ -247,9 +251,7 @@ def _disturbances(
     else:
         return None
 
-    # θ̂ steps by Γ Φ^Q z₂^Q with the values at a tick, while z₂ᵀ Φ θ̃ acts all the while; the last term is its square.
-    omega_Q, z2_Q = omega + delta_omega, z2 + delta_z2  # the paper's letters
-    power = p.age * theta * (z2_dot * omega_Q + delta_z2 * omega_dot) + p.age / 2 * max(p.Gamma) * (omega_Q * z2_Q) ** 2
+    power = stale_power(p, z2_dot, omega_dot, omega + delta_omega, z2 + delta_z2, delta_z2)
     push_dot = theta * p.k_omega_d_dot + p.axis_rate * theta_dot
     D2 = fast + theta * omega_e + max(1 - p.share, p.share - phi) * torque  # θ̃ acts on ω_e; φ beside its mean
     if held:
@@ -330,6 +332,37 @@ def stale_torque(
         + j * (p.k_omega_d_ddot + omega * p.k_omega_d_dot)
         + j * c1 / 2 * (omega_e_dot + omega_e**2 / 2)
     )  # fmt: skip
+
+
+def fastest_estimate(p: Premises, omega: float, z2: float) -> float:
+    """The largest ‖θ̂'‖, by the projection's norm √cond Γ; largest |ω_k^Q| [rad/s] and ‖z₂^Q‖ [rad/s]."""
+    return max(p.Gamma) * sqrt(max(p.Gamma) / min(p.Gamma)) * omega * z2
+
+
+def stale_power(p: Premises, z2_dot: float, omega_dot: float, omega: float, z2: float, delta_z2: float) -> float:
+    """Power by which the adaptation, held for a period, is out of date [W].
+
+    θ̂ steps by T Γ Φ^Q z₂^Q with the values at a tick, while z₂ᵀ Φ θ̃ acts all the while; the second term is the step's
+    square. A step that ends s beyond the ball of k_θ/0.95 =: R is clipped to it, at its nearest point. For unequal Γ
+    that is not the nearest in θ̃ᵀΓ⁻¹θ̃, which then grows by at most s Θ/λ_min(Γ). The projection leaves of the outward
+    part o of a step from within the ball at most (1 − σ) o, σ the share of R² − k_θ² that ‖θ̂‖² has passed: so
+    s ≤ ‖step‖²/2R + o − (R² − k_θ²)/2R, or without its last two terms where they are negative.
+
+    Args:
+        p: Premises.
+        z2_dot: Largest ‖ż₂‖ [rad/s²].
+        omega_dot: Largest ‖ω̇‖ [rad/s²].
+        omega: Largest ‖ω^Q‖ [rad/s].
+        z2: Largest ‖z₂^Q‖ [rad/s].
+        delta_z2: Largest ‖z₂^Q − z₂‖ [rad/s].
+    """
+    gamma, least, R = max(p.Gamma), min(p.Gamma), p.k_theta_hat
+    power = p.age * p.theta_error * (z2_dot * omega + delta_z2 * omega_dot) + p.age / 2 * gamma * (omega * z2) ** 2
+    if gamma > least and p.age and R:
+        step, outward = p.age * fastest_estimate(p, omega, z2), p.age * gamma * omega * z2
+        beyond = step**2 / (2 * R) + max(0.0, outward - (R**2 - p.k_theta**2) / (2 * R))
+        power += beyond * p.theta_error / (least * p.age)
+    return power
 
 
 def _mean(values: Vector) -> float:

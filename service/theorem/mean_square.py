@@ -6,9 +6,8 @@ the size of ‖z‖ that a log shows. Then, for every run that keeps the premise
 
     ∫ k ‖z‖² dt ≤ V(t₀) + ∫ δ dt
 
-Age: the torque differs by `stale_torque`, and the noise by δ_V1 T ‖ż‖, since z grew by as much. θ̂ steps by T Γ Φ^Q z₂^Q
-with the value at the tick, while z₂ᵀ Φ^Q θ̃ acts for the whole period: together with the square of the step that adds
-the power T ‖θ̃‖ (‖ż₂‖ ‖ω^Q‖ + δ_z2 ‖ω̇‖) + T/2 ‖Γ‖ (‖ω^Q‖ ‖z₂^Q‖)².
+Age: the torque differs by `stale_torque`, and the noise by δ_V1 T ‖ż‖, since z grew by as much; `stale_power` adds what
+the adaptation's steps do.
 
 Held roll: `mechanism_torque`.
 """
@@ -21,7 +20,7 @@ from typing import Final, NamedTuple
 
 from aeroloop.service.theorem.bounds import lemma_1, theorem_1
 from aeroloop.service.theorem.evaluation import Evaluated
-from aeroloop.service.theorem.invariant import Premises, stale_torque
+from aeroloop.service.theorem.invariant import Premises, fastest_estimate, stale_power, stale_torque
 
 _MOST_ITERATIONS: Final = 1000
 _AGREED: Final = 1e-9
@@ -61,7 +60,7 @@ def decay(e: Evaluated, seen: float) -> Decay | None:
         seen: Largest ‖z^Q‖ [1, rad/s].
     """
     p = e.plant
-    c1, c2, gamma = max(p.C1), max(p.C2), max(p.Gamma)
+    c1, c2 = max(p.C1), max(p.C2)
     size, z2_dot = seen, 0.0
     for _ in range(_MOST_ITERATIONS):
         omega_e = hypot(1, c1) * size  # (C.26)
@@ -73,7 +72,7 @@ def decay(e: Evaluated, seen: float) -> Decay | None:
         known = replace(e.known, delta_eps=delta_eps, delta_omega=delta_omega, k_tau_d=p.k_tau_d)
         lemma = lemma_1(known)
         omega_Q, z2_Q = omega + delta_omega, size + lemma.delta_z2  # the paper's letters
-        theta_dot = gamma * sqrt(gamma / min(p.Gamma)) * omega_Q * z2_Q
+        theta_dot = fastest_estimate(p, omega_Q, z2_Q)
         hold = stale_torque(p, omega, omega, omega_e, z2_dot, theta_dot)
         if p.tilt is not None:
             hold += mechanism_torque(p, size, omega_Q, z2_dot)
@@ -86,8 +85,7 @@ def decay(e: Evaluated, seen: float) -> Decay | None:
         next_dot = (hypot(1, c2) * size + p.theta_error * omega_Q + noise) / min(p.J)
         next_size = seen + hypot(lemma.delta_z1, lemma.delta_z2) + p.age * z_dot
         if next_dot <= z2_dot * (1 + _AGREED) and next_size <= size * (1 + _AGREED):
-            power = p.age * p.theta_error * (z2_dot * omega_Q + lemma.delta_z2 * omega_dot)
-            power += p.age / 2 * gamma * (omega_Q * z2_Q) ** 2
+            power = stale_power(p, z2_dot, omega_dot, omega_Q, z2_Q, lemma.delta_z2)
             return Decay(theorem.k, theorem.delta_Qdist + power, delta_eps, delta_omega)
         z2_dot, size = next_dot, next_size
         if not isfinite(z2_dot) or z2_dot > _FASTEST:

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import operator as verbs
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Description, Event, Loss, Status, Telemetry, Truth
+from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Event, Loss, Status, Telemetry, Truth
 from aeroloop.protocol.messages.trace import Batch, Sent, read_batch
 from aeroloop.protocol.wire import attitude
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -135,7 +135,7 @@ class Decoder:
             return []
         try:
             return read(address, payload, published_ns)
-        except ValidationError:
+        except (ValueError, OverflowError):  # a stranger may publish anything, such as 1e999
             self.malformed += 1
             return []
 
@@ -226,7 +226,7 @@ class Decoder:
 
     def _loss(self, address: topics.Address, payload: bytes, at_ns: int) -> list[Decoded]:
         loss = Loss.model_validate_json(payload)
-        text = f"{loss.count} messages of {loss.key} are not in the log ({loss.reason})"
+        text = f"{loss.count} messages of {loss.key} are not in the log: {LOSS_REASONS[loss.reason]}"
         return [_logged(address.vehicle, LogLevel.Warning, "recorder", text, at_ns)]
 
 

@@ -22,10 +22,9 @@ from zenoh.handlers import RingChannel
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
+from aeroloop.protocol.transport.history import Delivery, RecoveringSubscriber, read_sample
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.publication import Delivery, read_sample
-from aeroloop.protocol.transport.recovery import RecoveringSubscriber
 from aeroloop.service.viewers.channels import LIMITED, SHAPES, UNLIMITED, Decoder, topic_of
 from aeroloop.service.viewers.schemas import Decoded, Shape
 
@@ -46,7 +45,8 @@ class LiveDecoder:
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
         self._decoder = Decoder(None)  # the rate of `take` bounds it
-        self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle), KEPT)
+        self._descriptions = RecoveringSubscriber(session, topics.key("description", vehicle))
+        self._described: dict[str, int] = {}  # when each key's newest description was published [ns since 1970]
         self._subscribers = {
             session.declare_subscriber(topics.key(name, vehicle), RingChannel(room)): room
             for names, room in ((UNLIMITED, KEPT), (LIMITED.union(topics.FRAMES), 1))
@@ -56,6 +56,10 @@ class LiveDecoder:
     def take(self) -> Iterator[Decoded]:
         """Messages since the last call: the newest of each streaming topic, all of the others. Never blocks."""
         for description in self._descriptions.take():
+            published_ns = description.published_ns or time_ns()
+            if published_ns < self._described.get(description.key, 0):
+                continue  # recovered after a newer one
+            self._described[description.key] = published_ns
             try:
                 self._decoder.configure(Description.model_validate_json(description.payload))
             except ValidationError:

@@ -16,23 +16,28 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import cycle
 from pathlib import Path
 from typing import Final
 
 import zenoh
+from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Loss, SessionRecord
+from aeroloop.protocol.messages.models import Claim, Event, Loss, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Advance, Gains, Hold, Inject, Request, Setpoint, Sinusoid, Track
+from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.messages.topics import Topic
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.service.bench.running import ROLES, RunningLoop
 from aeroloop.service.config import Settings
-from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous, standalone
+from aeroloop.service.testing.process_group import ProcessGroup, RoleName, free_rendezvous, standalone
+from tests.benchmarks.loop import memory_mb
+from tests.support.zenoh_network import eventually
 
+ROLES: Final[tuple[RoleName, ...]] = ("controller", "plant", "recorder")
 SECONDS: Final = 4.0
 LINKED_S: Final = 0.5
 """A stranger is linked to all processes within this time."""
@@ -52,7 +57,7 @@ WELL_FORMED: Final = {
     "advance": Advance(seconds=1.0),
     "reference": Setpoint(attitude=(0.0, 1.0, 2.0)),
     "event": Event(role="plant", kind="fault", text="it never happened"),
-    "loss": Loss(key="aeroloop/aero/event/plant", count=1, reason="network"),
+    "loss": Loss(key="aeroloop/aero/event/plant", count=1, reason="gone"),
 }  # fmt: skip
 """Without certificates an arm, a stop or a plant's status would be taken at its word: of those garbage alone."""
 
@@ -111,19 +116,26 @@ def start(endpoint: str, name: str, seconds: float) -> subprocess.Popen[bytes]:
 
 
 class Ends:
-    """Skipped ticks and memory of the loop's processes."""
+    """Skipped ticks and memory of the loop's processes, once the plant is driven."""
 
-    def __init__(self, loop: RunningLoop) -> None:
-        self._loop = loop
+    def __init__(self, processes: ProcessGroup, vehicle: str) -> None:
+        self._received: dict[str, Status] = {}
+        processes.zenoh.declare_subscriber(topics.key("status", vehicle), self._receive)
+        eventually("driving", lambda: "plant" in self._received and self._received["plant"].state == PlantState.DRIVEN)
         self._before = self._now()
 
+    def _receive(self, sample: zenoh.Sample) -> None:
+        with suppress(ValidationError):
+            status = Status.model_validate_json(sample.payload.to_bytes())
+            self._received[status.role] = status
+
     def _now(self) -> dict[str, tuple[int, float]]:
-        found = {}
-        for role, status in self._loop.statuses().items():
-            pid = int(status.process.rpartition(" ")[2])
-            with open(f"/proc/{pid}/statm") as pages:
-                found[role] = status.skipped, int(pages.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-        return found
+        self._received.clear()
+        eventually("a status of each", lambda: self._received.keys() >= {*ROLES})
+        return {
+            role: (status.skipped, memory_mb(int(status.process.rpartition(" ")[2]))[0])
+            for role, status in self._received.items()
+        }
 
     def since(self) -> str:
         """What has changed since the last call, end by end."""
@@ -139,26 +151,23 @@ def main(seconds: float, flooders: int, names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         settings = standalone(Settings(), Path(folder) / "log.mcap")
         with ProcessGroup(settings) as processes:
-            loop = RunningLoop(processes, settings.vehicle)
-            for role in ("recorder", "plant", "controller"):
+            for role in ROLES:
                 processes.start(role, environment={"PYTHONUNBUFFERED": "1"})  # an interpreter of its own
-                if role != "controller":  # whose token has a name of its own
-                    processes.await_role(role)
-            loop.await_drive()
+            ends = Ends(processes, settings.vehicle)
             aside = subprocess.Popen(words)
             os.nice(19)  # it watches tokens, too
             try:
                 targets = {"bystander": bystander, "flooded": settings.network.rendezvous[0]}
-                in_turns(loop, targets, seconds, flooders, names)
+                in_turns(ends, targets, seconds, flooders, names)
             finally:
                 aside.kill()
                 aside.wait()
 
 
-def in_turns(loop: RunningLoop, targets: dict[str, str], seconds: float, flooders: int, names: list[str]) -> None:
+def in_turns(ends: Ends, targets: dict[str, str], seconds: float, flooders: int, names: list[str]) -> None:
     """Floods, topic by topic and target by target, each time after a quiet stretch."""
     time.sleep(seconds)
-    ends = Ends(loop)
+    ends.since()
     for name in names:
         for title, rendezvous in {"quiet": None, **targets}.items():
             strangers = [start(rendezvous, name, seconds) for _ in range(flooders)] if rendezvous else []

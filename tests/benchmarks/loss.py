@@ -23,7 +23,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from aeroloop.service.lab.soak import usage_of
+from tests.benchmarks.record import cpu_s
 from tests.support.certificates import Authority
 from tests.support.namespaces import RECOVERY_S, Hosts
 from tests.support.zenoh_network import eventually
@@ -103,9 +103,9 @@ def run(overrides: list[str], condition: str, seconds: float, *, certificates: b
             if "kbit" in words:
                 hosts.narrow(host, round(words["kbit"]))
         ends = [processes[1].pid, processes[0].pid]
-        before, busy = hosts.crossed("plant"), [usage_of(pid).cpu_s for pid in ends]
+        before, busy = hosts.crossed("plant"), [cpu_s(pid) for pid in ends]
         time.sleep(seconds)
-        after, busy_after = hosts.crossed("plant"), [usage_of(pid).cpu_s for pid in ends]
+        after, busy_after = hosts.crossed("plant"), [cpu_s(pid) for pid in ends]
         for host in ("plant", "controller"):
             hosts.lose(host, 0)
             hosts.plug(host)

@@ -22,8 +22,8 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
+from aeroloop.protocol.transport.history import CachedPublisher
 from aeroloop.protocol.transport.network import join
-from aeroloop.protocol.transport.publication import CachedPublisher
 from aeroloop.service.config import Settings, load
 from aeroloop.service.testing.process_group import ProcessGroup, free_rendezvous
 from tests.support.made_messages import VEHICLE, Ends, description_of

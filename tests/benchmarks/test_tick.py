@@ -1,7 +1,6 @@
 """Tick benchmark: the law in plain NumPy from frame bytes to frame bytes, and a row of the plant's trace.
 
-Run with `uv run pytest tests/benchmarks --benchmark-enable`; `aeroloop host bench --only tick` measures the
-controller's own tick. No time is asserted.
+Run with `uv run pytest tests/benchmarks --benchmark-enable`. No time is asserted.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.messages.operator import Sinusoid

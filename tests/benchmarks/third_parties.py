@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from pathlib import Path
 from subprocess import Popen
@@ -20,6 +21,9 @@ from subprocess import Popen
 from tests.support.namespaces import Hosts
 
 AWAY_S = 2.0
+LONG_S = 25.0
+"""Longer than the lease of links between hosts, 10 s: these are closed meanwhile [s]."""
+THIRDS = ("third", "third2", "third3", "third4")
 SETTLE_S = 2.0
 TRIALS = 10
 
@@ -41,15 +45,15 @@ class Seen:
 
 def main(trials: int) -> None:
     """Run all troubles and print a line for each."""
-    with tempfile.TemporaryDirectory() as name, Hosts(["plant", "controller", "third"], Path(name)) as hosts:
+    with tempfile.TemporaryDirectory() as name, Hosts(["plant", "controller", *THIRDS], Path(name)) as hosts:
         folder = Path(name)
         hosts.aeroloop("plant", "emulator")
         hosts.aeroloop("controller", "controller", "--auto-arm")
         hosts.watch("plant", folder / "seen")
         seen, logs = Seen(folder / "seen"), count()
 
-        def recorder() -> Popen[bytes]:
-            return hosts.aeroloop("third", "recorder", "--log", str(folder / f"{next(logs)}.mcap"))
+        def recorder(host: str = "third") -> Popen[bytes]:
+            return hosts.aeroloop(host, "recorder", "--log", str(folder / f"{next(logs)}.mcap"))
 
         def operator() -> Popen[bytes]:
             return hosts.aeroloop("third", "op", "top")
@@ -58,6 +62,13 @@ def main(trials: int) -> None:
             hosts.pull("third")
             time.sleep(AWAY_S)
             hosts.plug("third")
+
+        def four_cables_out(_: Parties) -> None:
+            for host in THIRDS:
+                hosts.pull(host)
+            time.sleep(LONG_S)
+            for host in THIRDS:
+                hosts.plug(host)
 
         def narrow(_: Parties) -> None:
             hosts.narrow("third", 64)
@@ -85,6 +96,7 @@ def main(trials: int) -> None:
                 party.wait()
 
         starts: dict[str, Callable[[], Popen[bytes]]] = {"recorder": recorder, "operator": operator}
+        starts |= {host: partial(recorder, host) for host in THIRDS}
         troubles: list[tuple[str, list[str], Callable[[Parties], None]]] = [
             ("nothing", ["recorder", "operator"], lambda _: time.sleep(AWAY_S)),
             ("the recorder's cable out for 2 s", ["recorder"], cable_out),
@@ -93,6 +105,7 @@ def main(trials: int) -> None:
             ("both halted for 2 s", ["recorder", "operator"], halted),
             ("both killed and started again", ["recorder", "operator"], killed),
             ("a recorder and an operator join and leave", [], joins_and_leaves),
+            ("four recorders' cables out for 25 s", list(THIRDS), four_cables_out),
         ]
         time.sleep(2 * SETTLE_S)
         for title, names, happens in troubles:

@@ -21,7 +21,7 @@ from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.can_format import FaultPhase, FaultReport, Heartbeat, fault_check, fingerprint
+from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -42,7 +42,7 @@ class Ends:
         bus = virtual()
         self.role = Role("plant", "aero", gathering.settings, {})
         # No watchdog here: it counts real time, and the relay's is tried without.
-        self._bridge = Bridge(self.role, LOOP, WIRE, PlantSettings(watchdog_s=10, faults=["rate:off@9"]), bus)
+        self._bridge = Bridge(self.role, LOOP, WIRE, PlantSettings(watchdog_s=10), bus)
         self.node = CanLink(bus, WIRE, "plant")
         self.events: list[Event] = []
         self._session = gathering.join()
@@ -114,6 +114,10 @@ class Ends:
         """As `aeroloop op stop`."""
         return Answer.model_validate_json(self._ask("stop", Request().encode()))
 
+    def arm(self) -> Answer:
+        """As `aeroloop op arm`."""
+        return Answer.model_validate_json(self._ask("arm", Request().encode()))
+
     def received_state(self) -> PlantState | None:
         """The state that the node last received from the bridge."""
         return self.node.peer.state if self.node.peer else None
@@ -129,7 +133,7 @@ class Ends:
             for reply in self._session.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
-            time.sleep(2 / topics.TOPICS[topic].per_s)  # it came too soon after the last, and was dropped
+            time.sleep(2 / topics.QUERIES_PER_S)  # it came too soon after the last, and was dropped
         raise AssertionError(f"no reply to {topic!r}")
 
     def _on_event(self, sample: zenoh.Sample) -> None:
@@ -162,42 +166,6 @@ def ends() -> Iterator[Ends]:
             yield ends
         finally:
             ends.close()
-
-
-def test_begin_end_and_count_of_a_nodes_fault_are_published_at_the_ticks_that_the_node_reports(ends: Ends) -> None:
-    ends.hold()
-    for counter in range(4):
-        ends.node.send(WIRE.measurement.pack(counter, (counter, 0, 0, 0, 0, 0)))
-        eventually("the measurement", lambda counter=counter: len(ends.measured) == counter + 1)  # type: ignore[misc]
-    check = fault_check("rate:off@9")
-    for phase, tick, changed in ((FaultPhase.TO_COME, 3, 0), (FaultPhase.ACTS, 2, 1), (FaultPhase.OVER, 4, 300)):
-        ends.node.report(FaultReport(0, phase, tick, check, changed))
-    ends.node.report(FaultReport(5, FaultPhase.ACTS, 3, check, 1))  # the bridge's configuration has no sixth one
-
-    def faults() -> list[Event]:
-        return [event for event in ends.events if event.kind == "fault"]
-
-    eventually("the events", lambda: len(faults()) == 3)
-    unknown = "fault 6 of node 1, not in the bridge's plant.faults"
-    assert [(event.text, event.tick) for event in faults()] == [
-        ("fault begins (configured): rate:off@9", 2),
-        ("fault ends (configured): rate:off@9, 300 samples dropped", 4),
-        (f"fault begins (configured): {unknown}", 3),
-    ]
-    assert len({event.session for event in faults()} - {None}) == 1
-    eventually("the status", lambda: any(len(status.faults) == 2 for status in ends.statuses))
-    (known, other) = next(status.faults for status in ends.statuses if len(status.faults) == 2)
-    assert (known.fault, known.begin_tick, known.end_tick, known.changed) == ("rate:off@9", 2, 4, 300)
-    assert (other.fault, other.begin_tick, other.end_tick, other.changed) == (unknown, 3, None, 1)
-
-
-def test_without_a_report_no_fault_is_published(ends: Ends) -> None:
-    """The plant behind the bus may be no emulator."""
-    ends.hold()
-    assert ends.release()
-    eventually("a status", lambda: bool(ends.statuses))
-    assert not any(status.faults for status in ends.statuses)
-    assert not any(event.kind == "fault" for event in ends.events)
 
 
 def test_it_sends_the_node_a_sessions_number_and_its_end(ends: Ends) -> None:
@@ -241,6 +209,24 @@ def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
     refusal = ends.claim()
     assert isinstance(refusal, Refusal)
     assert "stopped by an operator" in refusal.reason
+
+
+def test_a_stop_of_the_bridge_holds_in_its_next_process_until_arm() -> None:
+    with Gathering() as gathering:
+        ends = Ends(gathering)
+        assert ends.stop().done
+        ends.close()
+    with Gathering() as gathering:
+        ends = Ends(gathering)
+        try:
+            ends.say(PlantState.IDLE)
+            refusal = ends.claim()
+            assert isinstance(refusal, Refusal)
+            assert "stopped by an operator: 0 V; `aeroloop op arm` clears it" in refusal.reason
+            ends.arm()
+            ends.hold()
+        finally:
+            ends.close()
 
 
 @pytest.mark.parametrize("cause", [TripCause.ENVELOPE, None])

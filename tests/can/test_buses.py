@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
@@ -26,9 +26,9 @@ from aeroloop.protocol.transport.can_format import CanSettings, Heartbeat
 from aeroloop.service.config import load
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.experiment import run_experiment
-from aeroloop.service.review.review import read, review
+from aeroloop.service.review.review import review
 from aeroloop.service.testing.fork_server import fork_server
-from aeroloop.service.testing.hil import Hil, HilLog
+from aeroloop.service.testing.hil import Hil, HilError, HilLog
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.slcan_adapter import SlcanAdapter
 
@@ -149,20 +149,6 @@ def test_in_lockstep_the_figures_are_those_of_the_experiment_to_the_last_bit(
     assert figures.trips == []
 
 
-def test_a_log_has_the_nodes_faults_to_the_tick_as_it_has_an_emulators(tmp_path: Path) -> None:
-    faults = ["command:drop=0.5@0.2..0.4", "rate:bias=0.01@0.5"]
-    with Loop(tmp_path, "udp_multicast", lockstep=True) as loop:
-        loop.start({"controller.duration_s": 1.0, "plant.faults": faults})
-        loop.hil.eventually("the end", lambda: not loop.hil.processes.running("controller"))
-        log = loop.hil.log
-    findings = read(log.path).findings
-    found = [(fault.fault, fault.begin_s, fault.end_s, fault.effect) for fault in findings.faults]
-    assert found == [(faults[0], 0.2, 0.4, "commands dropped"), (faults[1], 0.5, None, "samples shifted")]
-    assert 20 < findings.faults[0].changed < 80  # of 100 commands; its last report is after its end
-    marks = [(mark.text.partition(" (")[0], mark.time_s) for mark in findings.marks if mark.kind == "fault"]
-    assert marks == [("fault begins", 0.2), ("fault ends", 0.4), ("fault begins", 0.5)]
-
-
 @pytest.mark.parametrize(("interface", "settings"), BUSES[1:])
 def test_in_real_time_it_tracks(tmp_path: Path, interface: str, settings: dict[str, Any]) -> None:
     """No more than twice the experiment's error, and half a degree in the end.
@@ -279,6 +265,7 @@ def test_a_node_that_dies_is_missed_within_half_a_second_and_driven_again_when_i
     assert SILENT_S - 0.1 < (tripped - last) * 1e-9 < SILENT_S + SLACK_S
 
 
+@pytest.mark.smoke
 def test_a_controller_that_dies_leaves_the_node_at_rest_in_time(hil: Hil) -> None:
     """Its bridge releases it, or its own watchdog trips it: whichever is first, it is at 0 V then."""
     hil.start()
@@ -343,7 +330,8 @@ def test_an_unplugged_adapter_is_reported_and_reopened_at_the_same_path(tmp_path
         def driven_when_armed() -> bool:
             """The node opens its bus twice a second: armed before that, the plant gets no first command, and trips."""
             if hil.state("plant") == "tripped":
-                hil.arm()
+                with suppress(HilError):  # it was granted again since the last status
+                    hil.arm()
             return loop.driven()
 
         hil.eventually("driving again", driven_when_armed)

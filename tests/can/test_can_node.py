@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from threading import Event
 
 import pytest
 
+from aeroloop.plant_emulator.hosts.can_node import CanNetwork
+from aeroloop.plant_emulator.hosts.emulator import Emulator
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID
 from aeroloop.protocol.transport.can_link import CanLink
-from tests.support.can_in_process import Flaws, virtual
-from tests.support.can_stage import COUNTERS, OFF, Bus, command
+from aeroloop.protocol.wire.loop import LoopSettings
+from tests.support.can_in_process import Flaws, Stranger, virtual
+from tests.support.can_stage import COUNTERS, OFF, WIRE, Bus, command
 
 SLACK_S = 0.3
 """For a test that other work on the machine keeps waiting: it must run to notice anything."""
@@ -225,3 +231,23 @@ def test_a_bus_that_stays_away_trips_it_and_is_tried_twice_a_second(
     bus.begin(number=2)
     bus.await_heartbeat(PlantState.GRANTED)
     bus.drive()
+
+
+def test_an_emulated_node_logs_when_its_faults_begin_and_end_and_the_bus_carries_none(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bus, loop = virtual(), LoopSettings()
+    node = Emulator(loop, WIRE, PlantSettings(faults=["rate:bias=0.1@0.01..0.02"], watchdog_s=10), Event())
+    front = CanNetwork(bus, loop, node.endpoint)
+    with Stranger(bus) as stranger:
+        node.endpoint.claim(
+            Claim(controller="a", session="s", period_ns=loop.period_ns, lockstep=False, auto_arm=True, wire=WIRE)
+        )
+        for k in range(20):
+            front.after_tick(node.tick(None, k), None, 0)
+        front.leave()
+        assert {message.arbitration_id for message in stranger.everything()} == {PLANT_HEARTBEAT_ID + bus.node}
+    said = [record.getMessage() for record in caplog.records if "fault" in record.getMessage()]
+    assert len(said) == 2
+    assert "fault begins (configured): rate:bias=0.1@0.01..0.02" in said[0]
+    assert "fault ends (configured): rate:bias=0.1@0.01..0.02, 5 samples shifted" in said[1]

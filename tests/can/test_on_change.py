@@ -9,7 +9,7 @@ import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
-from aeroloop.plant_emulator.hosts.can_node import CanFront
+from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
@@ -82,17 +82,17 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
 
 
 @pytest.fixture(params=[False, True], ids=["real time", "lockstep"])
-def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanFront, Stranger, bool]]:
+def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanNetwork, Stranger, bool]]:
     """A node's front, a stranger that receives what it sends, and whether it is in lockstep."""
     bus = virtual()
     endpoint = Endpoint(Still(), BOTH, PERIOD_NS, lockstep=request.param)
-    front = CanFront(bus, LoopSettings(lockstep=request.param), endpoint)
+    front = CanNetwork(bus, LoopSettings(lockstep=request.param), endpoint)
     with Stranger(bus) as stranger:
         yield front, stranger, request.param
         front.leave()
 
 
-def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[CanFront, Stranger, bool]) -> None:
+def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[CanNetwork, Stranger, bool]) -> None:
     front, stranger, lockstep = node
     for frame in (measurement(0), SILENCE, SILENCE, measurement(3)):
         front.send(frame)

@@ -16,12 +16,13 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Event, Truth
+from aeroloop.protocol.messages.models import Event, Telemetry, Truth
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.testing.hil import Hil, HilLog
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.cable import Cable
+from tests.support.own_laws import HERE
 
 AEROLOOP = [sys.executable, "-P", "-m", "aeroloop"]
 WATCHDOG_S = 0.1
@@ -47,8 +48,7 @@ def last_command_ns(log: HilLog) -> int:
 
 
 # ── processes that die, stand still and come back ──
-
-
+@pytest.mark.smoke
 def test_the_motors_are_at_rest_in_time_when_the_controller_is_killed_and_a_new_one_takes_over(hil: Hil) -> None:
     hil.start(settings=FAST_TRUTH)
     hil.run(0.5)
@@ -79,6 +79,7 @@ def test_a_restarted_controller_is_back_in_control_within_a_second_of_looking_fo
     assert (has - looks) * 1e-9 < 1.0
 
 
+@pytest.mark.smoke
 def test_a_controller_that_stands_still_loses_the_plant_and_its_later_commands_have_no_effect(hil: Hil) -> None:
     hil.start(settings=FAST_TRUTH)
     hil.run(0.5)
@@ -217,6 +218,7 @@ def test_a_cut_cable_brings_the_motors_to_rest_and_a_mended_one_the_controller_b
     eventually(lambda: claims() == 2, "a second session")
 
 
+@pytest.mark.smoke
 def test_without_the_session_a_stranger_moves_nothing(hil: Hil) -> None:
     """A stranger that publishes on every likely key; the plant subscribes to its own session's only."""
     hil.start(settings={"controller.require_recorder": True}, drive=False)
@@ -331,3 +333,16 @@ def test_a_fault_does_over_the_network_what_it_does_in_one_process(lockstep: Hil
     alone = run_experiment(load(overrides=[f'plant.faults=["{fault}"]']), figures.duration_s)
     assert figures.z_track == alone.z_track
     assert figures.u_total == alone.u_total
+
+
+# ── what a user's code leaves behind ──
+
+
+def test_the_cycles_that_a_law_in_python_drops_at_every_tick_are_collected_while_it_drives(hil: Hil) -> None:
+    """20 000 objects in 4 s, of which it keeps 1 000. A machine that stalls makes fewer ticks, and as many to keep."""
+    hil.start(settings={**PATIENT, "law.kind": f"{HERE}:Cyclic"})
+    hil.run(4.0)
+    assert hil.state("controller") == "running"
+    alive = [sample.state["alive"][0] for _, sample in hil.log.messages("telemetry") if isinstance(sample, Telemetry)]
+    assert len(alive) > 20
+    assert max(alive) < 7_000

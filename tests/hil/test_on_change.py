@@ -136,6 +136,7 @@ def moments(log: HilLog, kind: str) -> list[int]:
     return [at for at, event in log.messages("event") if isinstance(event, Event) and event.kind == kind]
 
 
+@pytest.mark.smoke
 def test_the_motors_are_at_rest_in_time_when_a_controller_dies_that_was_silent_anyway(hil: Hil) -> None:
     hil.start(settings={**FAST_TRUTH, **ON_CHANGE})
     hil.run(0.5)

@@ -1,16 +1,24 @@
-"""A controller that was killed and is started again: nothing moves that was not asked for."""
+"""A process that was killed and is started again: nothing moves that was not asked for."""
 
 from __future__ import annotations
 
+import getpass
 import shlex
+import signal
+from datetime import UTC, datetime
 from math import degrees
+from pathlib import Path
 
 import pytest
 
+from aeroloop.plant_emulator.hosts.latch_file import Latch
 from aeroloop.protocol.messages.models import SessionRecord, Truth
 from aeroloop.protocol.messages.operator import Gains, Hold, Sinusoid, Track
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.attitude import to_euler
+from aeroloop.service.config import load
 from aeroloop.service.host.operator import send, show
+from aeroloop.service.lab.demo import run_demo
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.testing.hil import Hil
 from tests.hil.test_faults import PATIENT
@@ -22,6 +30,42 @@ CONFIGURED = Gains(C1=(0.3, 0.3, 0.3), C2=(0.15, 0.15, 0.15), Gamma=(0.02, 0.02,
 
 
 SWING = Sinusoid(amplitude=(0.0, 10.0, 20.0))
+
+
+@pytest.mark.smoke
+def test_a_stop_holds_however_the_plants_process_ends_and_the_log_replays(hil: Hil) -> None:
+    """No slack: what must not happen is waited for over more than one period of the controller's claims, 0.25 s."""
+    hil.start(settings={**PATIENT, "controller.auto_arm": True})
+    hil.stop()
+    hil.eventually("the stop", lambda: hil.state("plant") == "tripped")
+    since, stopped = hil.status("plant").since, f"stopped by an operator ({getpass.getuser()}@"
+    for how in (signal.SIGKILL, signal.SIGTERM):
+        hil.events.clear()
+        hil.processes.stop("plant", how)
+        hil.restart("plant")
+        hil.eventually("what it says", lambda: hil.happened("started", f"aero is still tripped: {stopped}"))
+        hil.eventually("a refusal", lambda: hil.happened("refused", stopped))
+        hil.run(0.6)
+        assert (hil.state("plant"), hil.status("plant").since) == ("tripped", since)
+        assert not hil.happened("claimed")
+    hil.arm()
+    hil.eventually("driving", lambda: hil.state("plant") == "driven")
+    hil.run(0.3)
+    plants = replay([hil.log.path]).plants
+    assert [(plant.differ, plant.stopped) for plant in plants if plant.ticks] == [(0, None)] * 2
+
+
+def test_yesterdays_stop_surprises_no_demo(tmp_path: Path) -> None:
+    """In lockstep, so without slack."""
+    latch = Latch(cause=TripCause.OPERATOR, text="stopped: 0 V", operator_only=True, since=datetime.now(UTC))
+    kept = tmp_path / "aero.json"
+    kept.write_text(latch.model_dump_json())
+    settings = load(overrides=["loop.lockstep=true", f"plant.state_directory={tmp_path}"])
+    for name in ("a", "b"):
+        figures, complete = run_demo(settings, 0.2, tmp_path / f"{name}.mcap")
+        assert complete
+        assert figures.duration_s > 0.1
+    assert kept.exists()
 
 
 def shown(hil: Hil, *, last: bool = False) -> SessionRecord:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -50,6 +51,7 @@ def harass(session: zenoh.Session, names: frozenset[str], running: str, tokens: 
         session.liveliness().declare_token(token).undeclare()
 
 
+@pytest.mark.smoke
 @pytest.mark.processes
 def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: Hil, tmp_path: Path) -> None:
     """Slack: the watchdog of `PATIENT`; a second of driving, where a stop takes effect within milliseconds."""
@@ -80,3 +82,24 @@ def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: 
         assert hil.status("controller").session == hil.status("plant").session == running
         harass(joined["operator", "aero"], frozenset({"stop"}), running, tokens)  # as a proof that it would have
         hil.eventually("the stop", lambda: hil.happened("tripped", "stopped by an operator"))
+
+
+def test_frames_of_a_wrong_length_displace_no_good_one_and_are_counted(hil: Hil) -> None:
+    """Some thousands a second on both keys of an open loopback. Slack: the watchdog and patience of `PATIENT`."""
+    hil.start(settings=PATIENT)
+    hil.run(1.5)  # until each has published a status
+    running = hil.status("controller").session
+    assert running is not None
+    keys = [topics.key(name, "aero", session=running) for name in ("measurement", "command")]
+    puts = [hil.processes.zenoh.declare_publisher(key, express=True).put for key in keys]
+    until = time.monotonic() + 4.0
+    while time.monotonic() < until:
+        for payload in (b"", b"\1", os.urandom(20), bytes(200)):
+            for put in puts:
+                put(payload)
+        time.sleep(0.0005)
+    hil.run(1.5)
+    assert (hil.state("plant"), hil.state("controller")) == ("driven", "running")
+    assert hil.status("plant").session == running
+    assert min(hil.status("plant").refused, hil.status("controller").refused) > 1000
+    assert not hil.happened("tripped")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
-from aeroloop.plant_emulator.own_plant import OwnPlant, PlantError
+from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import load

@@ -16,12 +16,12 @@ from aeroloop import protocol
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, PLANT_TABLE, TripCause
 from aeroloop.protocol.messages.topics import TOPICS, Topic
-from aeroloop.protocol.transport.can_format import FaultPhase, FaultReport, fault_check
-from aeroloop.protocol.transport.publication import Cache, attachment, read_page, read_request, request
+from aeroloop.protocol.transport.history import attachment, page, query
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Sender, Transmit
+from tests.protocol.spec_messages import section
 
 SPEC: Final = Path(protocol.__file__).parent / "SPEC.md"
 
@@ -29,7 +29,6 @@ QUANTIZER: Final = "| bits | limit | dead zone | value | code | level |"
 KINDS: Final = "| kind | bits | limit | dead zone | parameter | values | codes | levels |"
 FRAMES: Final = "| frame | counter bits | bits of ε, ω / u | actuators | counter | codes | hex |"
 SENT: Final = "| heartbeat_s | period in ms | counter bits | codes | ticks that send | their counters |"
-REPORTS: Final = "| fault | place | phase | tick | check | changed | report |"
 PUBLISHED: Final = "| what | wanted | hex |"
 REFUSED: Final = "| frame | counter bits | bits of ε, ω / u | actuators | hex | why |"
 
@@ -64,7 +63,6 @@ KIND_ROWS: Final = rows(KINDS, "Golden vectors")
 FRAME_ROWS: Final = rows(FRAMES, "Golden vectors")
 REFUSED_ROWS: Final = rows(REFUSED, "Golden vectors")
 SENT_ROWS: Final = rows(SENT, "Golden vectors")
-REPORT_ROWS: Final = rows(REPORTS, "On a CAN bus")
 PUBLISHED_ROWS: Final = rows(PUBLISHED, "Topics")
 
 
@@ -102,7 +100,6 @@ def as_bits(text: str) -> int | str:
         pytest.param(FRAME_ROWS, 14, id="frames"),
         pytest.param(REFUSED_ROWS, 4, id="refused"),
         pytest.param(SENT_ROWS, 8, id="sent"),
-        pytest.param(REPORT_ROWS, 3, id="fault reports"),
         pytest.param(PUBLISHED_ROWS, 5, id="published"),
     ],
 )
@@ -176,36 +173,17 @@ def test_frames_are_sent_as_their_golden_vectors_say(row: Row) -> None:
     assert [k % counters for k in sent] == [int(counter) for counter in counted.split()]
 
 
-@pytest.mark.parametrize("row", REPORT_ROWS, ids=" ".join)
-def test_a_fault_report_has_the_bytes_of_its_golden_vector(row: Row) -> None:
-    fault, place, phase, tick, check, changed, packed = row
-    number, _, name = phase.partition(" ")
-    report = FaultReport(int(place), FaultPhase(int(number)), int(tick), bytes.fromhex(check), int(changed))
-    assert fault_check(fault).hex() == check
-    assert report.phase.name.lower() == name.replace(" ", "_")
-    assert report.pack() == bytes.fromhex(packed)
-    assert FaultReport.unpack(report.pack()) == report
-
-
 @pytest.mark.parametrize("row", PUBLISHED_ROWS, ids=lambda row: " ".join(row[:2]))
 def test_queries_pages_and_attachments_are_their_golden_vectors(row: Row) -> None:
-    what, number, data = row[0], int(row[1]), bytes.fromhex(row[2])
+    what, wanted, data = row[0], row[1], bytes.fromhex(row[2])
     publisher, clock_ns = 0x0123456789ABCDEF, 1_800_000_000_000_000_000
-    payloads = [b"one", b"two", b"", b"four"]
-    cache = Cache(publisher, 3)
-    for after, payload in enumerate(payloads):
-        cache.put(clock_ns + after, payload)
-    if what == "query":
-        assert request({publisher: number}) == data
-        assert read_request(data) == {publisher: number}
-    elif what == "attachment":
-        assert attachment(clock_ns + number, publisher, number) == data
-    else:
-        assert what == "page"
-        assert cache.page(number) == data
-        first = min(max(number, 1), 4)
-        messages = [(clock_ns + each, payloads[each]) for each in range(first, 4)]
-        assert read_page(data) == (publisher, first, 4, messages)
+    kept = [(number, clock_ns + number, payload) for number, payload in ((1, b"two"), (2, b""), (3, b"four"))]
+    if what == "attachment":
+        assert attachment(clock_ns + int(wanted), publisher, int(wanted)) == data
+        return
+    ranges = [tuple(map(int, each.split("–"))) for each in wanted.split(", ")]
+    asked = query([(publisher, (first, end)) for first, end in ranges])
+    assert (asked if what == "query" else page(asked, publisher, kept)) == data
 
 
 def longest(topic: Topic) -> int:
@@ -258,3 +236,8 @@ def test_the_causes_of_a_trip_are_numbered_as_the_text_says() -> None:
     text = " ".join(SPEC.read_text(encoding="utf-8").split())
     documented = text.split("Causes: ")[1].split(". >")[0]
     assert documented == ", ".join(f"{number} {cause}" for number, cause in enumerate(TripCause, start=1))
+
+
+def test_every_message_stands_in_the_text_as_its_model_reads_it() -> None:
+    """`python -m tests.protocol.spec_messages` writes the section anew."""
+    assert section() in SPEC.read_text()

@@ -57,7 +57,9 @@ def test_law_and_plant_run_as_processes_and_their_log_replays(folder: Path) -> N
     replayed = json.loads(run(folder, "log", "replay", "run.mcap", "--json"))
     assert replayed["controller"] == {"ticks": 1000, "differ": 0}
     assert replayed["plant"]["differ"] == 0
-    assert "no theorem for this law" in " ".join(run(folder, "log", "review", "run.mcap").split())
+    assert "No theorem for this law, own_law:OwnPythonLaw." in " ".join(
+        run(folder, "log", "review", "run.mcap").split()
+    )
     run(folder, "log", "export", "run.mcap", "--to", "csv")
     (table,) = folder.glob("*.csv")
     with table.open() as file:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from threading import Event, Thread
 
-from aeroloop.plant_emulator.hosts.can_node import CanFront
+from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
@@ -29,7 +29,7 @@ def run_on_bus(bus: CanSettings, settings: Settings, duration_s: float) -> Figur
     voltages: list[float] = []
     over = Event()
     node = Emulator(loop, wire, settings.plant, over)
-    front = CanFront(bus, loop, node.endpoint)
+    front = CanNetwork(bus, loop, node.endpoint)
     link = CanLink(bus, wire, "controller", lockstep=True)
     granted = Heartbeat(PlantState.GRANTED, 1, fingerprint(wire, loop.period_ns, lockstep=True))
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.hosts.can_node import CanFront
+from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, CanSettings, Heartbeat, fingerprint
@@ -65,7 +65,7 @@ class Bus:
         self.plant = Still()
         # Ticks are as fast as this test goes, so the endpoint's own watchdog, which counts them, is out of the way.
         self.endpoint = Endpoint(self.plant, WIRE, PERIOD_NS, watchdog_s=3600)
-        self.front = CanFront(settings, LoopSettings(), self.endpoint)
+        self.front = CanNetwork(settings, LoopSettings(), self.endpoint)
         self.side = CanLink(settings, WIRE, "controller")
         self.stranger = Stranger(settings)
         self.say: Heartbeat | None = None

@@ -31,11 +31,17 @@ LATENCY_NS = 2 * ONE_WAY_NS  # in the bin from 291.7 to 304.4 µs, whose middle 
 
 
 class Said(NamedTuple):
-    """A message: its key, when it was recorded [ns], what it says."""
+    """A message: its key, when it was published [ns], what it says, and when it was recorded if not at once."""
 
     key: str
     published_ns: int
     data: bytes
+    recorded_ns: int | None = None
+
+    @property
+    def at_ns(self) -> int:
+        """When it was recorded."""
+        return self.published_ns if self.recorded_ns is None else self.recorded_ns
 
     @property
     def topic(self) -> str:
@@ -67,15 +73,17 @@ def rewrite(
         log: The log.
         out: The new one.
         change: What becomes of each message; None leaves it out.
-        more: Messages to add, by their times.
+        more: Messages to add, where they were recorded.
         metadata: Metadata to add, by name.
     """
     with log.open("rb") as file:
         reader = make_reader(file)
-        messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+        messages = [
+            Said(channel.topic, one.publish_time, one.data, one.log_time) for _, channel, one in reader.iter_messages()
+        ]
         known = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
     kept = [one for message in messages if (one := change(message)) is not None]
-    return write_messages(out, sorted([*kept, *more], key=lambda one: one.published_ns), [*known, *metadata])
+    return write_messages(out, sorted([*kept, *more], key=lambda one: one.at_ns), [*known, *metadata])
 
 
 def write_messages(out: Path, messages: Iterable[Said], metadata: Iterable[tuple[str, dict[str, str]]] = ()) -> Path:
@@ -89,7 +97,7 @@ def write_messages(out: Path, messages: Iterable[Said], metadata: Iterable[tuple
         for one in messages:
             if one.key not in channels:
                 channels[one.key] = writer.register_channel(one.key, "", 0)
-            writer.add_message(channels[one.key], one.published_ns, one.data, one.published_ns)
+            writer.add_message(channels[one.key], one.at_ns, one.data, one.published_ns)
         writer.finish()
     return out
 

@@ -35,7 +35,7 @@ from aeroloop.protocol.messages.operator import (
     Track,
 )
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Operation, Tail
+from aeroloop.protocol.messages.trace import PlantChange, Tail
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 
 LATENCY = Percentiles(count=3, p50=230.5, p99=700.25, p999=800.0, max=812.0)
@@ -103,7 +103,7 @@ MESSAGES: list[Message] = [
     Truth(tick=0, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0, -0.5, 0.1), voltages=(0.0, 24.0, 3.0)),
     Timing(wake=LATENCY, busy=LATENCY, period=LATENCY, recent_wake=LATENCY, recent_busy=None, recent_period=None),
     Event(role="plant", kind="tripped", text="no fresh command for 100 ms", session="5f0c", tick=1207),
-    Loss(key="aeroloop/aero/5f0c/command", count=3, reason="network"),
+    Loss(key="aeroloop/aero/5f0c/command", count=3, reason="gone"),
     Event(role="recorder", kind="started", text="η and ω, ≥ 0"),
     Sinusoid(),
     Hold(),
@@ -120,10 +120,10 @@ MESSAGES: list[Message] = [
     Inject(clear=True),
     Advance(seconds=0.5),
     Answer(done=True, text="armed"),
-    Operation(tick=-1, kind="inject", name="rate:off@2"),
+    PlantChange(tick=-1, kind="inject", name="rate:off@2"),
     Tail(
         state={"uptime": 3},
         changes=[Change(session="5f0c", tick=0)],
-        operations=[Operation(tick=7, kind="release", name="5f0c")],
+        operations=[PlantChange(tick=7, kind="release", name="5f0c")],
     ),
 ]

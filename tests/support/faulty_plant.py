@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import cos, isnan, sin
 
+from aeroloop.plant_emulator.faults.injection import FaultyPlant
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.signals import FaultyPlant
 from aeroloop.plant_emulator.plant import Measurement, Plant
 
 PERIOD = 0.1

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from aeroloop.plant_emulator.faults.injection import FaultyStream
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.streams import FaultyStream
 from tests.support.faulty_plant import PERIOD
 
 

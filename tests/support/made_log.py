@@ -15,13 +15,13 @@ from unittest.mock import patch
 
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, Description, Event, Grant, Status
 from aeroloop.protocol.messages.operator import Change, Gains, Hold, Reference
 from aeroloop.protocol.messages.trace import End, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.transport.history import Delivery as Message
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.transport.publication import Delivery as Message
 from aeroloop.service.config import Settings, load
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.daemon.telemetry import telemetry_of
@@ -138,7 +138,8 @@ class ControllerEnd:
         self.trace.changes.append(first)
 
     def follow(self, k: int, gains: Gains | None, reference: Reference | None) -> None:
-        change = Change(session=self.trace.session, tick=k, gains=gains, reference=reference, within_s=1.0)
+        here = self.controller.motion.here(k * self._period).row if reference is not None else None
+        change = Change(session=self.trace.session, tick=k, gains=gains, reference=reference, within_s=1.0, here=here)
         self.controller.apply(change)
         self.trace.changes.append(change)
 
@@ -226,7 +227,7 @@ def made(
         )  # fmt: skip
         messages.add("status", status.encode(), plant_clock, "plant")
 
-    with patch("aeroloop.plant_emulator.hosts.trace_rows.time", plant_clock):
+    with patch("aeroloop.plant_emulator.hosts.zenoh_network.time", plant_clock):
         plant_clock.now_ns = at_ns
         trace = PlantTrace(
             loop, wire, lambda batch: messages.add("trace", batch, plant_clock, "plant"), RUNS["plant"] + n

@@ -17,8 +17,7 @@ from mcap.reader import make_reader
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Description
 from aeroloop.protocol.messages.operator import Change
-from aeroloop.protocol.messages.trace import read_batch
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.recording import log_file as writer
 from aeroloop.service.recording import rolling
 from aeroloop.service.recording.rolling import RollingLog
@@ -126,9 +125,6 @@ class Recording:
         received, at_ns = arrived
         address = topics.read_key(received.key)
         assert address is not None
-        if batch := read_batch(received.payload) if address.topic.name == "trace" else None:
-            for change in batch.tail.changes:
-                self.log.add_change(received.key, change)
         decoded: list[Decoded] = self._decoder.take(address, received.payload, received.published_ns or at_ns)
         self.log.add(received, at_ns, decoded)
 

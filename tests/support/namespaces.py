@@ -119,8 +119,9 @@ class Hosts:
         """Start this Python on a host, with additions to the environment."""
         command = ["ip", "netns", "exec", self._prefix + host, sys.executable, *words]
         with self.log(host).open("ab") as errors, (stdout or Path(os.devnull)).open("ab") as output:
+            inherited = {**os.environ, "STATE_DIRECTORY": str(self._folder / "state")}
             process = subprocess.Popen(
-                command, stdin=stdin, stdout=output, stderr=errors, env={**os.environ, **(environment or {})}
+                command, stdin=stdin, stdout=output, stderr=errors, env={**inherited, **(environment or {})}
             )
         self._processes.append(process)
         return process

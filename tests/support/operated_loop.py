@@ -24,12 +24,9 @@ from aeroloop.protocol.runtime import role, throttle
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import gains_of
 from aeroloop.service.daemon import operator_requests, setpoint_stream
-from aeroloop.service.daemon.certificate_gate import CertificateGate
 from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.daemon.setpoint_stream import SETPOINTS
 from aeroloop.service.settings import ControllerSettings
@@ -131,7 +128,6 @@ class Loop:
         k: The next tick.
         session: Name of the session, or "".
         log: Of each session, its frames: (tick, measurement, command).
-        gate: Its certificates; OperatorChanges needs them if a certified configuration is given.
     """
 
     def __init__(
@@ -140,14 +136,12 @@ class Loop:
         settings: ControllerSettings = CONFIGURED,
         *,
         rolls: bool = False,
-        certified: Settings | None = None,
     ) -> None:
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
             patch.setattr(role, "join", lambda *_: self.network)
             self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
         self.configured = reference
-        self.gate = CertificateGate(self.role, certified or Settings(wire=WIRE, law=LAW), gains_of(LAW), reference)
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
         self.live = OperatorChanges(
             self.role,
@@ -155,7 +149,6 @@ class Loop:
             reference,
             settings,
             self.trace,
-            self.gate if certified else None,
             rolls=rolls,
             why_none=lambda: "controller-7 does not have aero",
         )
@@ -222,10 +215,6 @@ class Loop:
     def raw(self, payload: bytes) -> None:
         """Bytes come where set-points should."""
         self.network.received[topics.key("reference", "aero")].append(SimpleNamespace(payload=_bytes(payload)))
-
-    def read_again(self, law: AdaptiveSettings, reference: Reference) -> None:
-        """A configuration is read again, as reload.py's SIGHUP does."""
-        self.role.enqueue(lambda: self.live.adopt(law, reference))
 
     # What was published
 

@@ -6,6 +6,7 @@ one without gain and state, and one with a known optimum, for searches of gains.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final
 
@@ -64,6 +65,44 @@ class Python(PythonLaw[PDSettings]):
         kp, kd, ki = (now.gains[name] for name in self.gains)
         u: Floats = -(kp * error) - kd[first:] * rate - ki * self.state["sum"]
         return u
+
+
+class Node:
+    """Half of a reference cycle, which only the garbage collector can free; `alive` counts those not yet freed."""
+
+    alive = 0
+
+    def __init__(self) -> None:
+        Node.alive += 1
+        self.other: Node
+
+    def __del__(self) -> None:
+        Node.alive -= 1
+
+
+def cycle() -> Node:
+    """A node of a cycle of two."""
+    node, node.other = (pair := Node()), Node()
+    node.other.other = pair
+    return node
+
+
+class Cyclic(Python):
+    """Makes ten objects a tick that refer to one another, and keeps those of the last second for as long."""
+
+    kept: deque[Node]
+
+    def reset(self) -> None:
+        super().reset()
+        self.state["alive"] = np.zeros(1)
+        self.kept = deque(maxlen=round(1 / self.period))
+
+    def step(self, now: Now[Floats]) -> Floats:
+        self.kept.append(cycle())
+        for _ in range(4):
+            cycle()
+        self.state["alive"] = np.array([float(Node.alive)])
+        return super().step(now)
 
 
 class Bare(ExpressionLaw[LawSettings]):

@@ -1,7 +1,7 @@
-"""Driver harness: a driver's loop on a scripted grid, link and front, without network or clock.
+"""Driver harness: a driver's loop on a scripted grid, link and network, without a clock.
 
-A test scripts actions between ticks, answers to measurements, and skipped ticks; the trace is the one that a ZenohFront
-would publish.
+A test scripts actions between ticks, answers to measurements, and skipped ticks; the trace is the one that a
+ZenohNetwork would publish.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from collections.abc import Callable
 from typing import Self
 from unittest.mock import patch
 
-from aeroloop.plant_emulator.endpoint.front import Front
-from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import Claim, Grant, Refusal
 from aeroloop.protocol.messages.trace import Batch, read_batch
@@ -81,7 +80,7 @@ class Grid:
         return self.tick
 
 
-class Stage(Front):
+class Stage(PlantNetwork):
     """Runs an emulator's driver to a tick.
 
     Args:
@@ -175,7 +174,7 @@ class Stage(Front):
             self._answer(self, frame)
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """As a ZenohFront does."""
+        """As a ZenohNetwork does."""
         self.trace.row(self.endpoint, measurement, arrival, sent_ns)
         self.wires.tick = self.endpoint.ticked
         self.follow_session()
@@ -183,7 +182,7 @@ class Stage(Front):
             self.stop.set()
 
     def follow_session(self) -> None:
-        """As a ZenohFront does."""
+        """As a ZenohNetwork does."""
         self.trace.follow(self.endpoint)
         if self.endpoint.session is None:
             self.wires.close()
@@ -195,6 +194,6 @@ class Stage(Front):
         """Nothing to publish."""
 
     def leave(self) -> None:
-        """As a ZenohFront does."""
+        """As a ZenohNetwork does."""
         self.follow_session()
         self.trace.finish()

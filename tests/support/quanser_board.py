@@ -6,16 +6,18 @@ a count of samples of 2 ms: the board's watchdog of 0.1 s expires after 50 of th
 
 from __future__ import annotations
 
+import sys
 from math import isnan
+from types import ModuleType
 from typing import Any
 
-from aeroloop.plant_emulator.hosts.quanser.fake import FakeQuanser
-from aeroloop.plant_emulator.hosts.quanser.usb import QuanserPlant
+from aeroloop.plant_emulator.hosts.quanser_board import QuanserPlant
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.sensors import SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant
-from aeroloop.plant_emulator.quanser_settings import QuanserSettings
-from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
+from aeroloop.protocol.messages.states import PlantState
+from tests.support.fake_quanser import FakeQuanser
 
 PERIOD = 0.002
 WATCHDOG = 50
@@ -26,12 +28,28 @@ VOLTS = (9.0, -12.0)
 
 
 def plant_on_board(
-    settings: PlantSettings = AERO, *, realtime: bool = False, **changed: Any
+    settings: PlantSettings = AERO, *, realtime: bool = False, session: bool = True, **changed: Any
 ) -> tuple[QuanserPlant, FakeQuanser]:
     """A plant that was just opened, and its board; `changed` are fields of QuanserSettings."""
     quanser = QuanserSettings(**changed)
     board = FakeQuanser(settings, PERIOD, card_type=quanser.card_type, realtime=realtime)
-    return QuanserPlant(quanser, PERIOD, hardware=board), board
+    plant = plant_of(board, quanser)
+    if session:
+        plant.follow(PlantState.DRIVEN)
+    return plant, board
+
+
+def plant_of(board: FakeQuanser, settings: QuanserSettings = AERO.quanser) -> QuanserPlant:
+    """A plant on this board, which is what `import quanser.hardware` finds."""
+    names = {"HIL": board.HIL, "HILError": board.HILError, "Clock": board.Clock}
+    for module, of in (
+        ("quanser", {}),
+        ("quanser.hardware", names),
+        ("quanser.hardware.enumerations", {"BufferOverflowMode": board.BufferOverflowMode}),
+    ):
+        sys.modules[module] = ModuleType(module)
+        sys.modules[module].__dict__.update(of)
+    return QuanserPlant(settings, PERIOD)
 
 
 def drive(plant: Plant, periods: int, voltages: tuple[float, float] = VOLTS) -> None:

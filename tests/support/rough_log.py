@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
-from aeroloop.plant_emulator.hosts.trace_rows import PlantTrace
+from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.operator import Gains, Hold
 from aeroloop.protocol.messages.trace import Outcome, Received
@@ -179,7 +179,7 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
     sparse = settings.wire.transmit.measurement == "on_change"
     world = World(known, chance, plant_clock, clock, MAILBOX if sparse else 1)
     with (
-        patch("aeroloop.plant_emulator.hosts.trace_rows.time", plant_clock),
+        patch("aeroloop.plant_emulator.hosts.zenoh_network.time", plant_clock),
         patch("aeroloop.service.daemon.tick_source.time", world),
         patch("aeroloop.protocol.runtime.tick_grid.time", world),
     ):

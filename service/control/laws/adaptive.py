@@ -28,10 +28,10 @@ from dataclasses import dataclass
 from math import hypot
 from typing import Annotated, ClassVar, Final, Literal
 
+import casadi as ca
 from pydantic import AfterValidator, Field, model_validator
 
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.protocol.wire.rotations import R, S
 from aeroloop.service.control.laws.body import check_allocation, gravity_torque, voltages_for
 from aeroloop.service.control.laws.interface import MAX_GAIN, ExpressionLaw, LawSettings, Now, Vector
 

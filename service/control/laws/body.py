@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.lazy import numpy as np
-from aeroloop.protocol.wire.attitude import R, S
+import casadi as ca
+import numpy as np
+
+from aeroloop.protocol.wire.rotations import R, S
 from aeroloop.service.control.laws.interface import LawSettings
 
 

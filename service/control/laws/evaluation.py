@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.lazy import numpy as np
-from aeroloop.protocol.wire.attitude import R, S
+import casadi as ca
+import numpy as np
+
 from aeroloop.protocol.wire.expressions import as_written
+from aeroloop.protocol.wire.rotations import R, S
 from aeroloop.protocol.wire.symbolic import along_rows, in_columns
 from aeroloop.service.control.laws.interface import ExpressionLaw, Law, Now, PythonLaw
 

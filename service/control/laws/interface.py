@@ -14,9 +14,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
+import casadi as ca
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
-
-from aeroloop.protocol.lazy import casadi as ca
 
 if TYPE_CHECKING:
     import numpy as np

@@ -20,10 +20,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, Literal
 
+import casadi as ca
+import numpy as np
 from pydantic import Field, NonNegativeFloat
 
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.lazy import numpy as np
 from aeroloop.service.control.laws.interface import Diagonal, Floats, Now, Vector
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_lqr

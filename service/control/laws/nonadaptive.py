@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from math import hypot
 from typing import Literal
 
+import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
 from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings, Now, Vector
 

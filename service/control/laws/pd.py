@@ -17,9 +17,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.service.control.laws.interface import Gains3, Now
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_pd

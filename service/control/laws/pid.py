@@ -19,9 +19,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
+import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.lazy import casadi as ca
 from aeroloop.service.control.laws.body import check_allocation
 from aeroloop.service.control.laws.interface import Diagonal, Gains3, Now
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings

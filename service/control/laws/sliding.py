@@ -20,10 +20,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.wire.attitude import S
+from aeroloop.protocol.wire.rotations import S
 from aeroloop.service.control.laws.interface import Diagonal, Gains3, Now
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_sliding

@@ -23,10 +23,10 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
+import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.lazy import casadi as ca
-from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.protocol.wire.rotations import R, S
 from aeroloop.service.control.laws.body import gravity_torque, voltages_for
 from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings, Now, Vector
 

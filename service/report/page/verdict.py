@@ -101,7 +101,7 @@ def _check(check: Check) -> Html:
 
 def _moments(report: Report, index: int) -> list[Html]:
     """Trips, faults and losses with their times, and the time of the largest error that is drawn."""
-    grave_marks = [mark for mark in report.findings.marks if grave(mark)]
+    grave_marks = sorted(filter(grave, report.findings.marks), key=lambda mark: mark.time_s is None)
     moments = []
     for mark in grave_marks[:MOMENTS]:
         at = Html(" outside of the session that is judged")
@@ -202,6 +202,7 @@ def broken(reports: Sequence[Report]) -> Html:
         name = run_name(report, index, len(reports)) if len(reports) > 1 else Html("")
         lost = [f"the recorder lost {_count(n, 'message')} of {topic}" for topic, n in report.findings.losses.items()]
         missing = [f"not recorded: {gap}" for gap in report.findings.missing if gap.rows]
+        missing += [str(one) for one in report.findings.unknown]
         items += [tag("li", name, " " if name else "", text) for text in [*report.findings.damages, *missing, *lost]]
     return tag("ul", items) if items else Html("")
 

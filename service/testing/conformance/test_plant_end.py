@@ -116,8 +116,8 @@ def test_at_its_voltage_limit_for_too_long_it_trips(hil: Hil) -> None:
 
 
 def test_without_a_valid_measurement_it_trips_and_says_so(hil: Hil, hil_plant: str) -> None:
-    if hil_plant in ("can", "quanser", "quanser-fake"):
-        pytest.skip("only an emulated plant's sensors fail on request; the board's fake has other tests")
+    if hil_plant in ("can", "quanser"):
+        pytest.skip("only an emulated plant's sensors fail on request")
     hil.start(settings={**PATIENT, "plant.faults": ["rate:off@0.3"]}, drive=False)
     hil.processes.start("controller")
     hil.eventually("the trip", lambda: hil.happened("tripped"))

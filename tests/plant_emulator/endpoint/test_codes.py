@@ -12,7 +12,7 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Measurement
 from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
-from tests.plant_emulator.endpoint.test_endpoint import PERIOD_NS, Notebook
+from tests.plant_emulator.endpoint.test_endpoint import PERIOD_NS, RecordingPlant
 
 SIGNALS = (
     SignalSpec(bits=8, limit=1.0),
@@ -34,7 +34,7 @@ MEASUREMENTS = st.lists(
 def test_codes_are_those_of_a_quantizer_for_each_value(
     attitude: SignalSpec, rate: SignalSpec, measured: list[tuple[float, ...]]
 ) -> None:
-    wire, plant = WireSpec(attitude=attitude, rate=rate), Notebook()
+    wire, plant = WireSpec(attitude=attitude, rate=rate), RecordingPlant()
     endpoint = Endpoint(plant, wire, PERIOD_NS)
     endpoint.claim(Claim(controller="a", session="s", period_ns=PERIOD_NS, lockstep=False, auto_arm=True, wire=wire))
     quantizers = [signal.quantizer() for signal in (attitude, rate) for _ in range(3)]

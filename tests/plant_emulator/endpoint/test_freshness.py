@@ -1,31 +1,58 @@
-"""Freshness of commands by tick counters alone, against a model that has the tick of every measurement.
+"""Freshness of commands and the watchdog, by counters alone, against a model that has the tick of every measurement.
+
+The model holds for both that judge commands: the plant's endpoint and the bridge of a CAN bus.
 
 A short counter of 16 ticks and a watchdog of 5, so that counters wrap often.
 """
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from collections.abc import Callable
+
+import pytest
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.wire.spec import WireSpec
-from tests.plant_emulator.endpoint.test_endpoint import OFF, Notebook
+from tests.plant_emulator.endpoint.test_endpoint import OFF, RecordingPlant
 
 PERIOD_NS = 2_000_000
 COUNTERS, WATCHDOG = 16, 5
 WIRE = WireSpec(counter_bits=4)
+CLAIM = Claim(controller="c", session="s", period_ns=PERIOD_NS, lockstep=False, wire=WIRE)
 
 
 def claimed(watchdog: int = WATCHDOG) -> Endpoint:
     """An endpoint that sends its first measurement at tick 0."""
-    endpoint = Endpoint(Notebook(), WIRE, PERIOD_NS, watchdog_s=watchdog * PERIOD_NS * 1e-9, armed=True)
-    claim = Claim(controller="c", session="s", period_ns=PERIOD_NS, lockstep=False, wire=WIRE)
-    assert isinstance(endpoint.claim(claim), Grant)
+    endpoint = Endpoint(RecordingPlant(), WIRE, PERIOD_NS, watchdog_s=watchdog * PERIOD_NS * 1e-9, armed=True)
+    assert isinstance(endpoint.claim(CLAIM), Grant)
     return endpoint
+
+
+class BridgeEnd(Relay):
+    """A bridge to which a plant's measurements and a controller's commands come as to an endpoint, tick by tick."""
+
+    def __init__(self) -> None:
+        super().__init__(WIRE, PERIOD_NS, lockstep=False, watchdog_s=WATCHDOG * PERIOD_NS * 1e-9, armed=True)
+        assert isinstance(self.claim(CLAIM), Grant)
+
+    def tick(self, frame: bytes | None, k: int) -> None:
+        """The command received since tick k − 1, then measurement k; a nanosecond after a deadline it is over."""
+        if self.session is None:
+            self.outcome = Outcome.NONE
+            return
+        now_ns = (k - 1) * PERIOD_NS
+        if frame is not None:
+            self.command(frame, now_ns)
+        if k == 0 or not self.watch(now_ns + 1):
+            self.measurement(WIRE.measurement.pack(k % COUNTERS, [0] * 6))
+        if k == 0:
+            self.watch(0)
 
 
 def command(answers: int) -> bytes:
@@ -61,10 +88,16 @@ late = st.one_of(st.integers(0, WATCHDOG + 2), st.integers(0, COUNTERS - 1), st.
 """By how many ticks a command is late; None: it is lost. A whole round of the counter cannot be detected."""
 
 
+@pytest.mark.parametrize("end", [claimed, BridgeEnd])
 @settings(max_examples=120)
+@example(delays=[WATCHDOG + 1, *[None] * COUNTERS])  # stale
+@example(delays=[2, 0, *[None] * COUNTERS])  # overtaken, then none
+@example(delays=[0, WATCHDOG, *[0] * COUNTERS])  # just in time
 @given(delays=st.lists(late, min_size=1, max_size=120))
-def test_commands_are_judged_as_by_the_ticks_that_they_answer(delays: list[int | None]) -> None:
-    endpoint, model = claimed(), Model()
+def test_commands_are_judged_as_by_the_ticks_that_they_answer(
+    end: Callable[[], Endpoint | BridgeEnd], delays: list[int | None]
+) -> None:
+    endpoint, model = end(), Model()
     endpoint.tick(None, 0)
     stale = 0
     for now in range(len(delays)):

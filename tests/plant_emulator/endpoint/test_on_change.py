@@ -16,7 +16,7 @@ from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY, Vector
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
-from tests.plant_emulator.endpoint.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, Notebook
+from tests.plant_emulator.endpoint.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, RecordingPlant
 
 HEARTBEAT = 15
 """Ticks: 30 ms of 2 ms."""
@@ -29,9 +29,9 @@ def wire_of(measurement: Policy = "on_change", command: Policy = "on_change") ->
 BOTH = wire_of()
 
 
-def claimed(wire: WireSpec = BOTH, *, lockstep: bool = False) -> tuple[Endpoint, Notebook]:
+def claimed(wire: WireSpec = BOTH, *, lockstep: bool = False) -> tuple[Endpoint, RecordingPlant]:
     """An endpoint at tick 0 that has sent a session's first measurement."""
-    plant = Notebook(wire.actuators)
+    plant = RecordingPlant(wire.actuators)
     endpoint = Endpoint(plant, wire, PERIOD_NS, lockstep=lockstep)
     claim(endpoint, "first")
     assert endpoint.tick(None, 0)
@@ -198,7 +198,7 @@ def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_th
 # In real time, the end of silence may show late that values are valid again
 
 
-def after_a_failure(policy: Policy, *, lockstep: bool = False) -> tuple[Endpoint, Notebook, int]:
+def after_a_failure(policy: Policy, *, lockstep: bool = False) -> tuple[Endpoint, RecordingPlant, int]:
     """An endpoint whose measurements had no valid value until tick 9."""
     endpoint, plant = claimed(wire_of(measurement=policy), lockstep=lockstep)
     for k in range(1, 11):

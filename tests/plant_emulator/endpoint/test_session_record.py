@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.tenancy import Tenancy
+from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
 from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.settings import PlantSettings
@@ -32,7 +32,7 @@ def relay() -> Relay:
     return Relay(WIRE, PERIOD_NS, lockstep=False, watchdog_s=0.1, armed=True)
 
 
-def claim(end: Tenancy, name: str) -> Grant | Refusal:
+def claim(end: VehicleClaim, name: str) -> Grant | Refusal:
     """A controller claims."""
     return end.claim(
         Claim(controller=name, session=f"of-{name}", period_ns=PERIOD_NS, lockstep=False, auto_arm=True, wire=WIRE)
@@ -54,13 +54,13 @@ def granted(answer: Grant | Refusal) -> SessionRecord | None:
 
 
 @pytest.fixture(params=[endpoint, relay], ids=["endpoint", "bridge"])
-def end(request: pytest.FixtureRequest) -> Tenancy:
+def end(request: pytest.FixtureRequest) -> VehicleClaim:
     """Both ends that grant claims."""
-    made: Callable[[], Tenancy] = request.param
+    made: Callable[[], VehicleClaim] = request.param
     return made()
 
 
-ENDINGS: list[tuple[Callable[[Tenancy], object], TripCause | str]] = [
+ENDINGS: list[tuple[Callable[[VehicleClaim], object], TripCause | str]] = [
     (lambda end: end.release("of-a"), "released"),
     (lambda end: end.lost("a"), TripCause.HOLDER_GONE),
     (lambda end: end.expire(TripCause.NO_ANSWER, "no answer"), TripCause.NO_ANSWER),
@@ -70,7 +70,7 @@ ENDINGS: list[tuple[Callable[[Tenancy], object], TripCause | str]] = [
 
 @pytest.mark.parametrize(("ends", "how"), ENDINGS, ids=[str(how) for _, how in ENDINGS])
 def test_the_next_controller_gets_the_last_record_and_how_its_session_ended(
-    end: Tenancy, ends: Callable[[Tenancy], object], how: TripCause | str
+    end: VehicleClaim, ends: Callable[[VehicleClaim], object], how: TripCause | str
 ) -> None:
     assert granted(claim(end, "a")) is None
     assert end.keep(record("a"))
@@ -91,7 +91,7 @@ def test_the_record_names_the_sessions_last_tick() -> None:
     assert end.last.ended_tick == end.session_tick == 4
 
 
-def test_an_operators_stop_after_the_session_replaces_how_it_ended(end: Tenancy) -> None:
+def test_an_operators_stop_after_the_session_replaces_how_it_ended(end: VehicleClaim) -> None:
     claim(end, "a")
     end.keep(record("a"))
     end.lost("a")
@@ -110,7 +110,7 @@ def test_an_operators_stop_after_the_session_replaces_how_it_ended(end: Tenancy)
     ],
 )
 def test_a_repeated_stop_is_no_second_trip_and_the_first_cause_stays(
-    end: Tenancy, trips: Callable[[Tenancy], object], events: list[str], cause: str
+    end: VehicleClaim, trips: Callable[[VehicleClaim], object], events: list[str], cause: str
 ) -> None:
     claim(end, "a")
     end.notices.clear()
@@ -122,14 +122,14 @@ def test_a_repeated_stop_is_no_second_trip_and_the_first_cause_stays(
     assert (end.trip, end.cause) == (trip, cause)
 
 
-def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: Tenancy) -> None:
+def test_two_plants_of_one_name_are_a_trip_even_after_an_operators_stop(end: VehicleClaim) -> None:
     end.stop()
     end.stop(TripCause.DUPLICATE, "two plants")
     end.stop()
     assert (end.trip, [notice.kind for notice in end.notices]) == (TripCause.DUPLICATE, ["tripped", "tripped"])
 
 
-def test_a_session_without_a_record_leaves_none(end: Tenancy) -> None:
+def test_a_session_without_a_record_leaves_none(end: VehicleClaim) -> None:
     claim(end, "a")
     end.keep(record("a"))
     end.lost("a")
@@ -138,7 +138,7 @@ def test_a_session_without_a_record_leaves_none(end: Tenancy) -> None:
     assert granted(claim(end, "c")) is None
 
 
-def test_only_the_controller_that_has_the_plant_leaves_a_record(end: Tenancy) -> None:
+def test_only_the_controller_that_has_the_plant_leaves_a_record(end: VehicleClaim) -> None:
     assert not end.keep(record("a"))
     claim(end, "a")
     assert not end.keep(record("b"))
@@ -148,8 +148,8 @@ def test_only_the_controller_that_has_the_plant_leaves_a_record(end: Tenancy) ->
     assert end.last is None
 
 
-def test_keeping_a_record_is_no_operation_of_the_trace(end: Tenancy) -> None:
+def test_keeping_a_record_is_no_operation_of_the_trace(end: VehicleClaim) -> None:
     claim(end, "a")
-    before = list(end.operations)
+    before = list(end.changes)
     end.keep(record("a"))
-    assert end.operations == before
+    assert end.changes == before

@@ -11,8 +11,8 @@ from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Operation, Outcome, Sent, batches_per_s
-from aeroloop.protocol.transport.publication import KEPT_S
+from aeroloop.protocol.messages.trace import MAX_ROWS, Batch, Outcome, PlantChange, Sent, batches_per_s
+from aeroloop.protocol.transport.history import KEPT_S
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE, Transmit
@@ -46,7 +46,7 @@ def rows(batches: list[Batch], column: str) -> list[object]:
     return [value for batch in batches for value in batch.columns[column].tolist()]
 
 
-def operations(batches: list[Batch]) -> list[Operation]:
+def operations(batches: list[Batch]) -> list[PlantChange]:
     return [operation for batch in batches for operation in batch.tail.operations]
 
 
@@ -148,7 +148,7 @@ def test_commands_that_a_fault_keeps_back_are_withheld_and_in_their_rows() -> No
     first = rows(batches, "tick").index(41)
     assert rows(batches, "outcome")[first - 1 : first + 11] == [Outcome.ACTED, *[Outcome.WITHHELD] * 10, Outcome.ACTED]
     assert set(rows(batches, "received_as")[first:]) == {Sent.FRAME}
-    assert operations(batches)[-1] == Operation(tick=40, kind="inject", name="command:off@0..0.02")
+    assert operations(batches)[-1] == PlantChange(tick=40, kind="inject", name="command:off@0..0.02")
 
 
 def test_silence_is_a_row_with_the_measurement_not_sent() -> None:
@@ -174,14 +174,6 @@ def test_what_is_done_without_a_session_is_published_at_once_without_rows() -> N
     assert (seen[5], seen[6], seen[9], seen[10]) == (0, 1, 1, 2)
     assert [(batch.header.rows, batch.header.session, batch.header.final) for batch in batches] == [(0, "", False)] * 2
     assert [operation.kind for operation in operations(batches)] == ["stop", "arm"]
-
-
-def test_a_change_of_limits_or_watchdog_is_recorded_in_full() -> None:
-    other = PLANT.model_copy(update={"watchdog_s": 0.04})
-    stage = Stage(LOOP, WIRE, PLANT, between=at({3: lambda stage: stage.driver.reconfigure(other)})).run(5)
-    assert operations(stage.batches) == [
-        Operation(tick=3, kind="reconfigure", settings={"watchdog_s": 0.04, "limits": PLANT.limits.model_dump()})
-    ]
 
 
 def test_in_lockstep_an_answer_that_does_not_come_is_an_operation() -> None:

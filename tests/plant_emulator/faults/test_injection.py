@@ -7,8 +7,7 @@ from weakref import ref
 
 import pytest
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.endpoint.envelope import Guard, LimitSettings
+from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import PlantState
@@ -140,20 +139,12 @@ def test_it_is_closed_at_no_voltage_whatever_its_faults_even_one_that_comes_too_
         assert stand.voltages == (0.0, 0.0)
 
 
-def test_the_plant_inside_is_at_hand() -> None:
-    plant, stand = faulty("command:off", "measurement:off")
-    assert plant.plant is stand
-    plant.actuate((1.0, 2.0))
-    plant.advance()
-    assert (stand.voltages, plant.measure()) == ((1.0, 2.0), sample(1))
-
-
 def test_an_endpoint_trips_when_its_sensors_fail() -> None:
     """0.1 s are 50 ticks of 2 ms."""
     wire, period_ns = WireSpec(), 2_000_000
     plant, still = faulty("rate:off@0.2", started=False, period=0.002)
-    guard = Guard(LimitSettings(max_rate=1e9, max_invalid_s=0.1), period_ns, LIMIT)
-    endpoint = Endpoint(plant, wire, period_ns, guard=guard, armed=True)
+    guard = LimitMonitor(LimitSettings(max_rate=1e9, max_invalid_s=0.1), period_ns, LIMIT)
+    endpoint = Endpoint(plant, wire, period_ns, limits=guard, armed=True)
     claim = Claim(controller="a", session="a", period_ns=period_ns, lockstep=False, auto_arm=False, wire=wire)
     assert isinstance(endpoint.claim(claim), Grant)
     plant.start()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from math import inf, nan, nextafter, ulp
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from aeroloop.plant_emulator.faults.language import MAX_ANGLE, MAX_RATE, MAX_TIME_S, MAX_VOLTS, SIGNALS, Fault
 
@@ -76,8 +76,6 @@ def test_fields_are_held_to_the_same_rules_as_texts() -> None:
         Fault(signal="rate", kind="reorder", value=0.5)
     with pytest.raises(ValueError, match="bias takes -35 to 35 rad/s"):
         Fault(signal="rate", kind="bias")
-    with pytest.raises(ValueError, match="extra"):
-        Fault.model_validate({"signal": "rate", "kind": "off", "until": 3})
 
 
 def range_of(signal: str, kind: str) -> tuple[float, float] | None:
@@ -114,8 +112,8 @@ def test_a_value_or_a_time_just_beyond_its_range_is_refused(fault: Fault) -> Non
     wrong += [("start_s", t) for t in (-ulp(0.0), nan, inf, MAX_TIME_S + 1)]
     wrong += [("end_s", t) for t in (start, nan, inf, nextafter(MAX_TIME_S, inf))]
     for field, value in wrong:
-        with pytest.raises(ValidationError):
-            Fault.model_validate(fault.model_dump() | {field: value})
+        with pytest.raises(ValueError, match=r"takes|must"):
+            Fault(**{**asdict(fault), field: value})
 
 
 @given(text=st.text() | st.from_regex(r"(attitude|motor1|command):[a-z]*=?[-.0-9einf]*@?[-.0-9]*"))
@@ -130,10 +128,3 @@ def test_any_text_is_a_fault_or_one_line_that_states_why_not(text: str) -> None:
         assert len(reason.splitlines()) == 1
     else:
         assert Fault.parse(str(fault)) == fault
-
-
-def test_it_acts_from_its_start_until_just_before_its_end() -> None:
-    fault = Fault.parse("rate:off@2..4")
-    assert [fault.active(t) for t in (1.999, 2.0, 3.999, 4.0)] == [False, True, True, False]
-    assert Fault.parse("rate:off").active(0.0)
-    assert Fault.parse("rate:off").active(1e9)

@@ -9,21 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aeroloop.plant_emulator.faults.injection import ActingFault
 from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.faults.schedule import MAX_FAULTS, Schedule
-from aeroloop.plant_emulator.faults.streams import StreamFault
 
 PERIODS = (0.002, 0.009, 1 / 300, 0.1)
 
 
-def applied(fault: Fault) -> StreamFault:
-    return StreamFault(fault, np.random.default_rng(0), None)
+def acting(fault: Fault) -> ActingFault:
+    return ActingFault(fault, np.random.default_rng(0), 0.0)
 
 
 def with_faults(*texts: str, period: float = 0.1) -> Schedule:
     schedule = Schedule(period)
     for text in texts:
-        schedule.add(Fault.parse(text), "configured", applied(Fault.parse(text)))
+        schedule.add(acting(Fault.parse(text)), "configured")
     return schedule
 
 
@@ -44,41 +44,46 @@ def test_a_fault_acts_at_the_ticks_of_its_status_and_at_no_other(
         end_s=None if length is None else (start + length) / 1000,
     )
     schedule = Schedule(period)
-    schedule.add(fault, "configured", applied(fault))
+    at_work = acting(fault)
+    schedule.add(at_work, "configured")
     (status,) = schedule.statuses(0)
     assert status.begin_tick is not None
     for edge in (status.begin_tick, status.end_tick or 0):
         tick = max(0, edge + near)
         acts = status.begin_tick <= tick and (status.end_tick is None or tick < status.end_tick)
-        assert fault.active(round(tick * period, 9)) == acts
+        assert at_work.active(round(tick * period, 9)) == acts
 
 
 def test_each_begin_and_end_is_returned_once_and_in_order_however_many_ticks_are_skipped() -> None:
     schedule = with_faults("command:off@0.5..0.7", "rate:off@0.2", "rate:bias=1@0.61..0.69")
     assert schedule.due == 2
-    assert schedule.turns(1) == []
-    turns = schedule.turns(9)
-    assert [turn.tick for turn in turns] == [2, 5, 7]  # the last lies between two ticks and never acts
-    assert turns[0].text == "fault begins (configured): rate:off@0.2"
-    assert turns[2].text == "fault ends (configured): command:off@0.5..0.7, 0 commands dropped"
-    assert schedule.turns(9) == []
+    assert schedule.transitions(1) == []
+    transitions = schedule.transitions(9)
+    assert [transition.tick for transition in transitions] == [
+        2,
+        5,
+        7,
+    ]  # the last lies between two ticks and never acts
+    assert transitions[0].text == "fault begins (configured): rate:off@0.2"
+    assert transitions[2].text == "fault ends (configured): command:off@0.5..0.7, 0 commands dropped"
+    assert schedule.transitions(9) == []
     assert schedule.due == inf
 
 
 def test_what_is_cleared_ends_then_and_what_is_to_come_never_begins() -> None:
     schedule = with_faults("command:off", "rate:off@2")
-    schedule.turns(3)
-    assert [turn.tick for turn in schedule.clear(4)] == [4]
+    schedule.transitions(3)
+    assert [transition.tick for transition in schedule.clear(4)] == [4]
     assert [(status.begin_tick, status.end_tick) for status in schedule.statuses(10)] == [(10, 14)]
-    assert schedule.turns(1000) == []
+    assert schedule.transitions(1000) == []
 
 
 def test_too_many_faults_are_refused_and_those_that_are_over_are_forgotten() -> None:
     schedule = with_faults(*["command:off@0..0.5"] * MAX_FAULTS)
     with pytest.raises(ValueError, match="op inject --clear"):
         schedule.make_room(1)
-    schedule.turns(5)
+    schedule.transitions(5)
     schedule.make_room(MAX_FAULTS)
     for text in ["rate:off"] * MAX_FAULTS:
-        schedule.add(Fault.parse(text), "injected", applied(Fault.parse(text)))
+        schedule.add(acting(Fault.parse(text)), "injected")
     assert {status.source for status in schedule.statuses(0)} == {"injected"}

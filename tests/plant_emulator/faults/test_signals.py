@@ -8,8 +8,8 @@ from statistics import fmean, pstdev
 
 import pytest
 
+from aeroloop.plant_emulator.faults.injection import GARBLED_RATE
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.signals import GARBLED_RATE
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
 from tests.support.faulty_plant import LIMIT, driven, faulty, missing, sample, sensed
 

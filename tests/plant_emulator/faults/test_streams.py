@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aeroloop.plant_emulator.faults.injection import FaultyStream
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.streams import FaultyStream
 from tests.support.faulty_streams import flat, letters, numbered, passed
 
 MANY = 10_000

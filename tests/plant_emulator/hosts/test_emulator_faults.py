@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.endpoint.tenancy import Notice
+from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
 from aeroloop.plant_emulator.faults.language import SIGNALS, Fault
 from aeroloop.plant_emulator.faults.schedule import MAX_FAULTS
 from aeroloop.plant_emulator.hosts.emulator import Emulator
@@ -177,7 +177,7 @@ def test_of_faults_one_of_which_is_refused_none_is_injected() -> None:
     with pytest.raises(ValueError, match="the plant has no motor3"):
         emulator.inject([Fault.parse("motor1:off"), Fault.parse("motor3:off")], clear=True)
     assert emulator.fault_statuses() == []
-    assert emulator.endpoint.operations == []
+    assert emulator.endpoint.changes == []
     emulator.inject([Fault.parse("rate:off@5")] * MAX_FAULTS)
     with pytest.raises(ValueError, match=f"takes {MAX_FAULTS} faults"):
         emulator.inject([Fault.parse("rate:off")])

@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, why_not
-from aeroloop.plant_emulator.own_plant import OwnPlant, PlantError
+from aeroloop.plant_emulator.plant import OwnPlant, PlantError
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.loop import LoopSettings

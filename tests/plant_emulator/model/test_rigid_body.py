@@ -13,7 +13,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
 from aeroloop.plant_emulator.model.emulated import EmulatedPlant
 from aeroloop.plant_emulator.model.friction import FrictionSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
@@ -217,100 +216,6 @@ def test_the_attitude_at_the_start_is_scaled_to_unit_length(attitude: tuple[floa
 
 # The Aero by another route
 
-AERO = AeroSettings(
-    inertia=(0.015, 0.02, 0.03),
-    centre_of_mass=(0.001, 0.002, -0.004),
-    thrust=((0.0011, 0.0011), (-0.0014, 0.00176)),
-    damping=(0.004, 0.0071, 0.0220),
-)
 """J_x and J_z differ and the centre of mass lies off every axis, so that the mechanism has something to hold."""
 
-UNLOCKED = RigidBodySettings(
-    inertia=AERO.inertia,
-    mass=AERO.mass,
-    gravity=AERO.gravity,
-    centre_of_mass=AERO.centre_of_mass,
-    allocation=((0.0, 0.0, 0.0), (0.0, *AERO.thrust[0]), (0.0, *AERO.thrust[1])),
-    damping=AERO.damping,
-)
-STEP = 0.5e-3
 """[s]; the stiffer spring and its damper settle within 7 ms."""
-SECONDS = 6.0
-
-
-def _trajectory(derivative: ca.Function, start: list[float], voltages: Array) -> Array:
-    """States after each step of Runge–Kutta's method with its voltages held. Shape (steps, states)."""
-    x, u = ca.SX.sym("x", len(start)), ca.SX.sym("u", voltages.shape[1])
-    k1 = derivative(x, u)
-    k2 = derivative(x + STEP / 2 * k1, u)
-    k3 = derivative(x + STEP / 2 * k2, u)
-    k4 = derivative(x + STEP * k3, u)
-    step = ca.Function("step", [x, u], [x + STEP / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
-    states = step.mapaccum(len(voltages))(start, voltages.T)
-    return np.array(states, dtype=np.float64).T
-
-
-def _locked(voltages: Array) -> Array:
-    """q of the Aero. Shape (steps, 4)."""
-    x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 2)
-    aero = ca.Function("aero", [x, u], [aero_dynamics(AERO)(x, u, ca.SX.zeros(2))])
-    angles = _trajectory(aero, [0.0] * 4, voltages)[:, :2]
-    pitch, yaw = angles.T / 2
-    return np.array(
-        [
-            np.cos(yaw) * np.cos(pitch),
-            -np.sin(yaw) * np.sin(pitch),
-            np.cos(yaw) * np.sin(pitch),
-            np.sin(yaw) * np.cos(pitch),
-        ]
-    ).T
-
-
-def _held_by_a_spring(stiffness: float, voltages: Array) -> tuple[Array, Array]:
-    """q of the free body whose roll is held by a spring and a damper [N·m/rad], and the spring's torque [N·m].
-
-    With R = R_z(yaw) R_y(pitch) R_x(roll) the body's rates are ω = A₃ [roll˙, pitch˙, yaw˙]:
-
-        A₃ = [1 0 −sin p; 0 cos r sin r cos p; 0 −sin r cos r cos p]
-
-    A torque that does no work on pitch and yaw lies along n = [cos p, sin r sin p, cos r sin p], orthogonal to their
-    columns; for it to do the work of M about the roll joint it is M n/n₁. The damping is critical for J_x.
-    """
-    damper = 2 * sqrt(stiffness * AERO.inertia[0])
-    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
-    q0, q1, q2, q3 = (x[i] for i in range(4))
-    omega = x[4:7]
-    roll = ca.atan2(2 * (q0 * q1 + q2 * q3), 1 - 2 * (q1 * q1 + q2 * q2))
-    sin_p = 2 * (q0 * q2 - q3 * q1)
-    cos_p = ca.sqrt(1 - sin_p * sin_p)
-    n = ca.vertcat(cos_p, ca.sin(roll) * sin_p, ca.cos(roll) * sin_p)
-    torque = -(stiffness * roll + damper * ca.dot(n, omega) / cos_p)  # nᵀω = cos p roll˙
-    x_dot = RigidBody(UNLOCKED).derivative(x, ca.vertcat(0, u), torque * n / cos_p)
-    states = _trajectory(ca.Function("held", [x, u], [x_dot]), [1.0, *[0.0] * 6], voltages)
-    said = ca.Function("said", [x], [torque]).map(len(states))(states.T)
-    return states[:, :4], np.array(said, dtype=np.float64).ravel()
-
-
-def test_a_free_body_held_in_roll_ever_more_stiffly_becomes_the_aero() -> None:
-    times = np.arange(0.0, SECONDS, STEP)
-    voltages = np.array([10 * np.sin(1.7 * times) + 2, 12 * np.sin(1.1 * times + 1) - 6]).T
-    aero = _locked(voltages)
-    settled = times > 0.5  # the springs start slack: by then they have swung in, ten times 2 √(J/k) for the softer
-    errors = {}
-    softer, stiffer = 30.0, 300.0
-    for stiffness in (softer, stiffer):
-        held, torque = _held_by_a_spring(stiffness, voltages)
-        errors[stiffness] = (held - aero)[settled]
-        given_way = np.abs(torque[settled]).max() / stiffness  # the largest roll
-        assert given_way > 1e-4 * softer / stiffness  # so the mechanism has something to hold
-        # q differs by half the roll, and by at most as much again for where the rolled thrust has taken the body since
-        assert np.linalg.norm(errors[stiffness], axis=1).max() <= given_way
-    largest = {stiffness: np.linalg.norm(error, axis=1).max() for stiffness, error in errors.items()}
-    # What stays away from 1/k is that the roll follows its torque by 2 √(J/k), 0.04 s for the softer spring, while the
-    # motors go to and fro with 2 rad/s: a tenth at most.
-    assert largest[softer] / largest[stiffer] == pytest.approx(stiffer / softer, rel=0.1)
-    # Take the part in 1/k away, and what is left of the difference is that tenth: of it (1 − 1/√10)/9, as it falls with
-    # 1/√k. So the limit k → ∞ is the Aero to five digits.
-    limit = (stiffer * errors[stiffer] - softer * errors[softer]) / (stiffer - softer)
-    assert np.linalg.norm(limit, axis=1).max() <= 0.1 * largest[softer] * (1 - sqrt(softer / stiffer)) / 9
-    assert (np.ptp(aero[settled], axis=0) > 0.5).all()  # and it went somewhere, by more than half a turn in all

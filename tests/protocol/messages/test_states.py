@@ -1,6 +1,6 @@
 """State tables of both ends, a plant end that follows one, and rate limits of warnings.
 
-tests/plant_emulator/endpoint/test_envelope.py drives a plant end at random and checks its states. Here a model from
+tests/plant_emulator/endpoint/test_limits.py drives a plant end at random and checks its states. Here a model from
 SPEC.md, sections 5 and 6, predicts every step: which triggers fire, and the next state in the table.
 """
 
@@ -133,7 +133,7 @@ NO_COMMANDS = [(INVALID, INVALID), (INVALID, 3), (3, INVALID)]
 NO_VALID_VALUE = (-128,) * 6
 
 
-class Notebook(Plant):
+class RecordingPlant(Plant):
     """A plant that reports a preset measurement and records the voltages of every period."""
 
     actuators = 2
@@ -174,7 +174,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.plant = Notebook()
+        self.plant = RecordingPlant()
         self.endpoint = Endpoint(self.plant, WIRE, PERIOD_NS)
         self.endpoint.tick(None, 0)
         self.k = 0
@@ -393,7 +393,7 @@ class ForetoldPlantEnd(RuleBasedStateMachine):
         if self.endpoint.session is not None:
             return
         plant = copy.copy(self.endpoint.plant)
-        assert isinstance(plant, Notebook)
+        assert isinstance(plant, RecordingPlant)
         plant.held = []  # a copy of all that was held at each step would be most of the work of this test
         endpoint = copy.deepcopy(self.endpoint, {id(self.endpoint.plant): plant, id(WIRE): WIRE})
         assert endpoint.plant is plant
@@ -410,7 +410,7 @@ TestForetoldPlantEnd.settings = settings(max_examples=40, stateful_step_count=40
 
 
 def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive() -> None:
-    endpoint = Endpoint(Notebook(), WIRE, PERIOD_NS, armed=True)
+    endpoint = Endpoint(RecordingPlant(), WIRE, PERIOD_NS, armed=True)
     for k in range(100):
         endpoint.tick(None, k)
     endpoint.claim(claim("ann", "ann", auto_arm=False))

@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.trace import (
     MAX_ROWS,
     NEVER,
     End,
-    Operation,
+    PlantChange,
     TraceWriter,
     read_batch,
     row_dtype,
@@ -73,7 +73,7 @@ def test_the_golden_batch_of_the_plant_is_what_the_writer_writes() -> None:
     writer.session = "s1"
     for row in rows:
         add(writer, row)
-    writer.operations.append(Operation(tick=1001, kind="stop"))
+    writer.operations.append(PlantChange(tick=1001, kind="stop"))
     assert writer.take(5_004_100_000, 1_800_000_000_004_100_000, final=True).hex(" ") == batch.hex(" ")
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
-import time
 from itertools import pairwise
 from math import isnan
 
@@ -15,7 +13,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.runtime import tick_grid, timing
 from aeroloop.protocol.runtime.tick_grid import TickGrid
-from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, report
+from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram
 from aeroloop.protocol.wire.loop import LoopSettings
 
 START = 123_456_789_012_345
@@ -253,25 +251,6 @@ def test_the_warm_up_begins_with_the_first_tick_however_long_the_loop_waited_for
     timing.woke(START)
     timing.turn()
     assert timing.wake.total.count == 0
-
-
-def test_page_faults_are_counted_from_the_end_of_the_warm_up() -> None:
-    pages = 100
-    kept: list[mmap.mmap] = []
-
-    def touch() -> None:
-        kept.append(mmap.mmap(-1, pages * mmap.PAGESIZE))
-        for page in range(pages):
-            kept[-1][page * mmap.PAGESIZE] = 1
-
-    loop = LoopTiming(warm_up_ns=10**12)
-    loop.woke(time.monotonic_ns())
-    touch()
-    assert loop.faults == (0, 0)
-    loop = LoopTiming(warm_up_ns=0)
-    loop.woke(time.monotonic_ns())
-    touch()
-    assert report(loop).minor_faults >= pages
 
 
 def test_a_pause_is_no_period(fake: FakeTime) -> None:

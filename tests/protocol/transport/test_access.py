@@ -13,8 +13,7 @@ import pytest
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
 from aeroloop.protocol.transport.access import access_control
-from aeroloop.protocol.transport.publication import CachedPublisher
-from aeroloop.protocol.transport.recovery import RecoveringSubscriber
+from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from tests.support.certificates import DAY, Authority
 from tests.support.certified_link import attempt, linked, open_session, with_marker
 from tests.support.zenoh_network import PATIENCE_S, eventually, free_port

@@ -63,7 +63,7 @@ BROKEN: dict[str, tuple[Callable[[Authority], object], tuple[str, ...]]] = {
         ("read by others (mode 0640)", "chmod 600"),
     ),
     "another's key": (replaced_key, ("is not the key of plant.aero.pem",)),
-    "expired": (lambda ca: ca.issue("plant", "aero", ends=-DAY), ("expired at", "keys renew plant.aero")),
+    "expired": (lambda ca: ca.issue("plant", "aero", ends=-DAY), ("expired at", "issue it anew")),
     "not yet valid": (
         lambda ca: ca.issue("plant", "aero", begins=DAY, ends=2 * DAY),
         ("not valid before", "set the clock"),

@@ -9,8 +9,9 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.messages.topics import key
-from aeroloop.protocol.transport import datagrams, network_settings
+from aeroloop.protocol.transport import datagrams
 from aeroloop.protocol.transport.datagrams import Datagrams
+from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.transport.security import Identity
@@ -26,8 +27,7 @@ FAR = "tcp/192.0.2.1:7447"
 @pytest.fixture
 def beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loopback counts as a network beyond it, so that one host will do."""
-    for module in (network_settings, datagrams):
-        monkeypatch.setattr(module, "leaves_host", lambda place: place.startswith(("tcp/", "tls/")))
+    monkeypatch.setattr(Endpoint, "leaves_host", property(lambda endpoint: endpoint.protocol in ("tcp", "tls")))
 
 
 @pytest.fixture(params=["plain", "certificates"])
@@ -67,10 +67,10 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[Datagrams,
     with Gathering() as gathering:
         main, other = gathering.join(), gathering.join()
         box = Mailbox()
-        plant = ZenohLink(main, MEASUREMENT, COMMAND, mailbox=box, also=pair[0].session)
+        plant = ZenohLink(main, MEASUREMENT, COMMAND, range(256), mailbox=box, also=pair[0].session)
         for session in (other, pair[1].session):
             assert session is not None
-            controller = ZenohLink(session, COMMAND, MEASUREMENT, mailbox=(received := Mailbox()))
+            controller = ZenohLink(session, COMMAND, MEASUREMENT, range(256), mailbox=(received := Mailbox()))
 
             def there_and_back(link: ZenohLink = controller, at: Mailbox = received, box: Mailbox = box) -> bool:
                 link.send(b"command")

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.transport.can_format import CanError, FaultPhase, FaultReport, Heartbeat
+from aeroloop.protocol.transport.can_format import CanError, Heartbeat
 from aeroloop.protocol.transport.dbc import dbc
 from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
@@ -330,7 +330,6 @@ def test_identifiers_and_ends_are_those_of_the_node(node: int) -> None:
         "Command": (0x200 + node, "Controller", "Plant"),
         "PlantHeartbeat": (0x300 + node, "Plant", "Controller"),
         "ControllerHeartbeat": (0x380 + node, "Controller", "Plant"),
-        "FaultReport": (0x400 + node, "Plant", "Controller"),
     }
     assert not any(message.is_extended_frame for message in database.messages)
     assert {one.name for one in database.nodes} == {"Plant", "Controller"}
@@ -368,7 +367,7 @@ def test_a_payload_is_the_frame_s_or_the_next_of_can_fd_and_the_bus_states_it(sp
         assert message.is_fd == (layout.size > 8)
         lengths = FD_LENGTHS if message.is_fd else {layout.size}
         assert message.length == min(length for length in lengths if length >= layout.size)
-    for name in ("PlantHeartbeat", "ControllerHeartbeat", "FaultReport"):
+    for name in ("PlantHeartbeat", "ControllerHeartbeat"):
         assert not database.get_message_by_name(name).is_fd
     assert database.dbc is not None
     fast = any(message.is_fd for message in database.messages)
@@ -382,7 +381,7 @@ def test_a_payload_is_the_frame_s_or_the_next_of_can_fd_and_the_bus_states_it(sp
 def test_cycle_times_are_whole_milliseconds_and_the_comment_has_the_period(period_ns: int, cycle_ms: int) -> None:
     database = read(WireSpec(), NODE, period_ns)
     found = {message.name: message.cycle_time for message in database.messages}
-    beats = dict.fromkeys(("PlantHeartbeat", "ControllerHeartbeat", "FaultReport"), 100)
+    beats = dict.fromkeys(("PlantHeartbeat", "ControllerHeartbeat"), 100)
     assert found == {"Measurement": cycle_ms, "Command": cycle_ms, **beats}
     for name in ("Measurement", "Command"):
         comment = database.get_message_by_name(name).comment
@@ -420,14 +419,6 @@ def test_heartbeats_have_eight_bytes_bounds_and_comments(name: str, highest: int
     assert [signal.minimum for signal in message.signals] == [0, 0, 0]
     assert [signal.maximum for signal in message.signals] == [highest, 3, 2**56 - 1]
     assert all(signal.comment for signal in message.signals)
-
-
-@pytest.mark.parametrize("phase", FaultPhase)
-def test_a_fault_report_carries_every_field(phase: FaultPhase) -> None:
-    report = FaultReport(place=63, phase=phase, tick=255, check=b"\xfe\xdc", changed=2**32 - 2)
-    assert read(WireSpec()).decode_message(0x400 + NODE, report.pack()) == {
-        "fault": 63, "phase": phase.name.lower(), "tick": 255, "check": 0xFEDC, "changed": 2**32 - 2,
-    }  # fmt: skip
 
 
 @every_wire

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import pytest
 import zenoh
-from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, Wake, ZenohLink
+from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, ZenohLink
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 
@@ -74,6 +73,8 @@ def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
     assert not thread.is_alive()
 
 
+ANY = range(256)
+"""Lengths of frames, where a test is not about them."""
 SETTLE_S = 0.1
 """What should not arrive would have arrived by then: a frame takes less than a millisecond."""
 
@@ -104,11 +105,15 @@ def connect(sender: Link, receiver: Link) -> None:
 
 
 def links(
-    pair: tuple[zenoh.Session, zenoh.Session], session: str = "s1", *, lossless: bool = True
+    pair: tuple[zenoh.Session, zenoh.Session],
+    session: str = "s1",
+    *,
+    lossless: bool = True,
+    lengths: Container[int] = ANY,
 ) -> tuple[ZenohLink, ZenohLink]:
     """Both ends of a link, connected in both directions. Lossless, so that a slow machine drops nothing."""
-    plant = ZenohLink(pair[0], f"t/{session}/measurement", f"t/{session}/command", lossless=lossless)
-    controller = ZenohLink(pair[1], f"t/{session}/command", f"t/{session}/measurement", lossless=lossless)
+    plant = ZenohLink(pair[0], f"t/{session}/measurement", f"t/{session}/command", lengths, lossless=lossless)
+    controller = ZenohLink(pair[1], f"t/{session}/command", f"t/{session}/measurement", lengths, lossless=lossless)
     connect(plant, controller)
     connect(controller, plant)
     return plant, controller
@@ -162,46 +167,22 @@ def test_a_frame_that_waits_is_pending_until_it_is_taken(pair: tuple[zenoh.Sessi
     assert not controller.pending
 
 
-def test_a_shorter_wait_ends_at_its_own_timeout(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
-    plant, controller = links(pair)
-    plant.send(b"1")
-    assert controller.wait(60 * PATIENCE_S) is not None  # leaves its alarm behind, an hour ahead
-    started = time.monotonic()
-    assert controller.wait(0.02) is None
-    assert controller.wait(0.01) is None
-    assert 0.03 <= time.monotonic() - started < PATIENCE_S
-
-
-def test_what_ends_a_wait_is_no_frame_and_leaves_the_session_to_no_one(
-    pair: tuple[zenoh.Session, zenoh.Session],
+@pytest.mark.parametrize("lossless", [True, False])
+def test_a_frame_of_a_wrong_length_is_counted_and_never_takes_the_place_of_a_good_one(
+    pair: tuple[zenoh.Session, zenoh.Session], lossless: bool
 ) -> None:
-    plant, controller = links(pair)
-    overheard = pair[0].declare_subscriber("t/s1/measurement", RingChannel(8))
-    assert controller.wait(0.0) is None
-    for _ in range(5):
-        assert controller.wait(0.01) is None
-        assert not controller.pending
-    plant.send(b"frame")
-    arrival = controller.wait(PATIENCE_S)
-    assert arrival is not None
-    assert arrival.frame == b"frame"
-    samples = iter(overheard.try_recv, None)
-    assert [sample.payload.to_bytes() for sample in samples] == [b"frame"]
-
-
-def test_closing_a_link_ends_a_wait_in_another_thread(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
-    _, controller = links(pair)
-    ended = threading.Event()
-
-    def wait() -> None:
-        controller.wait(60 * PATIENCE_S)
-        ended.set()
-
-    thread = threading.Thread(target=wait, daemon=True)
-    thread.start()
-    time.sleep(SETTLE_S)
-    controller.close()
-    assert ended.wait(PATIENCE_S)
+    plant, controller = links(pair, lossless=lossless, lengths={5, 0})
+    for sender, receiver in ((plant, controller), (controller, plant)):
+        for frame in (b"good!", b""):
+            before = receiver.refused
+            for sent in (b"long..", frame, b"four", bytes(200)):
+                sender.send(sent)
+            eventually("the refusals", lambda r=receiver, n=before: r.refused == n + 3)  # type: ignore[misc]
+            assert receiver.pending
+            arrival = receiver.wait(PATIENCE_S)
+            assert arrival is not None
+            assert arrival.frame == frame
+            assert receiver.take() is None
 
 
 def test_a_frame_that_was_taken_does_not_end_the_next_wait() -> None:
@@ -211,21 +192,6 @@ def test_a_frame_that_was_taken_does_not_end_the_next_wait() -> None:
     started = time.monotonic()
     assert mailbox.wait(0.05) is None
     assert time.monotonic() - started >= 0.05
-
-
-def test_a_frame_taken_while_it_is_put_does_not_end_the_next_wait() -> None:
-    # `put` appends, then wakes: a reader in between takes the frame and waits for the next one before the wake comes.
-    changed = Wake()
-    mailbox = Mailbox(changed)
-    received: list[Arrival | None] = []
-    waiting = threading.Thread(target=lambda: received.append(mailbox.wait(PATIENCE_S)))
-    waiting.start()
-    time.sleep(SETTLE_S)
-    changed.set()  # of the frame taken before
-    time.sleep(SETTLE_S)
-    mailbox.put(b"1")
-    waiting.join()
-    assert [arrival and arrival.frame for arrival in received] == [b"1"]
 
 
 def test_a_mailbox_holds_as_many_frames_as_its_depth_and_gives_the_oldest_first() -> None:

@@ -14,11 +14,11 @@ import zenoh
 from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.topics import TOPICS, Topic
+from aeroloop.protocol.messages.topics import QUERIES_PER_S, TOPICS, Topic
 from aeroloop.protocol.runtime.processes import listener, name_process
+from aeroloop.protocol.transport.endpoint import accepting
 from aeroloop.protocol.transport.network import visit
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
-from aeroloop.protocol.transport.places import accepting
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 
@@ -236,7 +236,7 @@ def test_what_exceeds_its_topics_limit_is_not_received(topic: Topic) -> None:
 
             member.declare_queryable(key, answer)
             eventually("an answer", lambda: any(reply.ok for reply in stranger.get(key, payload=asks)))
-            time.sleep(2 / topic.per_s)  # a query that comes sooner is dropped whatever its length
+            time.sleep(2 / QUERIES_PER_S)  # a query that comes sooner is dropped whatever its length
             assert not list(stranger.get(key, payload=asks_more, timeout=1.0))
             assert set(answered) == {topic.request}
 
@@ -263,12 +263,12 @@ def test_who_queries_too_often_is_answered_at_the_topics_rate_and_keeps_nobody_e
         with stranger_of(gathering) as stranger, stranger_of(gathering) as operator:
             eventually("a link", lambda: any(reply.ok for reply in operator.get("aeroloop/aero/stop")))
             eventually("a link", lambda: any(reply.ok for reply in stranger.get("aeroloop/aero/stop")))
-            time.sleep(2 / TOPICS["stop"].per_s)  # since their last queries
+            time.sleep(2 / QUERIES_PER_S)  # since their last queries
             answers.clear()
             begun, asked = time.monotonic(), 0
             while len(answers) < 5:
                 list(stranger.get(key))
                 asked += 1
-            assert len(answers) <= 1 + (time.monotonic() - begun) * TOPICS["stop"].per_s * 1.01
+            assert len(answers) <= 1 + (time.monotonic() - begun) * QUERIES_PER_S * 1.01
             assert asked > len(answers)
             assert any(reply.ok for reply in operator.get("aeroloop/aero/stop"))

@@ -15,10 +15,9 @@ import zenoh
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.network import join, visit
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
-from aeroloop.protocol.transport.publication import CachedPublisher
-from aeroloop.protocol.transport.recovery import RecoveringSubscriber
 from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
 from aeroloop.protocol.transport.security import Identity
 from aeroloop.service.host.operator import gather, stop
@@ -118,7 +117,7 @@ def test_what_was_published_while_the_router_was_away_is_recovered(
         eventually("the token", lambda: len(tokens) == 3)
         publisher.put(b"again")
         eventually("the third", lambda: arrived(b"before", b"away", b"again"))
-    assert list(subscriber.missed()) == []
+    assert subscriber.losses() == []
     seen.undeclare()
     token.undeclare()
 

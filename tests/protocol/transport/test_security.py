@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import socket
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -18,7 +17,7 @@ import zenoh
 from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
 from aeroloop.protocol.transport.network import join, visit
 from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.refusal import PLAIN_S, RefusalWatch, refusal
+from aeroloop.protocol.transport.refusal import PLAIN_S, refusal
 from aeroloop.protocol.transport.security import (
     READER,
     Identity,
@@ -201,50 +200,6 @@ def test_a_command_says_why_a_place_does_not_answer(network: Secured) -> None:
     )
     with join(network.settings, PLANT), pytest.raises(OperatorError, match="not of this authority"):
         gather(theirs)
-
-
-def test_a_watch_says_each_reason_once(network: Secured, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FIRST_S", "EVERY_S"):
-        monkeypatch.setattr(f"aeroloop.protocol.transport.refusal.{name}", 0.0)
-    wrong, lines, looks = read_certificate(spoiled(network, "expired")), list[str](), list[int]()
-
-    def places() -> list[str]:
-        looks.append(1)
-        return [network.place]
-
-    with join(network.settings, PLANT):
-        watch = RefusalWatch(wrong, "aero", places, lines.append)
-        for cn in ("plant/aero", "operator", "plant/aero-2", "plant/aero-2", "evil.example", None):
-            watch.linked("10.0.0.9", cn)
-        eventually("a third look", lambda: len(looks) > 2)
-        watch.close()
-    linked = [line for line in lines if "10.0.0.9" in line]
-    assert len(lines) == len(set(lines)) == len(linked) + 1
-    for text, said in zip(linked, ("plant/aero-2", "evil.example", "None"), strict=True):
-        assert said in text
-
-
-def test_a_watch_that_is_closed_during_a_handshake_reports_no_more(
-    network: Secured, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its session is closed then, too: publishing would fail, and be a traceback."""
-    begun, go_on, lines = threading.Event(), threading.Event(), list[str]()
-
-    def slow(*_: object) -> str:
-        begun.set()
-        go_on.wait()
-        return "late"
-
-    monkeypatch.setattr("aeroloop.protocol.transport.refusal.FIRST_S", 0.0)
-    monkeypatch.setattr("aeroloop.protocol.transport.refusal.refusal", slow)
-    certificate = read_certificate(network.authority.folder / "operator.pem")
-    watch = RefusalWatch(certificate, "aero", lambda: [network.place], lines.append)
-    (thread,) = (each for each in threading.enumerate() if each.name == "refusals")
-    begun.wait()
-    watch.close()
-    go_on.set()
-    thread.join()
-    assert not lines
 
 
 def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(network: Secured) -> None:

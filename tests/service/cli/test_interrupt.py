@@ -1,4 +1,4 @@
-"""^C: no traceback at any moment, exit code 130, and no process left.
+"""^C: no traceback at any moment, exit code 130, and no process left. SIGTERM: a daemon says why it ends.
 
 Real processes, each in a session of its own that gets SIGINT as a terminal would send it. Nothing is timed: each test
 waits for an event of the process, for at most `PATIENCE_S`, as a shared machine can be slow.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -55,6 +56,55 @@ def test_an_interrupted_import_leaves_no_traceback(module: str) -> None:
     _, rest = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert not [line for line in rest.splitlines() if not line.startswith("import time:")]
+
+
+@pytest.mark.parametrize("module", ["typer._click.core", "aeroloop.service.cli.main", "pydantic.main", "zenoh"])
+def test_a_daemon_that_is_terminated_while_it_imports_says_so(module: str) -> None:
+    process = start(sys.executable, "-P", "-X", "importtime", "-m", "aeroloop", "recorder")
+    assert process.stderr is not None
+    while not (line := process.stderr.readline()).rstrip().endswith(f" {module}"):
+        assert line, f"{module} was not imported"
+    process.send_signal(signal.SIGTERM)
+    _, rest = process.communicate(timeout=PATIENCE_S)
+    said = [line for line in rest.splitlines() if not line.startswith("import time:")]
+    assert (process.returncode, said) == (0, ["aeroloop: ended by a signal before it had started"])
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP])
+def test_a_daemon_that_is_terminated_while_zenoh_is_opened_ends_at_once_and_says_so(tmp_path: Path, how: int) -> None:
+    """What it connects to accepts, and does not answer. SIGHUP: its terminal is closed."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        router = f"network.rendezvous=tcp/127.0.0.1:{silent.getsockname()[1]}"
+        process = start(*COMMAND, "recorder", "--log", str(tmp_path), "--set", router, "--set", "network.mode=client")
+        with silent.accept()[0]:
+            process.send_signal(how)
+            _, said = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, said) == (0, "aeroloop: ended by a signal before it had started\n")
+
+
+TERMINATED_IN_WAIT = """
+import os, signal, sys, threading
+from aeroloop.service.cli.common import DaemonOptions, run_alone
+
+def trace(frame, event, _):
+    if frame.f_code is threading.Condition.wait.__code__:  # the event's lock is held
+        os.kill(os.getpid(), signal.SIGTERM)
+
+def run(stop):
+    sys.settrace(trace)
+    stop.wait()
+
+run_alone(run, DaemonOptions())
+"""
+
+
+def test_a_daemon_that_is_terminated_just_as_it_begins_to_wait_ends() -> None:
+    process = start(sys.executable, "-P", "-c", TERMINATED_IN_WAIT)
+    try:
+        assert process.wait(timeout=10) == 0
+    finally:
+        process.kill()
+        process.communicate()
 
 
 @pytest.mark.parametrize("verb", ["tables", "calibrate"])

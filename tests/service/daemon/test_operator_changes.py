@@ -50,6 +50,13 @@ def test_gains_hold_from_the_very_tick_that_is_published(loop: Loop) -> None:
     assert loop.controller.gains == gains_with(C1=(1.0, 1.0, 1.0), Gamma=(0.5, 0.5, 0.5))
 
 
+@pytest.mark.parametrize("given", [Gains(), Gains(C1=LAW.C1), gains_with()])
+def test_gains_that_change_nothing_are_answered_and_publish_no_event(loop: Loop, given: Gains) -> None:
+    assert loop.answered("set_gains", given).done
+    assert loop.events("changed") == []
+    assert len(loop.changes()) == 1  # the session's start
+
+
 @pytest.mark.parametrize(
     ("topic", "payload", "why"),
     [
@@ -114,7 +121,8 @@ def test_a_reference_holds_from_the_tick_that_is_published_and_arrives(
 ) -> None:
     loop.run(0.1)
     answer = loop.answered("track", Track(reference=reference, within_s=1.5))
-    assert loop.changes()[1:] == [Change(session="s0", tick=50, reference=reference, within_s=1.5)]
+    here = ((0.0, 0.0, 0.0),) * 3
+    assert loop.changes()[1:] == [Change(session="s0", tick=50, reference=reference, within_s=1.5, here=here)]
     assert answer.done
     assert words in answer.text
     assert [words in text for text in loop.events("changed")] == [True]
@@ -243,46 +251,6 @@ def test_the_next_session_begins_with_the_gains_and_the_reference_of_now(loop: L
         assert loop.tick() == expected.tick(measured(k), k)
 
 
-# A configuration that is read again
-
-
-def test_a_configuration_read_again_takes_over_what_differs_and_leaves_an_operators_word(loop: Loop) -> None:
-    law = AdaptiveSettings(C1=(0.5, 0.5, 0.5))
-    loop.ask("track", Track(reference=SWING, within_s=0.5))
-    loop.run(0.1)
-    loop.read_again(law, LEVEL)  # LEVEL is configured
-    loop.run(0.1)
-    assert loop.controller.gains == gains_with(C1=(0.5, 0.5, 0.5))
-    assert [(change.tick, change.reference) for change in loop.changes()[1:]] == [(0, SWING), (50, None)]
-    loop.answered("set_gains", Gains(C1=(0.6, 0.6, 0.6)))
-    loop.read_again(law, yaw_of(5.0))
-    loop.run(2.5)
-    assert loop.controller.gains == gains_with(C1=(0.6, 0.6, 0.6))
-    assert loop.changes()[-1].reference == yaw_of(5.0)
-    assert loop.yaw() == pytest.approx(5.0, abs=1e-12)
-
-
-def test_limits_that_are_read_again_hold_for_what_is_asked_next(loop: Loop) -> None:
-    loop.live.configure(ControllerSettings(max_reference_tilt_deg=10.0))
-    answer = loop.answered("track", Track(reference=Hold(attitude=(0.0, 11.0, 0.0))))
-    assert not answer.done
-    assert "max_reference_tilt_deg = 10" in answer.text
-
-
-def test_a_configured_reference_that_is_far_away_is_reached_as_soon_as_the_limits_allow(loop: Loop) -> None:
-    loop.read_again(LAW, yaw_of(170.0))
-    loop.tick()
-    assert loop.events("fault") == []
-    assert loop.changes()[-1].within_s == pytest.approx(radians(170) * 15 / 8, rel=1e-9)
-
-
-def test_a_configured_reference_beyond_the_limits_is_reported_and_ends_nothing(loop: Loop) -> None:
-    loop.read_again(LAW, Hold(attitude=(0.0, 70.0, 0.0)))
-    loop.tick()
-    assert ["max_reference_tilt_deg" in text for text in loop.events("fault")] == [True]
-    assert len(loop.changes()) == 1
-
-
 # The log
 
 angle = st.integers(-20, 20).map(float)
@@ -309,7 +277,7 @@ steps: st.SearchStrategy[tuple[str, Any]] = st.one_of(
     st.tuples(st.just("track"), st.builds(Track, reference=anything, within_s=within)),
     st.tuples(st.just("set-points"), st.lists(attitudes, min_size=1, max_size=3)),
     st.tuples(st.just("time"), st.sampled_from([0.1, 1.0])),
-    st.tuples(st.sampled_from(["no valid value", "malformed", "gap", "next session", "read again"]), st.none()),
+    st.tuples(st.sampled_from(["no valid value", "malformed", "gap", "next session"]), st.none()),
 )
 
 
@@ -348,6 +316,4 @@ def test_from_the_logged_changes_a_fresh_controller_gives_the_same_commands_byte
                 case "next session":
                     loop.end()
                     loop.begin()
-                case "read again":
-                    loop.read_again(AdaptiveSettings(C1=(0.7, 0.7, 0.7)), SWING)
         loop.assert_it_runs_again()

@@ -23,7 +23,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, distance, received_quaternion
 from aeroloop.service.daemon.session_start import remaining
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, turned
+from tests.support.operated_loop import LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, turned
 
 GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
 TARGET = Hold(attitude=(0.0, 0.0, 60.0))
@@ -134,27 +134,6 @@ def test_the_configured_reference_is_followed_when_an_operator_asks_for_it() -> 
     assert reached(loop, 0.0) == pytest.approx(15.0)
     assert query.answers[0].done
     assert loop.live.record.reference_from == "configured"
-
-
-def test_a_setting_read_again_holds_for_the_next_session() -> None:
-    loop = of("configured")
-    start(loop, 0.0)
-    loop.live.configure(ControllerSettings(after_restart="hold"))
-    loop.end()
-    assert start(loop, 30.0) == pytest.approx(30.0, abs=1.0)
-    loop.end()
-    loop.live.configure(ControllerSettings(after_restart="configured"))
-    start(loop, 0.0)
-    assert (loop.live.record.reference, loop.live.record.reference_from) == (SWING, "configured")
-
-
-def test_a_configuration_read_again_moves_nothing_before_a_session_and_moves_one_that_runs() -> None:
-    loop = of("hold")
-    loop.live.adopt(LAW, LEVEL)
-    assert loop.live.record.reference == Hold()
-    assert start(loop, 30.0) == pytest.approx(30.0, abs=1.0)
-    loop.live.adopt(LAW, Hold(attitude=(0.0, 0.0, 20.0)))
-    assert reached(loop, 30.0) == pytest.approx(20.0)
 
 
 # ── resume ──

@@ -6,12 +6,18 @@ import json
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from aeroloop.protocol.runtime import tick_grid
+from aeroloop.protocol.transport.network import join
+from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.transport.security import Identity, SecuritySettings
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.service.host import doctor
+from aeroloop.service.testing.process_group import free_rendezvous
+from tests.support.certificates import Authority
 
 pytestmark = pytest.mark.processes
 
@@ -63,3 +69,25 @@ def test_cpus_that_sleep_are_no_reason_for_a_service_which_may_not_keep_them_awa
     monkeypatch.setattr(doctor, "CHECK_S", 0.1)
     advice = [finding.advice for finding in doctor.diagnose(LoopSettings()).findings if finding.what == "set-up"]
     assert ["service" in each for each in advice] == [True, False]
+
+
+def test_with_certificates_it_says_which_is_refused_where(tmp_path: Path) -> None:
+    ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
+    for authority in (ours, foreign):
+        authority.issue("operator")
+        authority.issue("plant", "aero")
+    settings = NetworkSettings(rendezvous=[free_rendezvous()], ports=1, loopback_secured=True)
+
+    def of(authority: Authority) -> NetworkSettings:
+        security = SecuritySettings(directory=str(authority.folder), vehicles=["aero"])
+        return settings.model_copy(update={"security": security})
+
+    with join(of(ours), Identity(("plant",), "aero")):
+        (fine,) = doctor.refused(of(ours))
+        assert fine.good
+        assert fine.found == "none of 2 certificates is refused"
+        findings = doctor.refused(of(foreign))
+    assert [finding.what for finding in findings] == ["operator.pem", "plant.aero.pem"]
+    assert all("refused at tls/" in finding.found for finding in findings)
+    assert all("not of this authority" in finding.advice for finding in findings)
+    assert [finding.good for finding in doctor.refused(settings)] == [True]

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 from aeroloop.protocol.messages.models import Percentiles, Status, Timing
-from aeroloop.protocol.messages.states import NOT_RECORDING
+from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
 from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.cli.main import execute as run
+from aeroloop.service.config import load
+from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.host.health import LATE_SHARE, SILENT_S, Trouble, troubles
-from aeroloop.service.host.operator import Gathered, gather
-from tests.support.zenoh_network import Gathering
+from aeroloop.service.host.operator import Gathered, OperatorError, gather
+from tests.support.zenoh_network import Gathering, eventually
 
 PERIOD = Percentiles(count=5000, p50=2000, p99=2100, p999=2200, max=2300)
 
@@ -53,6 +60,19 @@ LATE = int(LATE_SHARE * PERIOD.count) + 1
         (of(plant=status("plant", "driven", recent_latency_us=SLOW)), "late", "plant", "2001 µs"),
         (of(controller=None), "missing", "controller", "aero has no controller"),
         (of(plant=None), "missing", "plant", "aero has no plant"),
+        (of(plant=status("plant", "driven", unkept="read-only")), "not kept", "plant", "forget a stop at a restart"),
+        (of(plant=status("plant", "tripped", unkept="read-only")), "tripped", "plant", "forget it: read-only"),
+        (of(plant=status("plant", "driven", lacks_recorder="gone")), "missing", "recorder", "recorder is gone"),
+        (of(status("controller", "searching", lacks_recorder="required")), "missing", "recorder", "requires one"),
+        (
+            of(
+                status("controller", "running", lacks_recorder="required"),
+                status("plant", "driven", lacks_recorder="gone"),
+            ),
+            "missing",
+            "recorder",
+            "recorder is gone",
+        ),
         (of(CONTROLLER, PLANT, "the recorder at x does not answer"), "silent", None, "recorder at x"),
     ],
 )
@@ -121,3 +141,87 @@ def test_a_recorder_that_cannot_write_is_a_trouble() -> None:
     (trouble,) = troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
     assert (trouble.kind, trouble.role) == (NOT_RECORDING, "recorder")
     assert trouble.text == "aero's recorder records nothing: the disk is full"
+
+
+def test_a_recorder_that_lost_messages_is_a_trouble() -> None:
+    recorder = status("recorder", "recording", lost=7)
+    (trouble,) = troubles(Gathered({"aero": {"controller": CONTROLLER, "plant": PLANT, "recorder": recorder}}, []))
+    assert (trouble.kind, trouble.role) == ("lossy", "recorder")
+    assert "lost 7 messages" in trouble.text
+
+
+@contextmanager
+def ends(network: NetworkSettings, *, require_recorder: bool) -> Iterator[None]:
+    """An armed plant and a controller in this process, in real time."""
+    words = [
+        "loop.realtime=off",
+        "loop.rate_hz=50",
+        "plant.watchdog_s=5",
+        "controller.stale_s=5",
+        "wire.counter_bits=16",
+    ]
+    settings = load(overrides=[*words, "plant.armed_at_start=true", f"controller.require_recorder={require_recorder}"])
+    with Role("plant", "aero", network, {}) as plant, Role("controller", "aero", network, {}) as controller:
+        loops = [
+            EmulatorOnZenoh(plant, settings.loop, settings.wire, settings.plant).run,
+            Daemon(controller, settings).run,
+        ]
+        threads = [threading.Thread(target=loop) for loop in loops]
+        for thread in threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            for role in (controller, plant):
+                role.stop.set()
+            for thread in threads:
+                thread.join()
+
+
+@contextmanager
+def recorder(network: NetworkSettings, last: str) -> Iterator[None]:
+    """A recorder with its presence alone; `last` is the state in its last status."""
+    with Role("recorder", "aero", network, {}) as role:
+        role.announce()
+        role.status(status("recorder", "recording"))
+        yield
+        role.status(status("recorder", last))
+
+
+@pytest.mark.parametrize("require_recorder", [False, True])
+def test_a_recorder_that_was_there_or_is_required_is_missed_and_one_that_stopped_in_order_is_not(
+    require_recorder: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with Gathering() as gathering, ends(gathering.settings, require_recorder=require_recorder):
+        words = ["op", "status", "--check", "--json", "--set", f"network.rendezvous={gathering.settings.rendezvous[0]}"]
+
+        def missed() -> list[str]:
+            capfd.readouterr()
+            code = run(words)
+            found = json.loads(capfd.readouterr().out)["troubles"]
+            assert code == bool(found)
+            return [trouble["text"] for trouble in found if trouble["role"] == "recorder"]
+
+        def says(part: str) -> Callable[[], bool]:
+            return lambda: [part in text for text in missed()] == [True]
+
+        def uptimes() -> list[float]:
+            """Of the statuses of both ends; zeros before both have answered."""
+            with suppress(OperatorError, KeyError):
+                roles = gather(gathering.settings).statuses["aero"]
+                return [roles[role].uptime_s for role in ("controller", "plant")]
+            return [0.0, 0.0]
+
+        def after_two_statuses() -> list[str]:
+            since = uptimes()
+            eventually("two statuses", lambda: all(t > s + 1 for s, t in zip(since, uptimes(), strict=True)))
+            return missed()
+
+        eventually("statuses of both", lambda: min(uptimes()) > 0)
+        assert len(missed()) == require_recorder
+        with recorder(gathering.settings, "recording"):
+            eventually("nothing missed", lambda: not missed())
+        eventually("that it is gone", says("gone"))
+        with recorder(gathering.settings, STOPPED):
+            eventually("that it is back", lambda: not missed())
+        assert ["requires one" in text for text in after_two_statuses()] == [True] * require_recorder

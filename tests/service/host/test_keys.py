@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.transport.certificate import CertificateError, check, load, own_certificate, read_certificate
+from aeroloop.protocol.transport.certificate import CertificateError, load, own_certificate, read_certificate
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.host import keys
 from aeroloop.service.host.doctor import _certificates
@@ -43,15 +43,14 @@ def test_what_is_issued_can_be_used_for_ninety_days(folder: Path, role: str, veh
 
 def test_keys_are_the_owners_alone(folder: Path) -> None:
     keys.issue(folder, "operator", "Ada")
-    keys.request(folder, "observer", "Ada")
-    keys.renew(folder, new_key=True)
+    keys.issue(folder, "observer", "Ada")
     secrets = [path for path in folder.iterdir() if b"PRIVATE" in path.read_bytes()]
-    assert len(secrets) == 4  # the authority's, the operator's two, the observer's
+    assert len(secrets) == 3
     assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    folder.chmod(0o755)
+    (folder / "open").mkdir(mode=0o755)
     with pytest.raises(CertificateError, match="chmod 700"):
-        keys.request(folder, "recorder", "Ada")
+        keys.init(folder / "open")
 
 
 @pytest.mark.parametrize(
@@ -59,63 +58,14 @@ def test_keys_are_the_owners_alone(folder: Path) -> None:
     [
         keys.init,
         lambda folder: keys.issue(folder, "operator", "Eve"),
-        lambda folder: keys.request(folder, "operator", "Eve"),
-        lambda folder: keys.request(folder, "observer", "Eve"),
-        lambda folder: keys.issue(folder, "observer", "Eve"),
-        lambda folder: keys.issue_requested(folder, folder / "operator.csr"),
-        lambda folder: keys._write(folder / "operator.pem", b""),  # made by another since it was looked for
     ],
 )
 def test_nothing_is_overwritten(folder: Path, again: Callable[[Path], object]) -> None:
     keys.issue(folder, "operator", "Ada")
-    keys.request(folder, "observer", "Ada")
-    shutil.copy(folder / "observer.csr", folder / "operator.csr")
     before = files(folder)
     with pytest.raises(CertificateError, match="is not overwritten"):
         again(folder)
     assert files(folder) == before
-
-
-def test_a_request_for_more_than_its_name_says_is_not_signed(folder: Path, tmp_path: Path) -> None:
-    asked = keys.request(tmp_path / "far", "operator", "Eve")
-    harmless = shutil.copy(asked, tmp_path / "observer.csr")
-    with pytest.raises(CertificateError, match="asks for a certificate of operator, which its name does not say"):
-        keys.issue_requested(folder, Path(harmless))
-    assert not (tmp_path / "observer.pem").exists()
-
-
-def test_a_request_is_signed_and_its_key_stays_where_it_was_made(folder: Path, tmp_path: Path) -> None:
-    far, here = tmp_path / "far", tmp_path / "here"
-    here.mkdir()
-    asked = shutil.copy(keys.request(far, "plant", "bench", "aero"), here)
-    signed = keys.issue_requested(folder, Path(asked), days=7)
-    shutil.copy(signed, far)
-    shutil.copy(folder / "ca.pem", far)
-    assert own_certificate(far, ("plant",), "aero").name == "bench"
-    assert sorted(files(folder)) == ["ca.key", "ca.pem"]
-    again = keys.renew(far)  # without the authority's key
-    assert again == [far / "plant.aero.csr"]
-    with pytest.raises(CertificateError, match=r"ca\.key is not here"):
-        keys.issue(far, "operator", "Ada")
-
-
-@pytest.mark.parametrize("new_key", [False, True])
-def test_a_renewed_certificate_is_good_for_longer_and_what_it_replaces_is_kept(folder: Path, new_key: bool) -> None:
-    file = keys.issue(folder, "plant", "bench", "aero", days=1)
-    keys.issue(folder, "operator", "Ada", days=1)
-    before, old = files(folder), read_certificate(file)
-    assert keys.renew(folder, ["plant"], new_key=new_key) == [file]
-    found = check(file, "plant", "aero")
-    assert found.not_after - old.not_after > 80 * DAY
-    assert (found.name, found.vehicle) == (old.name, old.vehicle)
-    after = files(folder)
-    kept = f".{old.fingerprint[:8]}"
-    assert after[f"plant.aero.pem{kept}"] == before["plant.aero.pem"]
-    assert (after["plant.aero.key"] == before["plant.aero.key"]) != new_key
-    assert after.get(f"plant.aero.key{kept}") == (before["plant.aero.key"] if new_key else None)
-    assert after["operator.pem"] == before["operator.pem"]
-    with pytest.raises(CertificateError, match="no certificate of router"):
-        keys.renew(folder, ["router"])
 
 
 def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
@@ -139,19 +89,10 @@ def test_what_cannot_be_in_a_certificate_is_refused(
     folder: Path, role: str, name: str, vehicle: str | None, says: str
 ) -> None:
     before = files(folder)
-    for make in (keys.issue, keys.request):
-        with pytest.raises(CertificateError, match=says) as caught:
-            make(folder, role, name, vehicle)
-        assert "\n" not in str(caught.value)
+    with pytest.raises(CertificateError, match=says) as caught:
+        keys.issue(folder, role, name, vehicle)
+    assert "\n" not in str(caught.value)
     assert files(folder) == before
-
-
-def test_a_request_of_anything_else_is_not_signed(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "x.csr").write_text("x")
-    with pytest.raises(CertificateError, match="no request in PEM"):
-        keys.issue_requested(folder, tmp_path / "x.csr")
-    with pytest.raises(CertificateError, match="cannot be read"):
-        keys.issue_requested(folder, tmp_path / "y.csr")
 
 
 def test_what_expires_soon_or_cannot_be_used_is_shown(
@@ -163,7 +104,7 @@ def test_what_expires_soon_or_cannot_be_used_is_shown(
     findings = {finding.what: finding for finding in _certificates(authority.folder)}
     assert [name for name, finding in findings.items() if not finding.good] == ["operator.pem"]
     assert "13 days left" in findings["operator.pem"].found
-    assert "keys renew operator" in findings["operator.pem"].advice
+    assert "keys issue" in findings["operator.pem"].advice
     words = ["host", "keys", "show", "--json", "--set", f"network.security.directory={authority.folder}"]
     assert run(words) == 0
     authority.issue("observer", ends=-DAY)
@@ -198,18 +139,17 @@ def test_the_status_of_a_role_says_when_its_certificate_expires_soon(
 
 
 def test_the_command_line_makes_what_two_hosts_need(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    lab, far = str(tmp_path / "lab"), str(tmp_path / "far")
+    lab, far = tmp_path / "lab", tmp_path / "far"
     configured = ["--set", f"network.security.directory={lab}"]
     assert run(["host", "keys", "init", *configured]) == 0
     assert run(["host", "keys", "issue", "operator", "Ada", "--days", "7", *configured]) == 0
-    assert run(["host", "keys", "request", "plant", "bench", "--vehicle", "aero", "--directory", far]) == 0
-    assert run(["host", "keys", "issue", "--request", f"{far}/plant.aero.csr", "--directory", lab]) == 0
-    out = capfd.readouterr().out.splitlines()
-    assert out == [f"{lab}/ca.pem", f"{lab}/operator.pem", f"{far}/plant.aero.csr", f"{far}/plant.aero.pem"]
-    assert run(["host", "keys", "issue", *configured]) == 2
+    assert run(["host", "keys", "issue", "plant", "bench", "--vehicle", "aero", "--directory", str(lab)]) == 0
+    assert capfd.readouterr().out.splitlines() == [f"{lab}/{file}.pem" for file in ("ca", "operator", "plant.aero")]
+    assert run(["host", "keys", "issue", "operator", *configured]) == 2
     assert run(["host", "keys", "issue", "plant", "bench", *configured]) == 1
-    assert capfd.readouterr().err.count("aeroloop: ") == 2
-    assert run(["host", "keys", "renew", "operator", *configured]) == 0
-    shutil.copy(Path(lab, "ca.pem"), far)
-    assert own_certificate(Path(far), ("plant",), "aero").name == "bench"
-    assert own_certificate(Path(lab), ("operator",), None).days_left > 80
+    far.mkdir()
+    for name in ("ca.pem", "plant.aero.pem", "plant.aero.key"):
+        shutil.move(lab / name, far)
+    assert own_certificate(far, ("plant",), "aero").name == "bench"
+    with pytest.raises(CertificateError, match=r"ca\.key is not here"):
+        keys.issue(far, "operator", "Ada")

@@ -18,7 +18,6 @@ from aeroloop.service.host.units import UNITS, Source, unit
 SLCAN = ("plant.via=can", "can.interface=slcan", "can.channel=/dev/ttyACM0@115200")
 VIAS = {
     "emulator": (),
-    "quanser-fake": ("plant.via=quanser-fake",),
     "quanser": ("plant.via=quanser",),
     "udp_multicast": ("plant.via=can",),
     "socketcan": ("plant.via=can", "can.interface=socketcan", "can.channel=can0"),
@@ -40,7 +39,7 @@ def made(name: str, *overrides: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("via", "devices"),
     [
-        ("emulator", NONE), ("quanser-fake", NONE), ("udp_multicast", NONE), ("socketcan", NONE),
+        ("emulator", NONE), ("udp_multicast", NONE), ("socketcan", NONE),
         ("slcan", SERIAL), ("gs_usb", USB), ("quanser", USB),
     ],
 )  # fmt: skip
@@ -52,6 +51,16 @@ def test_the_plants_unit_may_use_its_bus_or_device_and_the_others_may_not(via: s
     for name in ("controller", "recorder"):
         assert made(name, *VIAS[via])["PrivateDevices"] == "yes"
         assert "AF_CAN" not in made(name, *VIAS[via])["RestrictAddressFamilies"]
+
+
+def test_a_plant_that_systemd_starts_is_unarmed_and_can_keep_a_stop() -> None:
+    plant = made("plant")
+    assert "--set plant.armed_at_start=false" in plant["ExecStart"]
+    assert plant["StateDirectory"] == "aeroloop"
+    assert "armed_at_start" not in made("controller")["ExecStart"]
+    armed = "plant.armed_at_start=true"
+    assert made("plant", armed)["ExecStart"].rindex(armed) > made("plant", armed)["ExecStart"].index("start=false")
+    assert made("plant", "plant.state_directory=/srv/aero")["ReadWritePaths"] == "/srv/aero"
 
 
 def test_clients_get_a_unit_of_a_router_without_rights_and_peers_get_none() -> None:

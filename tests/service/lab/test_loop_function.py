@@ -14,14 +14,13 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
+from aeroloop.protocol.wire.frames import FrameFormat
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import ConfigError, Settings, as_overrides, load
-from aeroloop.service.figures import Figures
+from aeroloop.service.figures import Figures, Floats
 from aeroloop.service.lab import c_code, experiment, loop_function
-from aeroloop.service.lab.bare_loop import bare_loop
-from aeroloop.service.lab.experiment import LoopEndedError, experiment_figures, run_experiment
+from aeroloop.service.lab.experiment import LoopEndedError, run_experiment, sent_ticks
 from aeroloop.service.lab.loop_function import BLOCK, Loop, loop_of
-from aeroloop.service.lab.traffic import frames_of, sent_ticks
 
 TICKS = BLOCK + 90
 """More than a block, and not a whole number of blocks."""
@@ -92,6 +91,15 @@ def through(settings: Settings, ticks: int = TICKS) -> tuple[Figures, list[tuple
     return figures, frames
 
 
+def frames_of(codes: Floats, kind: FrameFormat) -> list[bytes]:
+    """The frames of every tick from 0 on. Shape of the codes: (ticks, components)."""
+    columns = [
+        column.tolist() if width is None else column.astype(int).tolist()
+        for column, width in zip(codes.T, kind.widths, strict=True)
+    ]
+    return [kind.pack(k % kind.counters, row) for k, row in enumerate(zip(*columns, strict=True))]
+
+
 def assert_the_same(settings: Settings, loop: Loop | None = None, ticks: int = TICKS) -> None:
     """Figures, and every frame that is sent."""
     figures, frames = through(settings, ticks)
@@ -106,7 +114,8 @@ def assert_the_same(settings: Settings, loop: Loop | None = None, ticks: int = T
         due = set(sent_ticks(codes, policy, heartbeat).tolist())
         assert [frame if k in due else SILENCE for k, frame in enumerate(frames_of(codes, kind))] == list(sent)
     found = experiment.experiment(settings, ticks * settings.loop.period)
-    assert (found.figures, found.path) == (figures, "compiled")
+    assert found.figures == figures
+    assert found.course is not None
 
 
 @given(CONFIGURATIONS)
@@ -238,17 +247,16 @@ def test_a_value_within_a_rounding_of_a_limit_is_left_to_the_frames() -> None:
     plant = settings.plant.build(settings.loop.period)
     run_experiment(settings, 1.0, watch=lambda *_: speeds.append(np.linalg.norm(plant.measure().rate)), plant=plant)
     limits = settings.plant.limits
-    for excess, path in ((1e-12, "frames"), (1e-6, "compiled")):
+    for excess, as_one_function in ((1e-12, False), (1e-6, True)):
         near = limits.model_copy(update={"max_rate": max(speeds) * (1 + excess)})
         changed = settings.model_copy(update={"plant": settings.plant.model_copy(update={"limits": near})})
-        assert experiment_figures(changed, 1.0).path == path
+        assert (experiment.experiment(changed, 1.0).course is not None) == as_one_function
 
 
-def test_a_fault_runs_frame_by_frame_and_the_figures_say_so() -> None:
+def test_a_fault_runs_frame_by_frame() -> None:
     faulty = load(overrides=['plant.faults=["rate:bias=0.1@0.1"]'])
-    found = experiment_figures(faulty, 0.3)
-    assert (found.path, found.z_track) == ("frames", run_experiment(faulty, 0.3, watch=lambda *_: None).z_track)
-    assert experiment_figures(load(), 0.3).path == "compiled"
+    assert experiment.experiment(faulty, 0.3).course is None
+    assert run_experiment(faulty, 0.3).z_track != run_experiment(load(), 0.3).z_track
 
 
 def test_nothing_is_held_before_the_first_measurement() -> None:
@@ -258,14 +266,3 @@ def test_nothing_is_held_before_the_first_measurement() -> None:
     wire = {"actuators": 3, "rate": {"kind": "hysteresis-uniform"}}
     settings = load(overrides=as_overrides({"plant": plant, "wire": wire, "law": LAW}))
     assert_the_same(settings, ticks=20)
-
-
-@needs_a_compiler
-def test_the_floor_that_time_is_compared_with_is_the_same_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    settings = load(overrides=VARIED[1])
-    floor, course = bare_loop(settings, TICKS), loop_of(settings).run(settings, TICKS)
-    assert floor is not None
-    assert course is not None
-    for _ in range(2):  # it can be timed again
-        assert np.array_equal(floor()[:, :8], np.hstack([course.measured, course.commanded]))

@@ -27,7 +27,7 @@ def tables() -> Tables:
 @pytest.mark.parametrize("windy", [False, True], ids=["calm", "wind"])
 def test_the_default_bench_is_the_one_that_calibration_finds(windy: bool) -> None:
     published = paper.WIND["continuous"]["wind" if windy else "calm"]
-    result, _ = run_cell(BENCH.description(), Cell(None, None, windy))
+    result = run_cell(BENCH.description(), Cell(None, None, windy))
     # Newton stops within TOLERANCE of the paper's figures; the committed values are rounded to four digits, and wind
     # and friction answer about in proportion, so as much again.
     assert result.z_track == pytest.approx(published["z_track_1e-4"], rel=2 * TOLERANCE)
@@ -44,7 +44,7 @@ def test_what_is_predicted_lies_as_near_the_paper_as_the_readme_says(tables: Tab
 
 
 def test_a_table_is_made_of_its_cells_in_rows_of_input_bits_and_columns_of_output_bits(tables: Tables) -> None:
-    coarse, _ = run_cell(BENCH.description(), Cell(bits_out=10, bits_in=7))
+    coarse = run_cell(BENCH.description(), Cell(bits_out=10, bits_in=7))
     assert tables.C2.ours[paper.INPUT_BITS.index(7)][paper.OUTPUT_BITS.index(10)] == round(coarse.z_track, 2)
     assert tables.C3.ours[paper.INPUT_BITS.index(7)][paper.OUTPUT_BITS.index(10)] == round(coarse.u_total, 2)
     assert tables.C2.ours[-1][-1] == tables.C4.ours["continuous"]["calm"]["z_track_1e-4"]
@@ -60,8 +60,7 @@ def test_the_fitted_cells_do_not_count_in_the_error(tables: Tables) -> None:
 
 def test_json_has_the_papers_shape_and_markdown_every_cell(tables: Tables) -> None:
     document = json.loads(tables.model_dump_json())
-    assert set(document) == {"C2", "C3", "C4", "path"}
-    assert document["path"] == "compiled"
+    assert set(document) == {"C2", "C3", "C4"}
     for name, published in (("C2", paper.Z_TRACK), ("C3", paper.U_TOTAL)):
         assert document[name]["paper"] == [list(row) for row in published]
         assert [len(row) for row in document[name]["ours"]] == [4] * 6

@@ -105,7 +105,6 @@ class Run:
             within_s=0.5 if brakes else float(rng.choice([0.0, 0.05, 0.5])),
             brake_s=(0.0, 0.123, 0.2) if brakes else None,
             run_up_s=(0.0, 0.2, 0.017) if brakes else None,
-            ease_s=0.0 if brakes else float(rng.choice([0.0, 0.1])),
             start=(0.0, 3.0, -7.0) if rng.random() < 0.2 else None,
         )
 

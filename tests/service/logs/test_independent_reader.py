@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.mcap_file import records
 from aeroloop.service.logs.recover import RecoverError, recover

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
-from aeroloop.protocol.messages.trace import Outcome, read_batch
+from aeroloop.protocol.messages.trace import RECORD_S, Outcome, Received, Sent, TraceWriter, read_batch
+from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.config import load
+from aeroloop.service.logs.export import export
 from aeroloop.service.logs.files import ReviewError
 from aeroloop.service.logs.replay import replay
 from aeroloop.service.logs.ticks import Ticks
-from aeroloop.service.logs.traces import Missing
+from aeroloop.service.logs.traces import Missing, TraceIndex
 from aeroloop.service.review.review import read, review
-from tests.support.edited_log import Said, edited, message_of, rewrite, write_messages
-from tests.support.made_log import SESSION, VEHICLE, Logged, made, make_log, write
+from tests.support.edited_log import Said, edited, rewrite, write_messages
+from tests.support.made_log import AN_OPERATORS_WORDS, SESSION, VEHICLE, Logged, made, make_log, write
 from tests.support.rough_log import Known, rough_loop
 
 SEEDS = range(5)
@@ -58,6 +62,7 @@ def test_what_was_joined_is_what_happened_and_both_ends_replay_byte_for_byte(see
     assert replayed.plant.differ == 0
     assert replayed.plant.ticks >= len(known.measured)
     assert replayed.reasons == {}
+    assert replayed.complete
     findings, ticks = read(path).findings, ticks_in(path)
     assert findings.missing == []
     answered = sorted({*(k for k, command in known.commands.items() if command is not None), *known.acted})
@@ -104,7 +109,10 @@ def test_batches_that_come_twice_or_out_of_order_change_nothing(seed: int, tmp_p
 
 @pytest.mark.parametrize("seed", SEEDS[:4])
 def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, tmp_path: Path) -> None:
-    """Each batch has the controller's state before it, so a gap ends with it. A plant is only known from its start."""
+    """Each batch has the controller's state before it, so a gap ends with it, once gains and reference are proven.
+
+    A plant is only known from its start.
+    """
     known, chance = rough_loop(seed, 2000, 'wire.transmit="periodic"'), random.Random(seed)
     messages = list(known.messages.all)
     for end in ("controller", "plant"):
@@ -123,7 +131,15 @@ def test_missing_batches_are_named_and_the_controller_still_replays(seed: int, t
     assert {gap.end for gap in findings.missing} == {"controller", "plant"}
     replayed = replay([path])
     assert replayed.controller is not None
-    assert replayed.controller.ticks == len(known.commands) - gone_rows["controller"]
+    left_out = {k for one in replayed.unknown for k in range(one.first_tick, one.last_tick + 1)}
+    gone_ticks = {
+        k
+        for m in known.messages.all
+        if end_of(m) == "controller" and m not in messages and (batch := read_batch(m.payload))
+        for k in batch.columns["tick"].tolist()
+    }
+    assert replayed.controller.ticks == len(known.commands.keys() - gone_ticks - left_out)
+    assert len(left_out - gone_ticks) < RECORD_S / known.settings.loop.period
     assert replayed.controller.differ == 0
     assert f"{gone_rows['plant']} rows are missing" in replayed.reasons["plant"]
 
@@ -174,46 +190,22 @@ def test_one_end_alone_is_read_for_what_it_has(tmp_path: Path) -> None:
     assert read(tmp_path / "b.mcap").findings.missing_ticks["controller"] == 499
 
 
-def test_a_log_of_the_first_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_a_log_of_another_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
     make_log(tmp_path / "a.mcap", 100)
-    path = write_messages(tmp_path / "b.mcap", [], [old_description()])
-    says = "is not a log of this version: it is of protocol version 1; read it with aeroloop 0.1, which wrote it"
+    path = write_messages(tmp_path / "b.mcap", [], [other_description()])
+    says = "is not a log of this version: it is of protocol version 1; read it with the aeroloop that wrote it"
     for reader in (review, lambda path: replay([path])):
         with pytest.raises(ReviewError, match=says) as refused:
             reader(path)
         assert str(refused.value) == f"{path} {says}"
-    both = rewrite(tmp_path / "a.mcap", tmp_path / "c.mcap", metadata=[old_description()])
+    both = rewrite(tmp_path / "a.mcap", tmp_path / "c.mcap", metadata=[other_description()])
     assert review(both).z_track == review(tmp_path / "a.mcap").z_track
     assert "protocol version 1" in review(both).damages[0]
 
 
-def old_description() -> tuple[str, dict[str, str]]:
-    text = '{"role": "plant", "vehicle": "aero", "host": "h", "versions": {}, "config": {}}'
+def other_description() -> tuple[str, dict[str, str]]:
+    text = '{"protocol": 1, "role": "plant", "vehicle": "aero", "host": "h", "versions": {}, "config": {}}'
     return "aeroloop.description", {"key": "aeroloop/aero/description/plant", "json": text}
-
-
-def test_frames_from_the_wire_are_compared_with_the_traces(tmp_path: Path) -> None:
-    known = rough_loop(20)
-    path = written(tmp_path / "a.mcap", known)
-    assert read(path).findings.frames is None
-
-    def frames(change: int | None = None) -> list[Said]:
-        at = known.messages.all[0].at_ns
-        sent = [("measurement", k, frame) for k, frame in known.measured.items() if frame]
-        sent += [("command", k, frame) for k, frame in known.commands.items() if frame]
-        sent.sort(key=lambda one: one[1])
-        return [
-            message_of(name, frame[:-1] + bytes([frame[-1] ^ 0x10]) if i == change else frame, at + k * 2_000_000)
-            for i, (name, k, frame) in enumerate(sent)
-        ]
-
-    made_frames = frames()
-    findings = read(rewrite(path, tmp_path / "b.mcap", more=made_frames)).findings
-    recorded = {name: sum(one.topic == name for one in made_frames) for name in ("measurement", "command")}
-    assert findings.frames == {name: {"recorded": n, "differ": 0} for name, n in recorded.items()}
-    findings = read(rewrite(path, tmp_path / "c.mcap", more=frames(change=100))).findings
-    assert findings.frames is not None
-    assert sum(count["differ"] for count in findings.frames.values()) == 1
 
 
 def test_a_row_that_is_not_what_was_done_is_found_at_either_end(tmp_path: Path) -> None:
@@ -249,3 +241,61 @@ def test_an_end_that_is_missing_for_long_costs_its_rows_and_nothing_else(end: st
     write(tmp_path / "a.mcap", settings, [m for m in messages if m not in gone])
     whole = read(tmp_path / "a.mcap").findings.missing_ticks
     assert whole == {"controller": 0, "plant": 0} | {end: sum(map(rows_of, gone))}
+
+
+def missing_of(kept: Collection[int]) -> list[str]:
+    """What is found missing where one process ran s1 (100 ticks), s2 (50) and s3 (100) and these batches were kept.
+
+    Each batch has 25 rows: 0 to 3 are of s1, 4 and 5 of s2, 6 to 9 of s3.
+    """
+    wire = WireSpec()
+    writer, index = TraceWriter("controller", wire, 7, 10**12), TraceIndex()
+    frames = bytes(wire.measurement.size), bytes(wire.command.size)
+    batches = []
+    for session, ticks in (("s1", 100), ("s2", 50), ("s3", 100)):
+        writer.session = session
+        for k in range(ticks):
+            writer.controller_row(k, Received.SILENT, Sent.FRAME, 10**10 + k, 10**10 + k, *frames)
+            if k % 25 == 24:
+                batches.append(writer.take(10**10 + k, k, final=k == ticks - 1))
+    for i in kept:
+        assert index.add(VEHICLE, batches[i])
+    index.finish()
+    return [str(gap) for gap in index.missing if gap.end == "controller"]
+
+
+@pytest.mark.parametrize(
+    ("kept", "missing"),
+    [
+        ((0, 1, 2, 3, 6, 7, 8, 9), ["50 of the controller's ticks in sessions of which the log has nothing"]),
+        ((0, 1, 2, 3, 8, 9), ["50 of the controller's ticks in sessions of which the log has nothing",
+                              "50 of the controller's ticks in s3, ticks 0 to 49"]),
+        ((0, 1, 8, 9), ["100 or more of the controller's ticks, from tick 50 of s1 on",
+                        "50 of the controller's ticks in s3, ticks 0 to 49"]),
+        ((8, 9), ["50 of the controller's ticks in s3, ticks 0 to 49"]),
+        ((0, 3, 4, 5, 6, 7, 8, 9), ["50 of the controller's ticks in s1, ticks 25 to 74"]),
+    ],
+)  # fmt: skip
+def test_rows_of_one_session_are_never_counted_as_those_of_another(kept: tuple[int, ...], missing: list[str]) -> None:
+    """A process numbers the rows of all its sessions; which of them a gap held is known only where both ends are."""
+    assert missing_of(kept) == missing
+
+
+def test_a_log_in_the_order_in_which_a_late_recorder_received_it_reads_as_one_in_order(tmp_path: Path) -> None:
+    """Topic by topic, the newest page first: rows are sorted by number, states and statuses by their sender's time."""
+    made, late = tmp_path / "made.mcap", tmp_path / "late.mcap"
+    make_log(made, 600, truth_every=2, changes=AN_OPERATORS_WORDS, injected={100: "rate:off", 120: None})
+    with made.open("rb") as file:
+        reader = make_reader(file)
+        messages = [Said(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+        metadata = [(record.name, dict(record.metadata)) for record in reader.iter_metadata()]
+    by_key = {key: [one for one in messages if one.key == key] for key in sorted({one.key for one in messages})}
+    pages = [said[max(0, end - 20) : end] for said in by_key.values() for end in range(len(said), 0, -20)]
+    write_messages(late, [one for page in pages for one in page], metadata)
+    out = []
+    for path in (made, late):
+        export([path], "csv", path.with_suffix(".csv"))
+        findings = read(path).findings.model_dump(exclude={"log", "marks", "started"})
+        out.append((findings, replay([path]), path.with_suffix(".csv").read_bytes()))
+    assert out[0] == out[1]
+    assert out[0][0]["faults"]

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.logs.recover import RecoverError, recover

@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.operator import Change, Gains, Hold
-from aeroloop.protocol.transport.publication import Delivery
+from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.config import load
 from aeroloop.service.recording import rolling
 from tests.support.made_messages import SESSION, VEHICLE, Ends, description_of

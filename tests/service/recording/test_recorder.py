@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,21 +18,23 @@ from mcap.reader import make_reader
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, Status
-from aeroloop.protocol.messages.operator import Change
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.publication import CachedPublisher, attachment
+from aeroloop.protocol.transport import history
+from aeroloop.protocol.transport.history import SOON_S, CachedPublisher, attachment
+from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.config import load
-from aeroloop.service.logs.mcap_file import CHANGE_METADATA, DESCRIPTION_METADATA
+from aeroloop.service.logs.mcap_file import DESCRIPTION_METADATA
 from aeroloop.service.recording import backlog, rolling
-from aeroloop.service.recording.log_file import FRAME_ENCODING, TRACE_ENCODING
-from aeroloop.service.recording.recorder import MANY, SOON_S, WORK_EVERY_S, Recorder
+from aeroloop.service.recording.log_file import TRACE_ENCODING
+from aeroloop.service.recording.recorder import MANY, WORK_EVERY_S, Recorder
 from aeroloop.service.recording.rolling import RecorderError, parts
 from aeroloop.service.recording.subscriptions import Subscriptions
 from aeroloop.service.settings import RecorderSettings
 from tests.service.recording.conftest import CHANGES
+from tests.support.cable import Cable
 from tests.support.made_messages import Ends, description_of
-from tests.support.zenoh_network import Gathering, eventually
+from tests.support.zenoh_network import Gathering, eventually, free_port
 
 KEY = "aeroloop/aero/telemetry"
 ROOM = 50
@@ -46,12 +49,14 @@ class Running:
         error: What it ended with, if it did not end well.
     """
 
-    def __init__(self, path: Path, gathering: Gathering, **settings: object) -> None:
+    def __init__(
+        self, path: Path, gathering: Gathering, network: NetworkSettings | None = None, **settings: object
+    ) -> None:
         self.path = path
         self.full = False
         self.error: Exception | None = None
         self._write = os.pwrite
-        self.role = Role("recorder", "aero", gathering.settings, {})
+        self.role = Role("recorder", "aero", network or gathering.settings, {})
         options = {"chunk_s": 0.05, "decoded_hz": 0.0, **settings}
         self.recorder = Recorder(self.role, RecorderSettings.model_validate({"path": path, **options}))
         self._thread = threading.Thread(target=self._run)
@@ -75,15 +80,18 @@ class Running:
         if not self.role.zenoh.is_closed():
             self.role.__exit__(None, None, None)
 
-    def messages(self) -> list[tuple[str, bytes]]:
+    def messages(self) -> list[tuple[str, int, bytes]]:
+        """Key, number and payload, in the order of arrival."""
         found = []
         for path in parts(self.path):
             with path.open("rb") as file:
-                found += [(channel.topic, one.data) for _, channel, one in make_reader(file).iter_messages()]
+                read = make_reader(file).iter_messages(log_time_order=False)
+                found += [(channel.topic, one.sequence, one.data) for _, channel, one in read]
         return found
 
     def of(self, key: str) -> list[bytes]:
-        return [data for topic, data in self.messages() if topic == key]
+        """Payloads of one publisher, by its numbers."""
+        return [data for _, data in sorted((number, data) for topic, number, data in self.messages() if topic == key)]
 
     def numbers(self) -> list[int]:
         return [int.from_bytes(data, "big") for data in self.of(KEY)]
@@ -110,8 +118,8 @@ def record(tmp_path: Path, gathering: Gathering, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(rolling, "RETRY_S", 0.1)
     running: list[Running] = []
 
-    def start(**settings: object) -> Running:
-        running.append(Running(tmp_path / f"log{len(running)}.mcap", gathering, **settings))
+    def start(network: NetworkSettings | None = None, **settings: object) -> Running:
+        running.append(Running(tmp_path / f"log{len(running)}.mcap", gathering, network, **settings))
         monkeypatch.setattr(os, "pwrite", running[-1].write)
         return running[-1]
 
@@ -138,6 +146,15 @@ class Publisher:
 @pytest.fixture
 def publisher(gathering: Gathering) -> Publisher:
     return Publisher(gathering.join())
+
+
+SIZE = 1500
+"""Bytes of a message, as of a trace's batch."""
+
+
+def numbers(running: Running, key: str = KEY) -> list[int]:
+    """What a recorder recorded of large messages, in the order of arrival."""
+    return [number for topic, number, _ in running.messages() if topic == key]
 
 
 def statuses(gathering: Gathering) -> list[Status]:
@@ -181,9 +198,6 @@ def test_a_recorder_that_starts_late_or_again_records_all_that_was_published_and
         assert running.losses() == []
         with parts(running.path)[-1].open("rb") as file:
             metadata = [(one.name, one.metadata) for one in make_reader(file).iter_metadata()]
-        changes = [entry for name, entry in metadata if name == CHANGE_METADATA]
-        assert {entry["key"] for entry in changes} == {"aeroloop/aero/trace/controller"}
-        assert [Change.model_validate_json(entry["json"]) for entry in changes] == list(CHANGES.values())
         descriptions = {
             entry["key"]: entry["json"].encode() for name, entry in metadata if name == DESCRIPTION_METADATA
         }
@@ -223,31 +237,6 @@ def test_decoded_messages_bear_the_times_of_the_rows_and_raw_ones_their_publishe
     assert first is not None
     assert raw == list(enumerate(batches))
     assert times == [START_NS + k * 2_000_000 for k in range(100)]
-
-
-@pytest.mark.parametrize("frames", [False, True])
-def test_frames_are_recorded_only_if_that_is_configured(gathering: Gathering, record: Record, frames: bool) -> None:
-    running = record(frames=frames)
-    measurement = topics.key("measurement", "aero", session="s1")
-    declared = gathering.join().declare_publisher(measurement)
-    sent = 0
-
-    def recorded() -> bool:
-        nonlocal sent
-        declared.put(sent.to_bytes(7, "big"))
-        sent += 1
-        return running.recorder.log.written > 20 if frames else sent > 20
-
-    eventually("frames", recorded)
-    running.end()
-    found = running.of(measurement)
-    assert bool(found) == frames
-    if frames:
-        assert found == sorted(found)
-        with running.path.open("rb") as file:
-            summary = make_reader(file).get_summary()
-        assert summary is not None
-        assert {c.message_encoding for c in summary.channels.values() if c.topic == measurement} == {FRAME_ENCODING}
 
 
 def test_a_burst_that_is_published_as_recording_ends_is_recorded_to_the_last_message(
@@ -295,27 +284,80 @@ def test_the_next_messages_are_taken_soon_while_many_come_or_caches_are_queried_
     eventually("quiet", lambda: waits.asked[-1] == WORK_EVERY_S)
 
 
-def test_what_a_role_publishes_before_it_answers_is_awaited_at_the_end(record: Record, publisher: Publisher) -> None:
-    """As a link keeps the order, the answer to a last question follows what was on its way."""
-    running, key = record(), topics.key("description", "aero", role="plant")
-    publisher.send(1)
-    eventually("the first", lambda: running.recorder.log.written > 2)
+def test_a_recorder_that_ends_takes_what_caches_still_hold(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends as soon as its cable is back and a new message has come: 2.5 MB were published meanwhile."""
+    monkeypatch.setattr(backlog, "MOST_MESSAGES", 200_000)
+    port, count = free_port(), 1700
+    far = gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1))
+    published = CachedPublisher(far, KEY, per_s=1000)
+    with Cable(port) as cable:
+        alone = NetworkSettings(rendezvous=[], listen=[], gossip=False, connect=[cable.endpoint])
+        running = record(network=alone)
+        published.put(bytes(SIZE))
+        eventually("the first", lambda: running.recorder.log.written > 2)
+        cable.cut()
+        for _ in range(count):
+            published.put(bytes(SIZE))
+        before = running.recorder.log.written
+        cable.mend()
 
-    def answer(query: zenoh.Query) -> None:
-        publisher.send(100)
-        query.reply(key, b"{}")
+        def received() -> bool:
+            published.put(bytes(SIZE))
+            return running.recorder.log.written > before + 5
 
-    publisher.session.declare_queryable(key, answer, complete=True)
-    eventually("the queryable", lambda: running.role.zenoh.declare_querier(key).matching_status.matching)  # type: ignore[attr-defined]
+        eventually("a new one", received)
+        running.end()
+    found = numbers(running)
+    assert len(found) == len(set(found)) > count
+    assert sorted(found) == list(range(max(found) + 1))
+    assert running.losses() == []
+
+
+def test_a_recorder_that_comes_again_begins_with_what_its_older_file_lacks(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The publisher ends soon after: what it published last is there."""
+    monkeypatch.setattr(backlog, "MOST_MESSAGES", 200_000)
+    session = gathering.join()
+    published = CachedPublisher(session, KEY, per_s=1000)
+    for _ in range(2000):
+        published.put(bytes(SIZE))
+    running = record()
+    eventually("some", lambda: running.recorder.log.written > 200)
+    published.put(bytes(SIZE))
+    eventually("the newest", lambda: running.recorder.log.written > 300)
+    session.close()
     running.end()
-    assert running.numbers() == list(range(100))
+    found = numbers(running)
+    assert set(range(1850, 2001)) <= set(found)
+    assert [loss for loss in running.losses() if loss[0] == KEY] in ([], [(KEY, 2001 - len(found), "gone")])
+
+
+def test_a_recorder_that_ends_names_the_traces_that_it_cannot_reach(
+    gathering: Gathering, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It cannot know whether their publishers have ended or its cable is out."""
+    monkeypatch.setattr(history, "ANSWER_S", 0.1)
+    session, key = gathering.join(), topics.key("trace", "aero", role="plant")
+    published, running = CachedPublisher(session, key, per_s=10), record()
+    published.put(b"")
+    eventually("the first", lambda: running.recorder.log.written > 2)
+    session.close()
+    time.sleep(1.0)
+    running.end()
+    said = f"nothing of {key} was received for 1 s: what it has published since is not in the log"
+    *_, last = running.of("aeroloop/aero/status/recorder")
+    assert Status.model_validate_json(last).notes == [said]
+    assert said in str(running.of("aeroloop/aero/event/recorder")[-1])
 
 
 def test_the_last_message_in_a_log_is_that_recording_stopped(record: Record, publisher: Publisher) -> None:
     running = record()
     publisher.send(2)
     running.end()
-    key, said = running.messages()[-1]
+    key, _, said = running.messages()[-1]
     assert key == "aeroloop/aero/status/recorder"
     assert Status.model_validate_json(said).state == "stopped"
     assert Status.model_validate_json(said).received == len(running.messages()) - 1
@@ -333,7 +375,7 @@ def test_what_is_no_description_or_no_batch_is_recorded_as_it_is_and_stops_nothi
     eventually("all", lambda: running.recorder.log.written >= len(names) + 2)
     running.end()
     assert running.error is None
-    recorded = {key for key, data in running.messages() if data == b"\xff\x00"}
+    recorded = {key for key, _, data in running.messages() if data == b"\xff\x00"}
     assert recorded == set(names)
 
 
@@ -357,7 +399,9 @@ def test_a_full_disk_is_reported_and_what_finds_no_room_in_memory_is_counted_in_
     running.full = False
     eventually(
         "its word",
-        lambda: reported[-1].state == "recording" and any("lost: disk" in note for note in reported[-1].notes),
+        lambda: (
+            reported[-1].state == "recording" and any("could not be written" in note for note in reported[-1].notes)
+        ),
     )
     publisher.send(510)
     running.end()
@@ -368,6 +412,8 @@ def test_a_full_disk_is_reported_and_what_finds_no_room_in_memory_is_counted_in_
     assert lost == 510 - len(numbers)
     assert 502 - ROOM < lost + 3 <= 502
     assert {reason for _, _, reason in running.losses()} == {"disk"}
+    total = sum(count for _, count, _ in running.losses())
+    eventually("the count in its status", lambda: reported[-1].lost == total)
     assert running.error is None
 
 
@@ -380,7 +426,11 @@ def test_a_loss_that_is_found_as_recording_ends_is_in_the_log(gathering: Gatheri
         declared.put(number.to_bytes(4, "big"), attachment=attachment(START_NS, 4711, number))
     running.end()
     assert running.numbers() == [0, 1, 2, 3, 1000]
-    assert running.losses() == [(KEY, 996, "network")]
+    assert running.losses() == [(KEY, 996, "gone")]
+    *_, said = running.of("aeroloop/aero/event/recorder")
+    assert f"996 messages of {KEY} are not in the log: not received, and their publisher does not answer" in str(said)
+    *_, last = running.of("aeroloop/aero/status/recorder")
+    assert Status.model_validate_json(last).notes[0].startswith("996 messages lost: not received")
 
 
 # The end, with a disk that refuses

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 
 import numpy as np
@@ -148,10 +149,17 @@ def status(session: str | None, uptime_s: float, changed: int, end_tick: int | N
     )
 
 
+def statuses_in_some_order(statuses: tuple[Status, ...]) -> list[tuple[int, Status]]:
+    """Statuses with their times of publication, as a recorder writes them that recovers some of them late."""
+    published = list(enumerate(statuses))
+    random.Random(len(statuses)).shuffle(published)
+    return published
+
+
 def intervals(*statuses: Status, first: int = 100, ticks: int = 50) -> list[FaultInterval]:
     log = FaultLog("s", 0.1)
-    for one in statuses:
-        log.status(one)
+    for at_ns, one in statuses_in_some_order(statuses):
+        log.status(one, at_ns)
     k = np.arange(ticks)
     log.take(Block(("aero", "s"), k, {}, {"tick": first + k, "session_tick": k}, k, k, k, [], None))
     return log.intervals()

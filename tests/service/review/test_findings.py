@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,16 @@ import numpy as np
 import pytest
 
 from aeroloop.protocol.messages.models import Event, Loss
-from aeroloop.protocol.messages.trace import Outcome, Received
+from aeroloop.protocol.messages.trace import Outcome, Received, read_header
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
+from aeroloop.service.logs.export import export
 from aeroloop.service.review.report import Check, Findings, Mark, Spread
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report, review
 from aeroloop.service.terminal.log_tables import sparkline
 from tests.support.edited_log import Said, edited, message_of, rewrite
-from tests.support.made_log import AN_OPERATORS_WORDS, START_NS, make_log
+from tests.support.made_log import AHEAD_NS, AN_OPERATORS_WORDS, START_NS, lockstep, make_log
 
 TICKS = 500
 
@@ -57,37 +59,88 @@ def test_what_an_operator_changed_is_a_mark_at_its_tick(tmp_path: Path) -> None:
     assert "sinusoid" in marks[3][1]
 
 
-def test_events_are_marks_at_their_ticks_or_where_the_trace_was_when_they_were_recorded(
-    whole: Path, tmp_path: Path
+def event(at_s: float, role: str, kind: str, text: str, session: str | None = "s1", tick: int | None = None) -> Said:
+    """An event, published so long after the session began by its role's own clock, and recorded at once."""
+    message = Event.model_validate({"role": role, "kind": kind, "text": text, "session": session, "tick": tick})
+    at_ns = START_NS + round(at_s * 1e9)
+    published_ns = at_ns + (AHEAD_NS if role == "controller" else 0)
+    return message_of("event", message, published_ns)._replace(recorded_ns=at_ns)
+
+
+HAPPENED = [
+    event(-7.0, "plant", "started", "waits", session=None),
+    event(-0.2, "controller", "started", "looks for it", session=None),
+    event(-0.1, "controller", "claimed", "has it"),
+    event(0.21, "recorder", "changed", "the next file", session=None),
+    event(0.52, "controller", "fault", "16 ticks missed", session=None),
+    event(0.59, "controller", "fault", "5 ticks missed", tick=255),
+    event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event/controller"),
+    event(1.1, "plant", "tripped", "tilted", tick=499),
+    event(1.3, "plant", "released", "at its end"),
+    event(60.0, "plant", "stopped", "at 0 V", session=None),
+]
+SHOWN = [
+    (None, "plant", "started", "waits"),
+    (None, "controller", "started", "looks for it"),
+    (0.0, "controller", "claimed", "has it"),
+    (0.21, "recorder", "changed", "the next file"),
+    (0.51, "controller", "fault", "5 ticks missed"),
+    (0.52, "controller", "fault", "16 ticks missed"),
+    (0.998, "plant", "tripped", "tilted"),
+    (0.998, "plant", "released", "at its end"),
+    (None, "plant", "stopped", "at 0 V"),
+]
+
+
+@pytest.mark.parametrize("recorded", ["at once", "after the session", "in any order"])
+def test_events_are_shown_at_their_sender_s_time_wherever_they_stand_in_the_file(
+    whole: Path, tmp_path: Path, recorded: str
 ) -> None:
-    """A batch is some 50 ticks here, recorded with its last row; the clocks of both ends differ by 10 s."""
+    """The clocks of both ends differ by 10 s; a recorder writes late what it recovers from a cache."""
+    chance = random.Random(1)
 
-    def event(
-        at_s: float, role: str, kind: str, text: str, session: str | None = "s1", tick: int | None = None
-    ) -> Said:
-        message = Event.model_validate({"role": role, "kind": kind, "text": text, "session": session, "tick": tick})
-        return message_of("event", message, START_NS + round(at_s * 1e9))
+    def place(one: Said) -> Said:
+        if recorded == "at once":
+            return one
+        at_s = 99.0 if recorded == "after the session" else chance.uniform(-10, 70)
+        return one._replace(recorded_ns=START_NS + round(at_s * 1e9))
 
-    more = [
-        event(1.1, "plant", "tripped", "tilted", tick=499),
-        event(-0.3, "controller", "claimed", "has it"),
-        event(-7.0, "plant", "started", "waits", session=None),
-        event(60.0, "plant", "stopped", "at 0 V", session=None),
-        event(0.52, "controller", "fault", "16 ticks missed", session=None),
-        event(0.53, "controller", "fault", "5 ticks missed", tick=260),
-        event(0.6, "controller", "fault", "of another vehicle")._replace(key="aeroloop/other/event/controller"),
-    ]
-    findings = found(rewrite(whole, tmp_path / "a.mcap", more=more))
+    findings = found(rewrite(whole, tmp_path / "a.mcap", more=[place(one) for one in HAPPENED]))
     marks = [mark for mark in findings.marks if mark.kind != "change"]
-    assert [(mark.time_s, mark.role, mark.kind, mark.text) for mark in marks] == [
-        (None, "plant", "started", "waits"),
-        (0.0, "controller", "claimed", "has it"),
-        (0.508, "controller", "fault", "16 ticks missed"),
-        (0.52, "controller", "fault", "5 ticks missed"),
-        (0.998, "plant", "tripped", "tilted"),
-        (None, "plant", "stopped", "at 0 V"),
-    ]
+    assert [(mark.time_s and round(mark.time_s, 3), mark.role, mark.kind, mark.text) for mark in marks] == SHOWN
     assert findings.trips == ["tilted"]
+
+
+def test_in_lockstep_an_event_is_shown_at_the_tick_that_ran_when_it_was_published(tmp_path: Path) -> None:
+    """A session in lockstep runs faster or slower than any clock; this one takes ten times as long as its ticks say."""
+
+    def slower(one: Said) -> Said:
+        if one.topic != "trace" or (header := read_header(one.data)) is None:
+            return one
+        at = 40  # of `wall_ns` in the header
+        wall_ns = header.wall_ns + 9 * (one.at_ns - START_NS)
+        return one._replace(data=one.data[:at] + wall_ns.to_bytes(8, "little") + one.data[at + 8 :])
+
+    make_log(tmp_path / "a.mcap", TICKS, settings=lockstep())
+    more = [event(5.0, "plant", "fault", "halfway", session=None)]
+    marks = found(rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", slower, more)).marks
+    (mark,) = (mark for mark in marks if mark.kind == "fault")
+    assert mark.time_s == pytest.approx(0.5, abs=0.06)
+
+
+def test_what_happened_hours_before_the_session_takes_a_few_lines_after_the_figures(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A recorder that is restarted begins with what caches still hold, such as the events of hours."""
+    kinds = ("refused", "armed")
+    more = [event(i - 4000.0, "plant", kind, f"{kind} {i}", session="s0") for i in range(15) for kind in kinds]
+    assert execute(["log", "review", str(rewrite(whole, tmp_path / "a.mcap", more=more))]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("no trip, failure, loss or refusal since the session began")
+    assert "26 events: 13 refused, 13 armed" in " ".join(out.split())
+    before = [words[3:] for line in out.splitlines() if (words := line.split())[:2] == ["before", "plant"]]
+    assert before == [[kind, str(i)] for i in (13, 14) for kind in kinds]
+    assert out.index("duration") < out.index("before")
 
 
 def test_what_a_restarted_recorder_received_again_counts_once(whole: Path, tmp_path: Path) -> None:
@@ -122,7 +175,7 @@ def test_what_went_otherwise_is_counted_by_kind(whole: Path, tmp_path: Path) -> 
 def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, tmp_path: Path) -> None:
     def loss(key: str, count: int, at_s: float) -> Said:
         at = START_NS + round(at_s * 1e9)
-        return message_of("loss", Loss(key=key, count=count, reason="queue"), at)
+        return message_of("loss", Loss(key=key, count=count, reason="disk"), at)
 
     more = [
         loss("aeroloop/aero/s1/measurement", 3, 0.21),
@@ -133,10 +186,29 @@ def test_what_the_recorder_has_lost_is_counted_by_topic_and_marked(whole: Path, 
     assert findings.losses == {"measurement": 7, "event": 1}
     marks = [(mark.time_s, mark.role, mark.text[:17]) for mark in findings.marks if mark.kind == "lost"]
     assert marks == [
-        (0.202, "recorder", "3 of measurement "),
-        (0.406, "recorder", "4 of measurement "),
-        (0.508, "recorder", "1 of event lost: "),
+        (0.21, "recorder", "3 of measurement "),
+        (0.41, "recorder", "4 of measurement "),
+        (0.51, "recorder", "1 of event lost: "),
     ]
+
+
+def test_what_a_recorder_writes_late_is_judged_all_the_same(tmp_path: Path) -> None:
+    """Of an outage, the first half of the session is recovered after the second was recorded, traces last."""
+
+    def late(one: Said) -> Said:
+        if one.at_ns >= START_NS + TICKS * 1_000_000:
+            return one
+        return one._replace(recorded_ns=one.at_ns + (11 if one.topic == "trace" else 10) * 10**9)
+
+    settings = load(overrides=['plant.faults=["command:drop=0.3@0.2..0.6"]'])
+    make_log(tmp_path / "a.mcap", TICKS, settings=settings, truth_every=5)
+    rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", late)
+    in_order, later = (found(tmp_path / name).model_copy(update={"log": None}) for name in ("a.mcap", "b.mcap"))
+    assert later == in_order
+    assert later.theorem is not None
+    assert later.theorem.samples == TICKS / 5
+    tables = [Path(export([tmp_path / name], "csv", tmp_path / f"{name}.csv").out) for name in ("a.mcap", "b.mcap")]
+    assert tables[0].read_text() == tables[1].read_text()
 
 
 def test_a_storm_of_events_is_shown_in_a_bounded_number_of_marks(whole: Path, tmp_path: Path) -> None:
@@ -216,8 +288,8 @@ KEYS = {
     "duration_s", "z_track", "u_total", "max_error_deg", "final_error_deg", "measurement", "command", "skipped_ticks",
     "latency_us", "log", "trips", "damages", "reasons", "vehicle", "session", "sessions", "started", "timing", "age_us",
     "gaps", "gap_count", "saturated", "invalid", "losses", "lapses", "marks", "theorem", "checks", "missing_ticks",
-    "missing", "frames", "clock_offset_us", "faults", "recorded", "disagreements", "second_half_error_deg",
-    "command_changes_per_s",
+    "missing", "unseen", "clock_offset_us", "faults", "recorded", "disagreements", "second_half_error_deg",
+    "command_changes_per_s", "unknown",
 }  # fmt: skip
 THEOREM_KEYS = {
     "verdict", "holds", "held", "radius", "pointwise_radius", "pointwise_deg", "mean_square_share", "mean_square_at_s",
@@ -267,7 +339,7 @@ def test_the_account_lists_timing_gaps_what_happened_and_what_does_not_hold(
     out = " ".join(capsys.readouterr().out.split())
     assert "gaps 1, the longest 3 ticks at 0.100 s" in out
     assert "latency 298 298 298 300 µs" in out
-    assert out.startswith("0.406 s plant tripped the [red] limit 0.4")
-    assert "plant refused no 0 refused (and 14 more like it, the last: 0.406 s)" in out
+    assert out.startswith("0.410 s plant tripped the [red] limit 0.500 s")
+    assert "plant refused no 0 refused (and 14 more like it, the last: 0.500 s)" in out
     assert "… and 4 more such events" in out  # beside what the session began with
     assert "✗ gaps ≤ 0 1" in out

@@ -22,7 +22,7 @@ from aeroloop.service.logs.runs import Run
 from aeroloop.service.review.compare import Comparison, read_runs
 from aeroloop.service.review.review import read, report, review
 from tests.support.edited_log import message_of, rewrite
-from tests.support.made_log import START_NS, VEHICLE, Logged, description, lockstep, made, write
+from tests.support.made_log import AHEAD_NS, START_NS, VEHICLE, Logged, description, lockstep, made, write
 
 HOUR_NS = 3_600_000_000_000
 OTHER = "beta"
@@ -104,7 +104,8 @@ def test_the_account_lists_vehicles_and_sessions_and_which_is_shown(
     page = tmp_path / "page.html"
     assert execute(["log", "review", str(log), "--session", "2", "--html", str(page)]) == 0
     out = " ".join(capfd.readouterr().out.split())
-    assert out.startswith("before plant tripped trip of s1 0.100 s plant tripped trip of s2 duration")
+    assert out.startswith("0.100 s plant tripped trip of s2 duration")
+    assert out.index("duration") < out.index("before plant tripped trip of s1")
     assert "session s2 of aero" in out
     assert "vehicles aero, beta; shown is aero, --vehicle shows another" in out
     assert "sessions 1 s1, 0.4 s 2 s2, 0.2 s, shown --session N shows another of 2" in out
@@ -211,18 +212,18 @@ def test_the_latency_is_that_of_the_session(tmp_path: Path) -> None:
 # What is said
 
 
-def test_events_that_matter_come_first_and_the_certificate_once(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_events_that_matter_come_first(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     settings = load()
     path = write(tmp_path / "a.mcap", settings, made(settings, 300, {20: (Gains(C2=(0.2, 0.2, 0.2)), None)}))
-    verdict = read(path).session.observer.check.findings()[0].verdict
-    happened = [("controller", "started", verdict.rstrip(".")), ("controller", "changed", verdict.rstrip("."))]
-    happened += [("plant", "armed", f"armed {i}") for i in range(30)]
+    happened = [("plant", "armed", f"armed {i}") for i in range(30)]
     happened += [("controller", "fault", f"{i} ticks missed") for i in range(5)]
     happened += [("plant", "tripped", f"no command for {i} ms: 0 V") for i in (100, 101)]
     more = [
-        message_of("event", Event.model_validate({"role": role, "kind": kind, "text": text}), START_NS + 4 * 10**8 + i)
+        message_of(
+            "event",
+            Event.model_validate({"role": role, "kind": kind, "text": text}),
+            START_NS + (AHEAD_NS if role == "controller" else 0) + 4 * 10**8 + i,
+        )
         for i, (role, kind, text) in enumerate(happened)
     ]
     assert execute(["log", "review", str(rewrite(path, tmp_path / "b.mcap", more=more))]) == 0
@@ -230,7 +231,6 @@ def test_events_that_matter_come_first_and_the_certificate_once(
     assert out.index("no command for 101 ms") < out.index("duration") < out.index("armed 0")
     assert "0 ticks missed (and 4 more like it" in out
     assert "no command for 100 ms: 0 V" in out
-    assert out.count(verdict[:60]) == 1
 
 
 def test_messages_of_strangers_cost_nothing_but_themselves(tmp_path: Path) -> None:

@@ -169,9 +169,12 @@ def test_what_comes_after_an_operators_change_is_not_judged(tmp_path: Path) -> N
     assert broken(theorem) == {}
 
 
-def test_a_log_that_lacks_what_its_session_began_with_is_judged_until_the_first_change_all_the_same() -> None:
+def test_a_session_is_judged_from_the_end_of_the_approach_in_force_until_the_next_change() -> None:
     operators = Change(session=SESSION, tick=120, gains=Gains(C1=(5.0, 5.0, 5.0)))
-    assert trial(operators).findings()[0].until_s == 0.24
+    gains = Change(session=SESSION, tick=7, gains=Gains(C1=(0.3, 0.3, 0.3)))
+    reference = Change(session=SESSION, tick=40, reference=Hold(), within_s=0.1, here=((0.0, 0.0, 0.0),) * 3)
+    found = trial(gains, reference, operators).findings()[0]
+    assert (found.since_s, found.until_s) == (0.18, 0.24)
     first = Change(session=SESSION, tick=0, gains=Gains(C1=(0.3, 0.3, 0.3)), reference=Hold())
     assert trial(first, operators).findings()[0].until_s == 0.24
     assert trial(first).findings()[0].until_s is None

@@ -55,7 +55,7 @@ def test_a_file_cut_off_anywhere_keeps_its_whole_lines_and_takes_the_others_agai
     assert path.read_bytes() == complete
 
 
-@pytest.mark.parametrize("text", ["hello", "hello\n", '{"seed": 0}\n', '{"aeroloop": "attack"}\n'])
+@pytest.mark.parametrize("text", ["hello", "hello\n", '{"seed": 0}\n', '{"aeroloop": "diary"}\n'])
 def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.jsonl"
     path.write_text(text)

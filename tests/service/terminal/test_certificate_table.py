@@ -44,12 +44,3 @@ def test_all_terms_are_there_with_their_equations_and_no_word_is_broken(monkeypa
     for term in found.terms:
         for word in f"{term.meaning} ({term.equation})".split():
             assert word in words, word
-
-
-def test_a_remedy_can_be_copied_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = certificate("law.C2=[0.01, 0.01, 0.01]")
-    assert not found.holds
-    shown = lines(found, monkeypatch, verbose=False, width=40)
-    for remedy in found.remedies:
-        if remedy.overrides:
-            assert "    " + " ".join(f"--set {change!r}" for change in remedy.overrides) in shown

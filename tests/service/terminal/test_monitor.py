@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from io import StringIO
 
-import pytest
 from rich.console import Console
 
 from aeroloop.protocol.messages.models import (
@@ -20,8 +18,7 @@ from aeroloop.protocol.messages.models import (
 from aeroloop.protocol.messages.operator import Message
 from aeroloop.service.config import load
 from aeroloop.service.host.health import SILENT_S
-from aeroloop.service.terminal.monitor import Footer, Top
-from tests.support.zenoh_network import eventually
+from aeroloop.service.terminal.monitor import Top
 
 
 def text(top: Top, width: int = 200) -> str:
@@ -172,40 +169,6 @@ def test_sixty_columns_hold_every_figure_and_the_whole_cause() -> None:
     for word in ("12345/67890", "1234567", "99 d", "tripped"):
         assert word in shown
     assert cause in " ".join(shown.split())
-
-
-class Plants:
-    """Plants that a footer stops; `stopped` is set when it has."""
-
-    def __init__(self) -> None:
-        self.stopped = threading.Event()
-
-    def stop(self) -> tuple[list[str], list[str]]:
-        """Their answers."""
-        self.stopped.set()
-        return ["aero is at 0 V"], []
-
-
-@pytest.mark.parametrize("keys", ["y", "sn", "snyy", "s\n", "sq"])
-def test_nothing_is_stopped_without_s_and_then_y(keys: str) -> None:
-    footer = Footer(Plants().stop, "aero")
-    assert not any(footer.press(key) for key in keys)
-    message, hint = footer.draw().plain.split("\n")
-    assert message == "" != hint
-
-
-def test_s_and_y_stop_and_say_what_was_answered() -> None:
-    plants = Plants()
-    footer = Footer(plants.stop, "aero")
-    assert not footer.press("s")
-    assert "stop aero? y" in footer.draw().plain
-    assert not footer.press("y")
-    eventually("the answer", lambda: "aero is at 0 V" in footer.draw().plain)
-    assert plants.stopped.is_set()
-
-
-def test_q_quits() -> None:
-    assert Footer(Plants().stop, "aero").press("q")
 
 
 def test_what_is_not_understood_is_left_out() -> None:

@@ -11,7 +11,7 @@ import pytest
 from aeroloop import ExpressionLaw, LawSettings
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.theorem.any_law import OwnCertificate, certify_any
+from aeroloop.service.theorem.any_law import OwnCertificate, certify_any, described_certificate
 from aeroloop.service.theorem.certificate import certify
 from aeroloop.service.theorem.configured import NoTheoremError
 
@@ -87,3 +87,9 @@ def test_an_own_certificate_keeps_what_the_law_says() -> None:
     found = certify_any(load(overrides=[f"law.kind={HERE}:Silent"]))
     assert isinstance(found, OwnCertificate)
     assert found.model_extra == {"decay_rate": 0.5}
+
+
+def test_a_description_carries_what_certify_prints_or_nothing() -> None:
+    assert described_certificate(load()) == certify(load()).model_dump(mode="json")
+    for without in ("reference.kind=stream", "law.kind=pd"):
+        assert described_certificate(load(overrides=[without])) is None

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.protocol.wire.attitude import R, S
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.wire.rotations import R, S
 from aeroloop.service.config import Settings, load_over
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings, Equations, equations
-from aeroloop.service.control.reference import Floats, Plan
+from aeroloop.service.control.reference import Angles, Floats, Plan
 from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import evaluate, premises
 from aeroloop.service.theorem.extremes import body_rates, extremes, vectors
@@ -29,7 +30,7 @@ ANISOTROPIC = load_over(
 
 
 def of(settings: Settings, age: float = 0.0) -> Premises:
-    return premises(settings, extremes(settings.reference), PlantBounds(age=age))
+    return premises(settings, extremes(settings), PlantBounds(age=age))
 
 
 class Found(NamedTuple):
@@ -56,7 +57,7 @@ def worst(settings: Settings, start: float, count: int, seed: int) -> Found:
     inputs += [built.C1, built.C2, built.Gamma]
     command = ca.Function("command", inputs, [built.u, built.theta_dot])
     Psi = ca.Function("psi", [built.q, built.omega], [_psi(law, built)])
-    desired = Plan.of(settings.reference).samples()
+    desired = Angles(*(part[0] for part in Plan.of(settings.reference).at(np.linspace(0, 40, 513)[None])))
     b, b_dot = body_rates(desired)
     eps_d = vectors(desired)
     kappa1 = 1 / (1 + C1 * C2)
@@ -110,6 +111,22 @@ def test_no_state_within_the_set_is_disturbed_by_more_than_its_bounds(settings: 
         found = worst(load_over(settings, wire), start, 400, bits)
         assert 0.2 < found.d1 <= 1
         assert 0.3 < found.d2 <= 1
+
+
+@pytest.mark.parametrize(
+    ("C1", "C2"), [((0.3, 0.3, 0.3), (0.15, 0.15, 0.15)), ((3.0, 0.3, 3.0), (1.0, 1.0, 1.0)), ((1, 1, 1), (0.1, 1, 1))]
+)
+def test_an_error_of_the_attitude_moves_the_command_by_no_more_than_the_bound(C1: Vector, C2: Vector) -> None:
+    """Along the reference, an error d of the attitude alone: (I + C₁C₂) d + 2 C₂ d × R ω_d."""
+    names = ("k_theta", "k_theta_hat", "weight", "delta_omega", "delta_u", "k_tau_d", "age", "k_omega_d_dot")
+    nothing: dict[str, Any] = dict.fromkeys(names, 0.0)
+    p = replace(of(PAPER), C1=C1, C2=C2, J=(0.001,) * 3, k_omega_d=1.0, axis_rate=1.0, **nothing)
+    at = reach(replace(p, k_omega_d_ddot=0.0, delta_q=lambda _: 1e-5))
+    assert at is not None
+    d, omega_d = np.random.default_rng(4).standard_normal((2, 100_000, 3))
+    d, omega_d = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (d, omega_d))
+    moved = (1 + np.array(C1) * C2) * d + 2 * np.array(C2) * np.cross(d, omega_d)
+    assert 0.7 < np.linalg.norm(moved, axis=1).max() * 1e-5 / at.fast <= 1
 
 
 def test_half_of_the_bounds_is_exceeded() -> None:
@@ -238,7 +255,7 @@ GENTLE = load_over(
 def test_no_state_of_a_body_with_a_held_roll_is_disturbed_by_more_than_its_bounds() -> None:
     """The Aero's own equations, pitch and yaw near the reference; derivatives by differences over a microsecond."""
     law = with_theorem(GENTLE).law
-    p = replace(of(GENTLE), tilt=extremes(GENTLE.reference).tilt)
+    p = replace(of(GENTLE), tilt=extremes(GENTLE).tilt)
     at = reach(p, 0.02)
     assert at is not None
     C1, C2, J = (np.array(v) for v in (law.C1, law.C2, law.inertia))

@@ -174,7 +174,6 @@ def test_v_falls_as_fast_as_the_theorem_says() -> None:
     b = evaluate(settings, disturbance=disturbance, attitude_error_deg=degrees(ERROR))
     t = b.theorem
     assert t.k is not None
-    assert t.radius is not None
     x, omega_d_dot = random_samples(wire, b, seed=5)
     rng = np.random.default_rng(5)
     body, voltage = body_of(LAW), wire.voltage.quantizer()
@@ -200,7 +199,7 @@ def test_v_falls_as_fast_as_the_theorem_says() -> None:
     margin = -t.k * z**2 + t.delta_Qdist - V_dot
     assert margin.min() >= 0
     assert (V_dot > 0).any()  # a law whose V always fell would need no theorem
-    assert np.all(V_dot[z > t.radius] < 0)
+    assert np.all(V_dot[z > sqrt(t.delta_Qdist / t.k)] < 0)
 
 
 def _within(radius: float, rng: np.random.Generator) -> Floats:

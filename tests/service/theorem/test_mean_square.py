@@ -11,10 +11,11 @@ import pytest
 
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
 from aeroloop.service.config import Settings, load
-from aeroloop.service.control.laws.adaptive import equations
-from aeroloop.service.control.reference import Floats, Plan
+from aeroloop.service.control.laws.adaptive import equations, projection
+from aeroloop.service.control.reference import Angles, Floats, Plan
 from aeroloop.service.theorem.configured import with_theorem
 from aeroloop.service.theorem.evaluation import Evaluated, evaluate
+from aeroloop.service.theorem.invariant import stale_power
 from aeroloop.service.theorem.lemma import coordinates
 from aeroloop.service.theorem.mean_square import decay, mechanism_torque
 
@@ -33,7 +34,7 @@ def shares(settings: Settings, size: float, count: int) -> list[float]:
     built = equations(law)
     inputs = [built.q, built.omega, built.q_d, built.omega_d, built.omega_d_dot, built.theta, built.s]
     command = ca.Function("command", [*inputs, built.C1, built.C2], [built.u])
-    angles = Plan.of(settings.reference).samples()
+    angles = Angles(*(part[0] for part in Plan.of(settings.reference).at(np.linspace(0, 40, 513)[None])))
     p = evaluate(settings).plant
     C1, J = np.array(law.C1), np.array(law.inertia)
     found = []
@@ -134,3 +135,22 @@ def test_v_falls_more_slowly_with_all_that_disturbs(worse: str) -> None:
     assert larger is not None
     assert larger.delta > before.delta
     assert decay(of("plant.ideal=false"), 0.1) is None  # the rotors lag by more than any bound of V takes
+
+
+def test_no_step_of_the_estimate_takes_more_from_v_than_its_power_has_it() -> None:
+    """Γ that differs by axis: the clip back to the ball is at its nearest point, not at the nearest in θ̃ᵀΓ⁻¹θ̃."""
+    p = replace(evaluate(load(overrides=["law.Gamma=[0.02, 0.2, 2]", "law.damping_bound=0.0119"])).plant, age=0.002)
+    rng, count, push = np.random.default_rng(3), 20_000, 0.1  # push: ‖Φ z₂‖
+    tau, theta = ca.SX.sym("tau", 3), ca.SX.sym("theta", 3)
+    gamma = np.array(p.Gamma)
+    step = ca.Function("step", [tau, theta], [projection(tau, theta, ca.diag(gamma), p.k_theta)]).map(count)
+    true, estimate, pushed = (
+        v / np.linalg.norm(v, axis=1, keepdims=True) * size
+        for v, size in zip(rng.standard_normal((3, count, 3)), (p.k_theta, p.k_theta_hat, push), strict=True)
+    )
+    after = estimate + p.age * np.array(step((gamma * pushed).T, estimate.T)).T
+    after *= np.minimum(1, p.k_theta_hat / np.linalg.norm(after, axis=1, keepdims=True))
+    grown = (((true - after) ** 2 - (true - estimate) ** 2) / gamma).sum(axis=1) / 2
+    taken = float((grown / p.age + ((true - estimate) * pushed).sum(axis=1)).max())
+    assert 2 * p.age / 2 * gamma.max() * push**2 < taken  # more than the step's square, which was all that counted
+    assert taken <= stale_power(p, z2_dot=0, omega_dot=0, omega=1, z2=push, delta_z2=0)

@@ -9,9 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.hosts.quanser.fake import BufferOverflowMode, FakeHIL, FakeQuanser, HILError, MisuseError
-from aeroloop.plant_emulator.model.sensors import SensorSettings
-from aeroloop.plant_emulator.settings import PlantSettings
+from tests.support.fake_quanser import BufferOverflowMode, FakeHIL, FakeQuanser, HILError, MisuseError
 from tests.support.quanser_board import AERO, OFF, PERIOD, VOLTS, WATCHDOG, drive, plant_on_board
 
 CH = np.array([0, 1], dtype=np.uint32)
@@ -20,13 +18,12 @@ ZERO = np.zeros(2)
 COUNTS = np.zeros(2, dtype=np.int32)
 LINES = np.ones(2, dtype=np.int8)
 UNLIMITED = 2**32 - 1
-OVERWRITE = BufferOverflowMode.OVERWRITE_ON_OVERFLOW
 BOARD = FakeQuanser(AERO, PERIOD)
 """To be misused: its Aero is never moved, and building one takes a tenth of a second."""
 
 
 def handle_of(board: FakeQuanser) -> FakeHIL:
-    return cast(FakeHIL, board.HIL())
+    return board.HIL()
 
 
 def opened(board: FakeQuanser = BOARD) -> FakeHIL:
@@ -44,8 +41,8 @@ def armed() -> FakeHIL:
     return handle
 
 
-def reader(handle: FakeHIL, samples: int = 1) -> object:
-    return handle.task_create_reader(samples, None, 0, JOINTS, 2, None, 0, None, 0)
+def reader(handle: FakeHIL) -> object:
+    return handle.task_create_reader(1, None, 0, JOINTS, 2, None, 0, None, 0)
 
 
 def started() -> FakeHIL:
@@ -84,7 +81,6 @@ def read_only() -> np.ndarray[tuple[int], np.dtype[np.int32]]:
         (opened, lambda h: h.read(None, 0, JOINTS, 2, None, 0, None, 0, None, COUNTS.astype(np.int64), None, None)),
         (opened, lambda h: h.read(CH, 2, JOINTS, 2, None, 0, None, 0, ZERO, COUNTS, None, None)),
         (opened, lambda h: h.open("quanser_aero2_usb", "0")),
-        (opened, lambda h: reader(h, 0)),
         (opened, lambda h: h.task_create_reader(1, None, 0, JOINTS, 2, None, 0, np.array([3003], np.uint32), 1)),
         (opened, lambda h: h.task_read(reader(h), 1, None, COUNTS, None, None)),
         (opened, lambda h: h.task_stop(reader(h))),
@@ -102,7 +98,7 @@ def read_only() -> np.ndarray[tuple[int], np.dtype[np.int32]]:
         (started, lambda h: h.task_read(BOARD.task, 1, None, COUNTS, None, np.zeros(3))),
         (started, lambda h: h.task_read(BOARD.task, 1, None, read_only(), None, None)),
         (started, lambda h: h.task_start(BOARD.task, 0, 500.0, UNLIMITED)),
-        (started, lambda h: h.task_set_buffer_overflow_mode(BOARD.task, OVERWRITE)),
+        (started, lambda h: h.task_set_buffer_overflow_mode(BOARD.task, BufferOverflowMode.OVERWRITE_ON_OVERFLOW)),
     ],
 )
 def test_it_refuses_what_c_would_misread_or_a_board_would_not_bear(
@@ -111,51 +107,6 @@ def test_it_refuses_what_c_would_misread_or_a_board_would_not_bear(
     handle = ready()
     with pytest.raises(MisuseError):
         use(handle)
-
-
-@pytest.mark.parametrize(
-    "use",
-    [lambda h: h.write_analog(CH, 2, ZERO), lambda h: h.watchdog_clear(), lambda h: h.watchdog_is_expired(), reader],
-)
-def test_it_refuses_every_call_before_it_is_open_and_after(use: Callable[[FakeHIL], None]) -> None:
-    with pytest.raises(MisuseError, match="not open"):
-        use(handle_of(BOARD))
-    handle = opened()
-    assert handle.is_valid()
-    handle.close()
-    assert not handle.is_valid()
-    with pytest.raises(MisuseError, match="not open"):
-        use(handle)
-    handle.close()
-
-
-@pytest.mark.parametrize(
-    ("mode", "expected"),
-    [
-        (OVERWRITE, [3, 4, 5, 6]),
-        (BufferOverflowMode.DISCARD_ON_OVERFLOW, [1, 2, 5, 6]),
-        (BufferOverflowMode.ERROR_ON_OVERFLOW, None),
-    ],
-)
-def test_it_handles_overflows_as_the_mode_states(mode: int, expected: list[int] | None) -> None:
-    handle = opened()
-    task = reader(handle, 2)
-    handle.task_set_buffer_overflow_mode(task, mode)
-    handle.task_start(task, 0, 500.0, UNLIMITED)
-    for k in range(1, 5):
-        BOARD.set_counts(2, k)
-        BOARD.let_pass(1)
-    assert handle.task_get_buffer_overflows(task) == 2
-    counts = np.zeros(2, dtype=np.int32)
-    if expected is None:
-        with pytest.raises(HILError, match="overflowed"):
-            handle.task_read(task, 1, None, counts, None, None)
-        return
-    for k, count in enumerate(expected, start=3):
-        if k > 4:  # the buffer is empty: the next sample is of now
-            BOARD.set_counts(2, k)
-        assert handle.task_read(task, 1, None, counts, None, None) == 1
-        assert counts[0] == count
 
 
 def test_it_leaves_buffers_as_they_were_when_a_read_fails() -> None:
@@ -182,20 +133,3 @@ def test_it_restores_outputs_as_they_were_when_its_watchdog_is_cleared() -> None
         handle.write_analog(CH, 2, ZERO)
     handle.watchdog_clear()
     assert board.motor_voltages == VOLTS
-
-
-def test_only_a_virtual_board_waits_for_its_reader() -> None:
-    handle = opened()
-    with pytest.raises(HILError, match="virtual"):
-        handle.task_set_buffer_overflow_mode(reader(handle), BufferOverflowMode.WAIT_ON_OVERFLOW)
-
-
-def test_a_failure_is_requested_by_the_name_of_a_call() -> None:
-    with pytest.raises(ValueError, match="no call 'read_minds'"):
-        BOARD.fail_next("read_minds")
-
-
-def test_there_is_an_aero_on_the_board() -> None:
-    rigid = PlantSettings(kind="rigid_body", sensors=SensorSettings(attitude="perfect", rate="perfect"))
-    with pytest.raises(ValueError, match=r"plant\.kind"):
-        FakeQuanser(rigid, PERIOD)

@@ -21,8 +21,8 @@ class Loop:
 
     def __init__(self, plant: Plant, settings: Settings) -> None:
         wire, period_ns = settings.wire, settings.loop.period_ns
-        guard = settings.plant.guard(period_ns, wire.voltage.quantizer().outermost)
-        self.endpoint = Endpoint(plant, wire, period_ns, lockstep=True, guard=guard)
+        guard = settings.plant.limit_monitor(period_ns, wire.voltage.quantizer().outermost)
+        self.endpoint = Endpoint(plant, wire, period_ns, lockstep=True, limits=guard)
         claim = Claim(controller="a", session="a", period_ns=period_ns, lockstep=True, auto_arm=True, wire=wire)
         assert isinstance(self.endpoint.claim(claim), Grant)
         self.controller = Controller(wire, settings.law, settings.reference, PERIOD)

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-import sys
 from types import ModuleType
 
 import pytest
 from pydantic import ValidationError
 
-from aeroloop.plant_emulator.hosts.quanser import fake, interface
-from aeroloop.plant_emulator.hosts.quanser.fake import BufferOverflowMode, FakeQuanser, HILError
-from aeroloop.plant_emulator.hosts.quanser.interface import QuanserError
-from aeroloop.plant_emulator.hosts.quanser.usb import QuanserPlant
+from aeroloop.plant_emulator.hosts import quanser_board
+from aeroloop.plant_emulator.hosts.quanser_board import QuanserError, QuanserPlant
 from aeroloop.plant_emulator.plant import Measurement
-from aeroloop.plant_emulator.quanser_settings import QuanserSettings
+from aeroloop.plant_emulator.settings import QuanserSettings
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.wire.attitude import IDENTITY
-from tests.support.quanser_board import AERO, OFF, PERIOD, VOLTS, WATCHDOG, Calls, drive, driven_plant, plant_on_board
+from tests.support.fake_quanser import BufferOverflowMode, FakeQuanser
+from tests.support.quanser_board import (
+    AERO,
+    OFF,
+    PERIOD,
+    VOLTS,
+    WATCHDOG,
+    Calls,
+    driven_plant,
+    plant_of,
+    plant_on_board,
+)
 
 CLOSING = ["write_analog", "write_digital", "write_other", "watchdog_stop", "task_stop", "task_delete", "close"]
 DARK = [0.0, 0.0, 0.0]
@@ -51,7 +59,7 @@ def test_where_quansers_package_cannot_be_imported_the_error_names_what_to_insta
     def fail(_: str) -> ModuleType:
         raise error
 
-    monkeypatch.setattr(interface, "import_module", fail)
+    monkeypatch.setattr(quanser_board, "import_module", fail)
     with pytest.raises(QuanserError) as refused:
         QuanserPlant(QuanserSettings(), PERIOD)
     text = str(refused.value)
@@ -59,20 +67,8 @@ def test_where_quansers_package_cannot_be_imported_the_error_names_what_to_insta
     assert "\n" not in text
 
 
-def test_quansers_package_is_used_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    board = FakeQuanser(AERO, PERIOD)
-    hardware = {"HIL": board.HIL, "HILError": HILError, "Clock": fake.Clock}
-    enumerations = {"BufferOverflowMode": BufferOverflowMode}
-    for name, names in (("", {}), (".hardware", hardware), (".hardware.enumerations", enumerations)):
-        module = ModuleType(f"quanser{name}")
-        module.__dict__.update(names)
-        monkeypatch.setitem(sys.modules, f"quanser{name}", module)
-    drive(QuanserPlant(QuanserSettings(), PERIOD), 3)
-    assert board.time == 3
-
-
 def test_a_board_is_made_safe_before_anything_else_and_sampled_only_when_time_begins() -> None:
-    plant, board = plant_on_board()
+    plant, board = plant_on_board(session=False)
     assert list(board.calls) == [
         "open",
         "watchdog_stop",
@@ -100,11 +96,11 @@ def test_a_board_is_made_safe_before_anything_else_and_sampled_only_when_time_be
 
 
 def test_the_watchdog_runs_before_the_first_command_is_written_and_the_amplifier_is_on_before_its_voltage() -> None:
-    plant, board = plant_on_board(board_watchdog_s=0.3)
+    plant, board = plant_on_board(session=False, board_watchdog_s=0.3)
     calls = Calls(board)
-    plant.actuate(VOLTS)
+    plant.follow(PlantState.GRANTED)
     start = ["watchdog_start", "task_start", "task_get_buffer_overflows"]
-    assert calls.names() == [*start, "write_digital", "write_analog"]
+    assert calls.names() == [*start, "write_digital", "write_analog", "write_other"]
     assert board.watchdog == 150  # samples, as set
 
 
@@ -113,7 +109,7 @@ def test_a_board_that_was_left_under_an_expired_watchdog_is_had_again_at_0_v() -
     board.let_pass(WATCHDOG + 1)
     assert board.expired
     board.holder = board.task = None  # its process died
-    QuanserPlant(QuanserSettings(), PERIOD, hardware=board)
+    plant_of(board)
     assert not board.expired
     assert board.motor_voltages == OFF
     assert board.analog == [0.0, 0.0]  # not only behind a switch
@@ -127,7 +123,7 @@ def test_a_board_that_is_not_there_or_not_free_is_reported_in_one_line() -> None
         (QuanserSettings(), "quanser_aero2_usb '0': the board is in use"),
     ]:
         with pytest.raises(QuanserError, match=f"cannot open {words}"):
-            QuanserPlant(settings, PERIOD, hardware=board)
+            plant_of(board, settings)
 
 
 @pytest.mark.parametrize(
@@ -147,14 +143,14 @@ def test_a_board_that_cannot_be_made_ready_is_closed(call: str) -> None:
     board = FakeQuanser(AERO, PERIOD)
     board.fail_next(call)
     with pytest.raises(QuanserError, match=f"cannot make quanser_aero2_usb '0' ready: {call} was made to fail"):
-        QuanserPlant(QuanserSettings(), PERIOD, hardware=board)
+        plant_of(board)
     assert board.holder is None
-    QuanserPlant(QuanserSettings(), PERIOD, hardware=board)  # so another try can have it
+    plant_of(board)  # so another try can have it
 
 
 @pytest.mark.parametrize("call", ["watchdog_start", "task_start"])
 def test_a_board_that_cannot_be_started_is_reported_in_one_line(call: str) -> None:
-    plant, board = plant_on_board()
+    plant, board = plant_on_board(session=False)
     board.fail_next(call)
     with pytest.raises(QuanserError, match=f"cannot start quanser_aero2_usb: {call} was made to fail"):
         plant.advance()
@@ -166,7 +162,7 @@ def test_a_board_that_cannot_be_started_is_reported_in_one_line(call: str) -> No
 def test_what_a_board_may_lack_does_not_keep_it_from_being_used(call: str) -> None:
     board = FakeQuanser(AERO, PERIOD)
     board.fail_next(call)
-    plant = QuanserPlant(QuanserSettings(), PERIOD, hardware=board)
+    plant = plant_of(board)
     plant.advance()
     assert plant.measure() == Measurement(IDENTITY, (0.0, 0.0, 0.0))
 
@@ -182,7 +178,7 @@ def test_a_virtual_board_waits_for_its_reader() -> None:
 
 def test_a_closed_plant_is_at_rest_and_dark_and_its_board_free() -> None:
     plant, board = driven_plant()
-    plant.show(PlantState.DRIVEN)
+    assert board.leds != DARK
     calls = Calls(board)
     plant.close()
     plant.close()
@@ -192,7 +188,7 @@ def test_a_closed_plant_is_at_rest_and_dark_and_its_board_free() -> None:
 
 
 def test_a_plant_that_was_never_started_can_be_closed() -> None:
-    plant, board = plant_on_board()
+    plant, board = plant_on_board(session=False)
     calls = Calls(board)
     plant.close()
     assert calls.names() == [call for call in CLOSING if call != "task_stop"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from aeroloop.plant_emulator.hosts.quanser.usb import COLOURS
+from aeroloop.plant_emulator.hosts.quanser_board import COLOURS
 from aeroloop.protocol.messages.states import PlantState
 from tests.support.quanser_board import (
     OFF,
@@ -20,9 +20,6 @@ from tests.support.quanser_board import (
     is_nothing,
     plant_on_board,
 )
-
-REST = 250
-"""Samples in 0.5 s."""
 
 
 @pytest.mark.parametrize(
@@ -49,43 +46,37 @@ def test_another_number_of_voltages_is_refused() -> None:
         plant.actuate((1.0, 2.0, 3.0))
 
 
-def test_the_amplifier_is_on_from_the_first_voltage_until_half_a_second_of_none() -> None:
-    plant, board = plant_on_board()
-    for periods, voltages, on in [
-        (10, OFF, False),
-        (1, (0.0, 0.1), True),
-        (REST, OFF, True),
-        (1, VOLTS, True),  # a voltage in between
-        (REST, OFF, True),
-        (1, OFF, False),
-        (1, VOLTS, True),
-    ]:
-        drive(plant, periods, voltages)
-        assert board.enabled == [on, on]
-    assert board.truth().voltages == VOLTS
-
-
-def test_with_explicit_enable_only_its_caller_switches_the_amplifier() -> None:
-    plant, board = plant_on_board()
-    plant.enable(False)
-    drive(plant, 3)
-    assert (board.enabled, board.analog) == ([False, False], [0.0, 0.0])
-    plant.enable(True)
-    assert (board.enabled, board.analog) == ([True, True], list(VOLTS))
-    drive(plant, 2 * REST, OFF)
+def test_the_amplifier_is_on_during_a_session_only() -> None:
+    plant, board = plant_on_board(session=False)
+    for state in (PlantState.IDLE, PlantState.GRANTED, PlantState.DRIVEN, PlantState.TRIPPED, PlantState.IDLE):
+        plant.follow(state)
+        on = state in (PlantState.GRANTED, PlantState.DRIVEN)
+        volts = VOLTS if on else OFF
+        assert board.enabled == [on, on]  # at once
+        drive(plant, 3)
+        assert (board.enabled, board.truth().voltages) == ([on, on], volts)
+        assert board.analog == list(volts)  # not only behind a switch
+    plant.follow(PlantState.DRIVEN)
+    drive(plant, 500, OFF)
     assert board.enabled == [True, True]
-    drive(plant, 1)
-    plant.enable(False)
-    assert (board.enabled, board.analog) == ([False, False], [0.0, 0.0])
+
+
+def test_an_amplifier_that_could_not_be_switched_is_switched_at_the_next_tick() -> None:
+    plant, board = driven_plant()
+    board.fail_next("write_digital")
+    plant.follow(PlantState.TRIPPED)
+    assert (board.enabled, board.analog) == ([True, True], [0.0, 0.0])
+    plant.actuate(OFF)
+    assert board.enabled == [False, False]
 
 
 def test_lights_show_the_state_and_are_written_when_it_changes() -> None:
-    plant, board = plant_on_board()
+    plant, board = plant_on_board(session=False)
     assert board.leds == [0.0, 0.0, 0.0]
     shown = []
     for state in PlantState:
-        plant.show(state)
-        plant.show(state)
+        plant.follow(state)
+        plant.follow(state)
         shown.append(tuple(board.leds))
     assert shown == [COLOURS[state] for state in PlantState]
     assert len(set(shown)) == list(board.calls).count("write_other") == 4
@@ -93,26 +84,24 @@ def test_lights_show_the_state_and_are_written_when_it_changes() -> None:
     assert [strongest[s] for s in (PlantState.IDLE, PlantState.DRIVEN, PlantState.TRIPPED)] == ["b", "g", "r"]
 
 
-def test_a_light_that_fails_is_tried_again_and_costs_no_sample() -> None:
+def test_a_light_that_fails_costs_no_sample() -> None:
     plant, board = driven_plant()
     board.fail_next("write_other")
-    plant.show(PlantState.DRIVEN)
+    plant.follow(PlantState.GRANTED)
     calls = Calls(board)
     plant.advance()
     assert "watchdog_reload" in calls.names()
     assert not is_nothing(plant.measure())
-    plant.show(PlantState.DRIVEN)
-    assert board.leds == list(COLOURS[PlantState.DRIVEN])
 
 
 def test_lights_come_back_with_the_outputs() -> None:
     plant, board = expired_plant()
-    plant.show(PlantState.DRIVEN)
+    plant.follow(PlantState.GRANTED)
     assert board.leds == list(COLOURS[PlantState.TRIPPED])  # the board's own
     assert plant.failures == 0
     calls = Calls(board)
     plant.actuate(OFF)
-    assert board.leds == list(COLOURS[PlantState.DRIVEN])
+    assert board.leds == list(COLOURS[PlantState.GRANTED])
     assert "write_other" in calls.names()  # not every board may restore them by itself
 
 
@@ -142,9 +131,9 @@ def test_a_watchdog_that_expired_is_noticed_and_nothing_written_while_it_has_the
     plant.advance()
     assert (plant.expiries, is_nothing(plant.measure())) == (1, True)
     assert not reads_go_on or (plant.passed, plant.failures) == (WATCHDOG + 1, 0)
-    for _ in range(WATCHDOG + REST + 2):  # long enough to switch the amplifier off, were it on
+    for _ in range(WATCHDOG):
         plant.advance()
-    plant.enable(True)
+    plant.follow(PlantState.TRIPPED)
     assert not any(call.startswith("write") for call in calls.names())
     assert plant.expiries == 1
 
@@ -175,9 +164,8 @@ def test_an_expired_watchdog_is_cleared_by_0_v_and_by_nothing_else_and_then_arme
 
 def test_an_enabled_amplifier_is_on_again_when_its_watchdog_is_cleared() -> None:
     plant, board = expired_plant()
-    plant.enable(True)
-    assert board.expired
-    assert plant.failures == 0  # nothing was tried
+    plant.follow(PlantState.GRANTED)
+    assert (board.expired, plant.failures) == (True, 0)  # nothing was tried
     drive(plant, 1, OFF)
     assert board.enabled == [True, True]
 
@@ -216,7 +204,7 @@ def test_where_reads_or_writes_fail_for_long_the_board_goes_to_0_v_by_itself(cal
         assert (board.truth().voltages == OFF) == (k > WATCHDOG)  # of the period that is over
         plant.actuate(VOLTS)  # the loop that drives it goes on
         if call == "write_digital":
-            plant.enable(False)
+            plant.follow(PlantState.TRIPPED)
             board.analog[:] = VOLTS  # were only the amplifier left to switch the motors off
         plant.advance()
     assert is_nothing(plant.measure())

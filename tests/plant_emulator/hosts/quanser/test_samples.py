@@ -7,12 +7,11 @@ from math import cos, pi, sin
 
 import pytest
 
-from aeroloop.plant_emulator.hosts.quanser.fake import FakeQuanser
 from aeroloop.plant_emulator.model.sensors import FilteredDerivative, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement
-from aeroloop.plant_emulator.quanser_settings import CardType, QuanserSettings
-from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.plant_emulator.settings import CardType, PlantSettings, QuanserSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
+from tests.support.fake_quanser import FakeQuanser
 from tests.support.quanser_board import (
     AERO,
     PERIOD,
@@ -209,7 +208,7 @@ def test_a_failed_read_counts_as_a_period_once() -> None:
 
 
 def test_a_board_that_does_not_count_overflows_is_taken_to_be_in_time() -> None:
-    plant, board = plant_on_board()
+    plant, board = plant_on_board(session=False)
     board.counts_overflows = False
     drive(plant, 10)
     board.let_pass(4)

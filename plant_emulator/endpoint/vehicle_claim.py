@@ -1,0 +1,292 @@
+"""Claims, sessions, fresh commands and the trip latch of a plant, sans-I/O.
+
+One controller at a time holds the plant, by name. Base of the plant's Endpoint and of the CAN bridge's Relay.
+
+              claim                first command
+  idle ────────────────► granted ───────────────► driven
+   ▲  ▲                     │ release                │ release
+   │  └─────────────────────┴────────────────────────┤
+   │ arm                                             │ watchdog, holder gone, invalid command, limit, operator's stop
+   └────────────────────────────────── tripped ◄─────┘
+
+A plant that tripped or started unarmed refuses claims with the reason. A claim with `auto_arm` arms the plant itself,
+except after `stop`.
+
+Freshness is counted in ticks: a command echoes the counter of the measurement that it answers, which gives its age.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any, Literal, NamedTuple
+
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal, SessionRecord
+from aeroloop.protocol.messages.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
+from aeroloop.protocol.messages.trace import Outcome, PlantChange, PlantChangeKind
+from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, WATCHDOG_S
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+
+class Notice(NamedTuple):
+    """An event to publish; `tick` is the session's, None before its first measurement."""
+
+    kind: EventKind
+    text: str
+    session: str | None
+    tick: int | None
+
+
+class Trip(NamedTuple):
+    """Cause of a trip, and the reason in words."""
+
+    cause: TripCause
+    reason: str
+
+
+class VehicleClaim:
+    """A plant that one controller at a time may drive.
+
+    Args:
+        wire: Format of the frames.
+        period_ns: Period of a tick [ns].
+        lockstep: Whether the loop waits for each command; a claim must have the same value.
+        armed: Whether the first claim is granted without `arm`.
+
+    Attributes:
+        session: Name of the session, or None.
+        holder: Controller that holds the plant, or None.
+        trip: Cause of the last trip, until it is cleared.
+        cause: Why the latch refuses claims, or None.
+        notices: Events since the owner last emptied this list.
+        changes: Of this end between ticks since the owner last emptied this list.
+        ticked: Index of the last tick; −1 before the first.
+        outcome: How the last tick judged the command received before it.
+        voltages: In force from the last tick to the next command [V]. Shape (actuators,).
+        refused: Malformed frames so far.
+        stale: Commands so far that answered a measurement older than the watchdog's time.
+        last: Record of the last session, for the next controller; None if it left none.
+        unavailable: Reason set by the owner to refuse every claim, such as a bus fault; None for none.
+        operator_only: Whether only an operator's `arm` clears the latch.
+    """
+
+    def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool = False, armed: bool = False) -> None:
+        self.wire = wire
+        self.period_ns = period_ns
+        self.lockstep = lockstep
+        self.session: str | None = None
+        self.holder: str | None = None
+        self.trip: TripCause | None = None
+        self.notices: list[Notice] = []
+        self.changes: list[PlantChange] = []
+        self.ticked = -1
+        self.outcome = Outcome.NONE
+        self.off = (0.0,) * wire.actuators
+        self.voltages: tuple[float, ...] = self.off
+        self.refused = self.stale = 0
+        self.last: SessionRecord | None = None
+        self.unavailable: str | None = None
+        self._record: SessionRecord | None = None  # of the running session
+        self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
+        self._counters = wire.measurement.counters
+        self._level = wire.voltage.quantizer().level
+        self._silent_commands = lockstep and wire.transmit.command == "on_change"
+        self._codes: tuple[float, ...] = ()  # of the last fresh command
+        self._echo = self._answered = -1  # its echo, and the session tick that it answers
+        self.protect(WATCHDOG_S)
+        self.cause: str | None = None if armed else "not armed since it was started"
+        self.operator_only = False
+
+    @property
+    def state(self) -> PlantState:
+        """State of the plant: idle, granted, driven or tripped."""
+        return self._machine.state
+
+    @property
+    def session_tick(self) -> int:
+        """Tick of the last measurement since the session's first, which has 0; −1 before that."""
+        return -1
+
+    @property
+    def answered(self) -> int:
+        """Session tick that the command in force answers; −1 for none."""
+        return self._answered
+
+    @property
+    def event_tick(self) -> int | None:
+        """Session tick for an event now; None without a session and before its first measurement."""
+        return self.session_tick if self.session is not None and self.session_tick >= 0 else None
+
+    @property
+    def saturated(self) -> int:
+        """Measured values beyond their quantizer's range so far; 0 where nothing is quantized."""
+        return 0
+
+    def start_tripped(self, trip: TripCause, cause: str, *, operator_only: bool) -> None:
+        """Begin with the latch that an earlier process left. No PlantChange: a replay begins at the first grant."""
+        self._machine.fire(PlantTrigger.TRIP)
+        self.trip, self.cause, self.operator_only = trip, cause, operator_only
+
+    def claim(self, claim: Claim) -> Grant | Refusal:
+        """Grant a claim, or refuse it with the fields that differ, the holder or the latch's reason."""
+        differences = self.wire.differences(claim.wire)
+        if claim.protocol != PROTOCOL_VERSION:
+            differences.append(f"protocol: {PROTOCOL_VERSION}, not {claim.protocol}")
+        if claim.period_ns != self.period_ns:
+            differences.append(f"period_ns: {self.period_ns}, not {claim.period_ns}")
+        if claim.lockstep != self.lockstep:
+            differences.append(f"lockstep: {self.lockstep}, not {claim.lockstep}")
+        if self.unavailable is not None:
+            return Refusal(reason=self.unavailable)
+        if differences:
+            return Refusal(reason=f"the plant has {'; '.join(differences)}", differences=differences)
+        if self.session is not None:
+            return Refusal(reason=f"the plant is held by {self.holder}", holder=self.holder)
+        if claim.auto_arm and not self.operator_only:
+            self._clear()
+        if self.cause is not None:
+            return Refusal(reason=f"{self.cause}; `aeroloop op arm` clears it")
+        self._machine.fire(PlantTrigger.GRANT)
+        self.session, self.holder = claim.session, claim.controller
+        self.record_change("claim", claim=claim)
+        self._begin()
+        self._notice("claimed", f"granted to {claim.controller}")
+        return Grant(session=claim.session, last=self.last)
+
+    def keep(self, record: SessionRecord) -> bool:
+        """Keep the record of the running session, until its end or the next one. False if it is of another session.
+
+        It changes nothing that a tick does, so it is no PlantChange.
+        """
+        if self.session is None or (record.session, record.controller) != (self.session, self.holder):
+            return False
+        self._record = record
+        return True
+
+    def release(self, session: str) -> bool:
+        """End the session on its holder's request: 0 V. False if another session or none runs."""
+        if session != self.session:
+            return False
+        self.record_change("release", name=session)
+        self._end(PlantTrigger.RELEASE, "released", f"released by {self.holder}", "released")
+        return True
+
+    def arm(self) -> bool:
+        """Clear the latch, so that the next claim is granted. False while a controller holds the plant."""
+        if self.session is not None:
+            return False
+        self.record_change("arm")
+        self.operator_only = False
+        self._clear()
+        self._notice("armed", "armed by an operator: the next claim is granted")
+        return True
+
+    def stop(self, cause: TripCause = TripCause.OPERATOR, reason: str = "stopped by an operator") -> None:
+        """Trip in any state: 0 V, and no claim, not even one with `auto_arm`, is granted before `arm`.
+
+        An operator's stop of a plant that has tripped keeps the cause of that trip, and is another event only if it
+        changes what clears the latch.
+        """
+        self.record_change("stop", cause=cause, reason=reason)
+        if cause is not TripCause.OPERATOR or self.state is not PlantState.TRIPPED:
+            self._trip(cause, reason)
+        elif not self.operator_only:
+            self.cause = f"{self.cause}; then {reason}"
+            self._notice("changed", f"{reason} after it tripped: a claim with auto_arm does not clear it any more")
+        self.operator_only = True
+        if self.last is not None:
+            self.last = self.last.model_copy(update={"ended": cause})
+
+    def lost(self, controller: str) -> None:
+        """Trip if this controller, having lost its liveliness token, holds the plant."""
+        if controller == self.holder:
+            self.record_change("lost", name=controller)
+            self._trip(TripCause.HOLDER_GONE, f"{controller} is gone")
+
+    def expire(self, cause: TripCause, reason: str) -> None:
+        """Trip for a cause that the owner detects, such as no answer in lockstep. Nothing without a session."""
+        if self.session is not None:
+            self.record_change("expire", cause=cause, reason=reason)
+            self._trip(cause, reason)
+
+    def record_change(self, kind: PlantChangeKind, **what: Any) -> None:
+        """Record a change of this end after its last tick; fields as in PlantChange."""
+        self.changes.append(PlantChange(tick=self.ticked, kind=kind, **what))
+
+    def protect(self, watchdog_s: float) -> None:
+        """Set the watchdog's time [s].
+
+        Why the first command of a session has a deadline of its own: the age of an echo is known modulo the counter.
+        Commands late by a whole round of the counter would look fresh, so the first one must be received before the
+        counter is back at 0. A counter shorter than twice the watchdog's time cannot detect this, and gets the usual
+        time.
+        """
+        self._watchdog_ns = round(watchdog_s * 1e9)
+        self._watchdog = max(1, round(self._watchdog_ns / self.period_ns))
+        self._first_command_ns = round(FIRST_COMMAND_S * 1e9)
+        if self._counters * self.period_ns >= 2 * self._watchdog_ns:
+            self._first_command_ns = min(self._first_command_ns, (self._counters - 1) * self.period_ns)
+
+    def _command(self, frame: bytes) -> Outcome:
+        """Put a command's voltages in force if it is well-formed, fresh and valid."""
+        if frame == SILENCE and self._silent_commands and self._codes:
+            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
+        else:
+            read = self.wire.command.unpack(frame)
+        if read is None:
+            self.refused += 1
+            return Outcome.MALFORMED
+        echo, codes = read
+        # The echo is a tick modulo `counters` and means the latest measurement with that counter. A repeated echo is
+        # refused: after a whole round of the counter it would look fresh again.
+        now = self.session_tick
+        age = (now - echo) % self._counters
+        if echo == self._echo or now - age <= self._answered:
+            return Outcome.REPEATED
+        if age > self._watchdog:
+            self.stale += 1
+            return Outcome.STALE
+        voltages = tuple(map(self._level, codes))
+        if not isfinite(sum(voltages)):
+            if not self._may_be_invalid(echo):
+                self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
+                return Outcome.INVALID
+            voltages = self.off
+        self.voltages = voltages
+        self._codes, self._echo, self._answered = codes, echo, now - age
+        if self.state is not PlantState.DRIVEN:
+            self._machine.fire(PlantTrigger.COMMAND)
+        return Outcome.ACTED
+
+    def _may_be_invalid(self, echo: int) -> bool:
+        """Whether a command without a valid value that answers this measurement means 0 V, or trips."""
+        del echo
+        return True
+
+    def _begin(self) -> None:
+        """Reset the state of a session when one begins."""
+        self._codes, self._echo, self._answered = (), -1, -1
+
+    def _rest(self) -> None:
+        """Set 0 V when a session has ended."""
+        self.voltages, self._answered = self.off, -1
+
+    def _trip(self, cause: TripCause, reason: str) -> None:
+        self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V", cause)
+        self.cause, self.trip = f"{reason}: 0 V", cause
+
+    def _clear(self) -> None:
+        self.cause = self.trip = None
+        self._machine.fire(PlantTrigger.ARM)
+
+    def _end(self, trigger: PlantTrigger, kind: EventKind, text: str, ended: TripCause | Literal["released"]) -> None:
+        self._notice(kind, text)
+        if self.session is not None:
+            how = {"ended": ended, "ended_tick": self.event_tick}
+            self.last, self._record = self._record and self._record.model_copy(update=how), None
+        self._machine.fire(trigger)
+        self.session = self.holder = None
+        self._rest()
+
+    def _notice(self, kind: EventKind, text: str) -> None:
+        self.notices.append(Notice(kind, text, self.session, self.event_tick))

@@ -1,0 +1,150 @@
+"""Latch file: keeps a plant's trip or stop on disk, so that it outlives the plant's process.
+
+One JSON file for each vehicle in a state directory. It is there while the plant is tripped. A thread of its own writes
+and removes it: a disk may take seconds, and neither 0 V nor the loop waits for it.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from datetime import UTC, datetime
+from errno import EACCES
+from pathlib import Path
+from typing import Final
+
+from pydantic import AwareDatetime, BaseModel, ValidationError
+
+from aeroloop.protocol.messages.states import TripCause
+
+KEPT_S: Final = 0.5
+"""How long an operator's answer waits for the disk [s]; `op arm` waits 1 s for its answer."""
+RETRY_S: Final = 5.0
+"""Time between attempts where the file cannot be written [s]."""
+
+
+class Latch(BaseModel, frozen=True, extra="forbid"):
+    """Why a plant refuses claims: the latch's cause, its text with the operator's name, what clears it."""
+
+    cause: TripCause
+    text: str
+    operator_only: bool
+    since: AwareDatetime
+
+
+def state_directory() -> Path:
+    """Where files are kept if nothing is configured: systemd's state directory, else the user's."""
+    if systemd := os.environ.get("STATE_DIRECTORY"):
+        return Path(systemd.partition(":")[0])
+    if xdg := os.environ.get("XDG_STATE_HOME"):
+        return Path(xdg) / "aeroloop"
+    return Path("~/.local/state/aeroloop")
+
+
+class LatchFile:
+    """Keeps the latch of one vehicle's plant in a directory; in `state_directory` if it is None.
+
+    Attributes:
+        path: The file.
+        found: The latch that an earlier process left, or None. A file that cannot be read counts as a stop.
+    """
+
+    def __init__(self, directory: Path | None, vehicle: str) -> None:
+        try:
+            folder = (directory or state_directory()).expanduser().absolute()
+        except RuntimeError:  # a user without a home
+            folder = Path("/nonexistent/aeroloop")
+        self.path = folder / f"{vehicle}.json"
+        self.found = self._read()
+        self._changed = threading.Condition()
+        self._wanted = self._tried = self._kept = self.found
+        self._wanted_at = time.monotonic()
+        self._error: str | None = None
+        self._closing = False
+        self._attempt(self.found)
+        self._thread = threading.Thread(target=self._run, daemon=True)  # no hanging disk keeps the process alive
+        self._thread.start()
+
+    def keep(self, latch: Latch | None) -> None:
+        """Have this latch on disk from now on, or none; returns at once."""
+        with self._changed:
+            if latch != self._wanted:
+                self._wanted, self._wanted_at, self._error = latch, time.monotonic(), None
+                self._changed.notify_all()
+
+    def wait(self) -> None:
+        """Wait until the newest latch is on disk or an attempt has failed, for `KEPT_S` at most."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._wanted == self._kept or self._error is not None, KEPT_S)
+
+    @property
+    def unkept(self) -> str | None:
+        """Why the newest latch is not on disk, in one line; None if it is."""
+        with self._changed:
+            return None if self._wanted == self._kept else self._error or f"{self.path} is not written yet"
+
+    @property
+    def problem(self) -> str | None:
+        """Why a latch is not on disk, or another could not be put there; None while the disk has `KEPT_S` for it."""
+        waits = time.monotonic() - self._wanted_at < KEPT_S
+        return self._error or (None if waits else self.unkept)
+
+    def close(self) -> None:
+        """Wait for the disk, and end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(KEPT_S)
+
+    def _read(self) -> Latch | None:
+        try:
+            return Latch.model_validate_json(self.path.read_bytes())
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except (OSError, ValidationError) as error:
+            why = error.strerror if isinstance(error, OSError) else "it is damaged"
+            text = f"{self.path} cannot be read ({why}), so the plant may have been stopped: 0 V"
+            return Latch(cause=TripCause.OPERATOR, text=text, operator_only=True, since=datetime.now(UTC))
+
+    def _run(self) -> None:
+        last = False
+        while not last:
+            with self._changed:
+                retry_s = RETRY_S if self._error else None
+                self._changed.wait_for(lambda: self._closing or self._wanted != self._tried, retry_s)
+                latch, last = self._wanted, self._closing
+            self._attempt(latch)
+
+    def _attempt(self, latch: Latch | None) -> None:
+        error, self._tried = None, latch
+        try:
+            self._store(latch)
+        except OSError as failure:
+            error = f"{self.path} cannot be written ({failure.strerror}); plant.state_directory names another folder"
+        with self._changed:
+            self._error = error
+            if error is None:
+                self._kept = latch
+            self._changed.notify_all()
+
+    def _store(self, latch: Latch | None) -> None:
+        """Bring the directory to this state. Raises OSError."""
+        folder = self.path.parent
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(EACCES, os.strerror(EACCES))
+        if latch is None:
+            self.path.unlink(missing_ok=True)
+        else:
+            new = self.path.with_name(f".{self.path.name}")  # a vehicle's name begins with no dot
+            with new.open("wb") as file:
+                file.write(latch.model_dump_json(indent=2).encode())
+                file.flush()
+                os.fsync(file.fileno())
+            new.replace(self.path)
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

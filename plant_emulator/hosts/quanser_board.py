@@ -1,0 +1,384 @@
+"""Quanser Aero on its USB board: plant and driver, by Quanser's HIL interface.
+
+The board samples by its own clock and `advance` waits for the next sample, so the board paces the loop. A measurement
+is this period's sample or NaN; a failed read never repeats the last one. Each good sample reloads the board's watchdog,
+which on expiry sets 0 V and switches the amplifier off. It is not reloaded after a failed read or write, so that a
+plant that cannot be commanded soon has 0 V. An expired watchdog is cleared only while 0 V is commanded.
+
+The interface is part of Quanser's SDK and is imported when a plant is made. It passes arrays to C as bare memory, so
+their types are part of the call: channels uint32, analog and other float64, encoder counts int32, digital lines int8.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from importlib import import_module
+from math import isnan, pi
+from typing import Any, Final
+
+import numpy as np
+
+from aeroloop.plant_emulator.hosts.driver import Driver
+from aeroloop.plant_emulator.model.sensors import NO_MEASUREMENT, FilteredDerivative, attitude_of, rate_of
+from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.transport.link import Arrival
+from aeroloop.protocol.wire.attitude import Vector
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+
+MOTORS: Final = np.array([0, 1], dtype=np.uint32)
+"""Analog outputs that carry the motors' voltages, and digital outputs that enable their amplifiers."""
+ENCODERS: Final = np.array([2, 3], dtype=np.uint32)
+"""Pitch and yaw; 0 and 1 are the rotors'."""
+GYRO: Final = np.array([3000, 3001, 3002], dtype=np.uint32)
+LEDS: Final = np.array([11000, 11001, 11002], dtype=np.uint32)
+"""Red, green, blue; 0…1."""
+
+COLOURS: Final[Mapping[PlantState, tuple[float, float, float]]] = {
+    PlantState.IDLE: (0.0, 0.2, 1.0),
+    PlantState.GRANTED: (1.0, 0.7, 0.0),
+    PlantState.DRIVEN: (0.0, 1.0, 0.0),
+    PlantState.TRIPPED: (1.0, 0.0, 0.0),
+}
+"""Blue, yellow, green, red."""
+
+_SAMPLES_IN_BUFFER: Final = 1  # a read returns the newest sample, and the board counts those it overwrote
+_UNLIMITED: Final = 2**32 - 1  # samples; as in Quanser's own class for this board
+
+
+class QuanserError(AeroloopError):
+    """Quanser's board cannot be used; the message is one line with the reason."""
+
+
+class BoardDriver(Driver):
+    """Drives the Aero on Quanser's board by the board's clock; the amplifier is on during a session only.
+
+    Raises:
+        QuanserError: The interface is missing, or the board cannot be opened.
+        ValueError: The wire does not command two motors.
+    """
+
+    def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
+        self._board = QuanserPlant(settings.quanser, loop.period)
+        super().__init__(self._board, loop, wire, settings, stop)
+
+    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
+        self._board.follow(self.endpoint.state)  # after a claim or a release since the last tick
+        echo = super()._tick(arrival, k)
+        self._board.follow(self.endpoint.state)  # after a trip or a first command in the tick
+        return echo
+
+
+class QuanserPlant(Plant):
+    """The Aero on its board.
+
+    Its encoders are relative: keep the Aero level and at yaw 0 while this object is made. Sampling starts at the first
+    `actuate` or `advance`. The amplifier is off until `follow` switches it on.
+
+    Each `advance` is one period. After a late call the newest sample is measured and `passed` is the number of periods
+    that passed; the next `passed` − 1 calls return at once and measure NaN. A caller that raises its tick index by
+    `passed` stays on the board's clock. `period` is the time between samples [s].
+
+    Raises:
+        QuanserError: The interface is missing, or the board cannot be opened and prepared.
+
+    Attributes:
+        overrun: Samples lost so far because they were not read in time.
+        failures: Failed calls of the interface so far, including reads without a sample.
+        failure: Message of the last failure, or None.
+        expiries: Expiries of the board's watchdog so far.
+    """
+
+    actuators = 2
+    paces = True
+
+    def __init__(self, settings: QuanserSettings, period: float) -> None:
+        self._settings, self._period = settings, period
+        try:
+            self._hardware: Any = import_module("quanser.hardware")
+            # Not every version exports this one in the module above.
+            self._overflow: Any = import_module("quanser.hardware.enumerations").BufferOverflowMode
+        except (ImportError, OSError) as error:  # OSError: the libraries that the package loads are missing
+            raise QuanserError(
+                f"Quanser's Python interface is missing ({error}): install the Quanser SDK, then in this environment "
+                "`pip install --find-links <SDK's folder>/python quanser_api`"
+            ) from error
+        self._error: type[Exception] = self._hardware.HILError
+        self._board: Any = self._hardware.HIL()
+        self.overrun = self.failures = self.expiries = 0
+        self.failure: str | None = None
+
+        self._steps = [
+            sign * 2 * pi / counts for sign, counts in zip(settings.encoder_signs, settings.counts, strict=True)
+        ]
+        self._filters: list[FilteredDerivative] | None = None
+        self._counts = np.zeros(2, dtype=np.int32)
+        self._gyro = np.zeros(3) if settings.rate == "gyro" else None
+        self._measurement = NO_MEASUREMENT
+
+        self._volts = np.zeros(2)
+        self._no_volts = np.zeros(2)
+        self._colours = {state: np.array(colour) for state, colour in COLOURS.items()}
+        self._state: PlantState | None = None
+        self._lit: PlantState | None = None
+        self._held: tuple[float, ...] = (0.0, 0.0)
+        self._driven = self._amplified = False
+
+        self._task: object = None
+        self._running = self._closed = self._expired = False
+        self._written = True  # whether every write since the last sample succeeded
+        self._counts_overflows = True
+        self._samples_read = self._index = self._owed = 0  # index: of the last sample, on the board's clock
+        self._advanced_ns = 0
+        self._open()
+
+    # ── Plant ──
+
+    def actuate(self, voltages: Sequence[float]) -> None:
+        """Hold voltages [V], clipped to the limit; NaN is 0 V. Shape (2,).
+
+        An expired board watchdog is cleared by 0 V only; until then nothing is written.
+
+        Raises:
+            QuanserError: The board cannot be started.
+        """
+        limit = self._settings.voltage_limit
+        self._held = tuple(0.0 if isnan(v) else max(-limit, min(limit, v)) for v in voltages)
+        self._start()
+        if self._expired and (any(self._held) or not self._clear()):
+            return
+        self._write_outputs()
+
+    def advance(self) -> None:
+        """Wait for the board's next sample; a failed read takes a period, too.
+
+        Raises:
+            QuanserError: The board cannot be started.
+        """
+        if self._owed:
+            self._owed -= 1
+            self._measurement = NO_MEASUREMENT
+            return
+        self._start()
+        passed = self._read()
+        alive = self._keep_alive(reload=passed > 0 and self._written)
+        self._written = True
+        if passed and alive:
+            self._measurement = self._seen(passed)
+        else:
+            self._measurement, self._filters = NO_MEASUREMENT, None
+        if not passed:
+            ahead = self._advanced_ns + self._period * 1e9 - time.monotonic_ns()
+            if ahead > 0:  # sleep to the end of the period, so that the loop does not spin
+                time.sleep(ahead * 1e-9)
+            self._index += 1
+        self.passed = max(1, passed)
+        self._owed = self.passed - 1
+        self.overrun += self._owed
+        self._advanced_ns = time.monotonic_ns()
+
+    def measure(self) -> Measurement:
+        """Values of the last sample; NaN if it could not be read."""
+        return self._measurement
+
+    def close(self) -> None:
+        """Set 0 V, switch amplifier and lights off, and close the board. A failed step does not prevent the next.
+
+        If neither 0 V nor amplifier-off could be written, the watchdog is left running, so that it expires.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        board = self._board
+        still = self._try(board.write_analog, MOTORS, len(MOTORS), self._no_volts)
+        off = self._amplify(False)
+        self._try(board.write_other, LEDS, len(LEDS), np.zeros(3))
+        if still or off:
+            self._try(board.watchdog_stop)
+        if self._running:
+            self._try(board.task_stop, self._task)
+        if self._task is not None:
+            self._try(board.task_delete, self._task)
+        self._try(board.close)
+
+    def follow(self, state: PlantState) -> None:
+        """Switch the amplifier on for a session and off after it, and show the state as a colour.
+
+        While its watchdog is expired, the board shows red by itself.
+        """
+        self._state = state
+        driven = state in (PlantState.GRANTED, PlantState.DRIVEN)
+        if driven is not self._driven:
+            self._driven = driven
+            self._start()
+            if not self._expired:
+                self._write_outputs()
+        if state is not self._lit and not self._expired:
+            self._lit = state
+            self._try(self._board.write_other, LEDS, len(LEDS), self._colours[state])
+
+    # ── starting ──
+
+    def _open(self) -> None:
+        card, which = self._settings.card_type, self._settings.card_identifier
+        try:
+            self._board.open(card, which)
+        except self._error as error:
+            raise QuanserError(
+                f"cannot open {card} '{which}': {_text(error)}; is it plugged in, switched on, and free?"
+            ) from error
+        try:
+            self._prepare()
+        except self._error as error:
+            self.close()
+            raise QuanserError(f"cannot make {card} '{which}' ready: {_text(error)}") from error
+
+    def _prepare(self) -> None:
+        board, n = self._board, len(MOTORS)
+        self._unlock()
+        board.write_analog(MOTORS, n, self._no_volts)
+        board.write_digital(MOTORS, n, np.zeros(n, dtype=np.int8))
+        board.watchdog_set_analog_expiration_state(MOTORS, n, self._no_volts)
+        board.watchdog_set_digital_expiration_state(MOTORS, n, np.zeros(n, dtype=np.int32))
+        with suppress(self._error):  # lights are not safety-relevant; the motors' states above are
+            board.watchdog_set_other_expiration_state(LEDS, len(LEDS), self._colours[PlantState.TRIPPED])
+        board.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(2, dtype=np.int32))
+
+        gyro = None if self._gyro is None else GYRO
+        inputs = None, 0, ENCODERS, len(ENCODERS), None, 0, gyro, 0 if gyro is None else len(gyro)
+        board.read(*inputs, None, self._counts, None, self._gyro)
+        self._measurement = self._seen(1)
+        self._task = board.task_create_reader(_SAMPLES_IN_BUFFER, *inputs)
+        virtual = "@" in self._settings.card_identifier  # it waits for its reader, as in Quanser's own class
+        mode = self._overflow.WAIT_ON_OVERFLOW if virtual else self._overflow.OVERWRITE_ON_OVERFLOW
+        board.task_set_buffer_overflow_mode(self._task, mode)
+
+    def _start(self) -> None:
+        """Start the watchdog and the sampling task, once."""
+        if self._running or self._closed:
+            return
+        board = self._board
+        try:
+            board.watchdog_start(self._settings.board_watchdog_s)
+            board.task_start(self._task, self._hardware.Clock.HARDWARE_CLOCK_0, 1 / self._period, _UNLIMITED)
+        except self._error as error:
+            raise QuanserError(f"cannot start {self._settings.card_type}: {_text(error)}") from error
+        self._running = True
+        self._advanced_ns = time.monotonic_ns()
+        try:
+            board.task_get_buffer_overflows(self._task)
+        except self._error:  # some boards may not count them
+            self._counts_overflows = False
+
+    # ── samples ──
+
+    def _read(self) -> int:
+        """Wait for the newest sample. Returns the periods that passed, or 0 if the read failed."""
+        board = self._board
+        try:
+            read = board.task_read(self._task, 1, None, self._counts, None, self._gyro)
+            lost = board.task_get_buffer_overflows(self._task) if self._counts_overflows else 0
+        except self._error as error:
+            self._failed(_text(error))
+            return 0
+        if read != 1:
+            self._failed("the board's task gave no sample")
+            return 0
+        self._samples_read += 1
+        before, self._index = self._index, self._samples_read + lost
+        return max(1, self._index - before)  # a failed read counted as a period, even if its sample followed
+
+    def _seen(self, passed: int) -> Measurement:
+        """Measurement of the sample in the buffers, this many periods after the last one."""
+        settings = self._settings
+        pitch, yaw = (step * count for step, count in zip(self._steps, self._counts.tolist(), strict=True))
+        attitude = attitude_of(pitch, yaw)
+        if self._gyro is not None:
+            axes = zip(settings.gyro_axes, settings.gyro_signs, strict=True)
+            x, y, z = (sign * settings.gyro_scale * self._gyro.item(axis) for axis, sign in axes)
+            return Measurement(attitude, (x, y, z))
+        if self._filters is None:
+            self._filters = [
+                FilteredDerivative(settings.bandwidth, settings.damping_ratio, self._period) for _ in self._steps
+            ]
+        of_pitch, of_yaw = self._filters
+        for _ in range(passed):
+            pitch_rate, yaw_rate = of_pitch.update(pitch), of_yaw.update(yaw)
+        rate: Vector = rate_of(pitch, pitch_rate, yaw_rate)
+        return Measurement(attitude, rate)
+
+    # ── outputs and watchdog ──
+
+    def _write_outputs(self) -> None:
+        if self._amplified is not self._driven:
+            self._amplify(self._driven)
+        volts = self._held if self._driven else (0.0, 0.0)
+        settings = self._settings
+        for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, volts, strict=True):
+            self._volts[channel] = sign * voltage
+        self._written &= self._try(self._board.write_analog, MOTORS, len(MOTORS), self._volts)
+
+    def _amplify(self, on: bool) -> bool:
+        done = self._try(self._board.write_digital, MOTORS, len(MOTORS), np.full(len(MOTORS), on, dtype=np.int8))
+        if done:
+            self._amplified = on
+        self._written &= done
+        return done
+
+    def _keep_alive(self, *, reload: bool) -> bool:
+        """Reload the watchdog or read its state. False if it has expired or cannot be read."""
+        if self._expired:
+            return False
+        try:
+            alive = self._board.watchdog_reload() if reload else not self._board.watchdog_is_expired()
+        except self._error as error:
+            self._failed(_text(error))
+            return False
+        if not alive:
+            self._expired = True
+            self._amplified = False
+            self._lit = None
+            self.expiries += 1
+        return alive
+
+    def _clear(self) -> bool:
+        """Clear the expired watchdog and restart it with outputs at 0 V. False if a step failed."""
+        board, n = self._board, len(MOTORS)
+        self._unlock()
+        # Clearing may restore the outputs of before the expiry, so a failed step must not prevent the next.
+        armed = self._try(board.watchdog_start, self._settings.board_watchdog_s)
+        still = self._try(board.write_analog, MOTORS, n, self._no_volts)
+        done = self._amplify(False) and still and armed
+        self._expired = not done
+        if done and self._state is not None:
+            self.follow(self._state)
+        return done
+
+    def _unlock(self) -> None:
+        """Stop and clear the watchdog, so that outputs can be written; failures show at the next write."""
+        with suppress(self._error):
+            self._board.watchdog_stop()
+        with suppress(self._error):  # a watchdog that has not expired may refuse
+            self._board.watchdog_clear()
+
+    def _try(self, call: Callable[..., object], *args: object) -> bool:
+        try:
+            call(*args)
+        except self._error as error:
+            self._failed(_text(error))
+            return False
+        return True
+
+    def _failed(self, text: str) -> None:
+        self.failures += 1
+        self.failure = text
+
+
+def _text(error: Any) -> str:
+    return str(error.get_error_message())

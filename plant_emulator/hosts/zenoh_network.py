@@ -1,0 +1,400 @@
+"""Plant end on Zenoh.
+
+Answers claims and operator commands, opens and closes the session's link, publishes status, events and the trace, and
+counts the frames. Claims, operator commands and lost peers arrive in other threads and are queued until the owner
+takes them between ticks, so that only one thread uses the endpoint.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Condition
+from typing import Final
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
+from aeroloop.plant_emulator.hosts.driver import PlantNetwork
+from aeroloop.plant_emulator.hosts.latch_file import KEPT_S, Latch, LatchFile
+from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages.models import (
+    Claim,
+    FaultStatus,
+    Grant,
+    Refusal,
+    Release,
+    SessionRecord,
+    Status,
+    Tenure,
+)
+from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.messages.states import TripCause
+from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches_per_s, record_json
+from aeroloop.protocol.runtime.role import RecorderWatch, Role
+from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
+from aeroloop.protocol.transport.link import Arrival, Mailbox, ZenohLink
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.transmit import SILENCE
+
+STATUS_PERIOD_NS: Final = 1_000_000_000
+OTHERS_PERIOD_NS: Final = 10_000_000
+"""How often the statuses of another plant of this name are read, of those the newest."""
+
+
+class ZenohNetwork(PlantNetwork):
+    """A plant end, an Endpoint or the bridge's Relay, on the network.
+
+    LatchFile keeps the latch in `state_directory`, and one that is there holds from the start. `changed` is notified
+    when a command arrives, for an owner that waits for more than one thing; `faults` returns the status of an
+    emulator's faults.
+    """
+
+    def __init__(
+        self,
+        role: Role,
+        loop: LoopSettings,
+        endpoint: VehicleClaim,
+        state_directory: Path | None,
+        changed: Condition | None = None,
+        faults: Callable[[], list[FaultStatus]] = list,
+    ) -> None:
+        super().__init__()
+        self._faults = faults
+        self._role = role
+        self._loop = loop
+        self._endpoint = endpoint
+        self._link: ZenohLink | None = None
+        self._changed = changed
+        self._trace = PlantTrace(loop, endpoint.wire, lambda batch: role.publish_bytes("trace", batch))
+        self._latency = RollingHistogram()
+        self._counters = endpoint.wire.measurement.counters
+        self._sent_at: list[tuple[int, int]] = []  # per counter: session tick of its last frame, and its time sent
+        self._sent = self._received = 0
+        self._refused = 0  # by the links of earlier sessions
+        self._latch_file = LatchFile(state_directory, role.vehicle)
+        self._since = datetime.now(UTC) if endpoint.cause else None
+        if (found := self._latch_file.found) is not None:
+            endpoint.start_tripped(found.cause, found.text, operator_only=found.operator_only)
+            self._since = found.since
+        self._published_state = endpoint.state
+        self._status_tick = -1
+        self._status_due = self._others_due = 0
+        self._status_time = time.monotonic()
+        self._forget_holder: Callable[[], None] | None = None
+
+    @property
+    def link(self) -> ZenohLink | None:
+        """Link of the session's frames; None without a session."""
+        return self._link
+
+    def serve(self) -> None:
+        """Declare the topics, and answer claims and operator commands from now on."""
+        role = self._role
+        role.declare("trace", batches_per_s(self._loop), lossless=self._loop.lockstep)
+        role.serve("claim", Claim, lambda claim: lambda: self._claim(claim))
+        role.serve("release", Release, lambda release: lambda: self._release(release))
+        role.serve("record", SessionRecord, self._read_record)
+        role.serve("show", Request, lambda _: self._show)
+        role.serve("arm", Request, lambda _: self._once_kept(self._arm))
+        role.serve("stop", Request, lambda request: self._once_kept(lambda: self._stop(request.by)))
+        if not self._loop.lockstep:
+            role.datagrams.listen()
+        self._others = role.zenoh.declare_subscriber(
+            topics.key("status", role.vehicle, role=role.role), RingChannel(1), allowed_origin=zenoh.Locality.REMOTE
+        )
+        self._recorder = RecorderWatch(role)
+        role.announce()
+        if (found := self._latch_file.found) is None:
+            role.event("started", f"{role.vehicle} waits for a claim")
+        else:
+            text = f"{found.text} ({found.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC)"
+            role.event("started", f"{role.vehicle} is still tripped: {text}; `aeroloop op arm` clears it")
+
+    def take_inbox(self) -> None:
+        """Process queued claims, releases and operator commands, and the status of another plant."""
+        if time.monotonic_ns() >= self._others_due:
+            self._read_others()
+        if self._role.take_inbox():
+            self.follow_session()
+
+    def send(self, frame: bytes) -> None:
+        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        if self._link is not None and (frame or self._loop.lockstep):
+            self._link.send(frame)
+            self._sent += frame != SILENCE
+
+    def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """After the measurement was sent: write the trace row, measure latency, publish events and a due status."""
+        endpoint = self._endpoint
+        self._trace.row(endpoint, measurement, arrival, sent_ns)
+        if endpoint.outcome is Outcome.ACTED:
+            answered = endpoint.answered
+            tick, at_ns = self._sent_at[answered % self._counters]
+            if tick == answered >= 0:
+                self._latency.add((sent_ns if arrival is None else arrival.at_ns) - at_ns)
+        elif endpoint.outcome is Outcome.STALE:
+            text = "commands answer measurements older than the watchdog's time: refused"
+            self._role.warn("stale", "fault", text, endpoint.session, endpoint.event_tick)
+        if measurement:
+            self._sent_at[endpoint.session_tick % self._counters] = endpoint.session_tick, sent_ns
+        if arrival is not None:
+            self._received += arrival.frame != SILENCE
+        self.follow_session()
+        self.publish_when_due()
+
+    def follow_session(self) -> None:
+        """Publish events, and close the link of a session that ended."""
+        self._trace.follow(self._endpoint)
+        endpoint = self._endpoint
+        if endpoint.state is not self._published_state:
+            self._published_state = endpoint.state
+            self._status_due = 0
+        if endpoint.session is None and self._link is not None:
+            self._link.close()
+            self._refused += self._link.refused
+            self._link = None
+            if self._forget_holder is not None:
+                self._forget_holder()
+        if not endpoint.notices:
+            return
+        if endpoint.cause is None:
+            self._since = None
+        elif any(notice.kind == "tripped" for notice in endpoint.notices):
+            self._published_state = endpoint.state
+            self._since = datetime.now(UTC)
+        self._keep_latch()
+        for notice in endpoint.notices:
+            self._role.event(*notice)
+        endpoint.notices.clear()
+        self._status_due = 0
+
+    def publish_when_due(self) -> None:
+        """Publish the status once a second, and at once after an event or a change of state."""
+        if time.monotonic_ns() >= self._status_due:
+            self.publish_status()
+
+    def leave(self) -> None:
+        """Publish the end of the trace, the stop and a last status."""
+        self.follow_session()
+        self._trace.finish()
+        self._latch_file.close()
+        self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
+        self.publish_status()
+
+    # ── queries and tokens from other threads, processed between ticks ──
+
+    def _watch(self, holder: str) -> None:
+        def seen(appeared: bool) -> None:
+            if not appeared:
+                self._role.enqueue(lambda: self._endpoint.lost(holder))
+
+        self._forget_holder = self._role.watch_token(holder, seen)
+
+    def _read_others(self) -> None:
+        """Another plant end publishes under this one's name, as after a network was cut and healed."""
+        self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
+        if (sample := self._others.try_recv()) is not None:
+            with suppress(intake.IntakeError):
+                self._contest(intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).process)
+                self.follow_session()
+
+    def _contest(self, other: str) -> None:
+        if self._endpoint.trip is not TripCause.DUPLICATE:
+            plants = f"this one ({self._role.process}) and another ({other})"
+            text = f"two plants are named {self._role.vehicle}, {plants}; end one of them, then `aeroloop op arm`"
+            self._endpoint.stop(TripCause.DUPLICATE, text)
+
+    def _claim(self, claim: Claim) -> Grant | Refusal:
+        answer = self._endpoint.claim(claim)
+        if isinstance(answer, Refusal):
+            text = f"{claim.controller} refused: {answer.reason}"
+            self._role.warn(text, "refused", text, claim.session)
+            return answer
+        vehicle = self._role.vehicle
+        self._sent_at = [(-1, 0)] * self._counters
+        self._link = ZenohLink(  # before the grant is sent, so that the first command is not lost
+            self._role.zenoh,
+            send_key=topics.key("measurement", vehicle, session=claim.session),
+            receive_key=topics.key("command", vehicle, session=claim.session),
+            lengths=self._endpoint.wire.lengths("command", lockstep=self._loop.lockstep),
+            lossless=self._loop.lockstep,
+            mailbox=Mailbox(self._changed),
+            also=self._role.datagrams.session,
+        )
+        self._watch(claim.controller)
+        return answer
+
+    def _release(self, release: Release) -> Answer:
+        done = self._endpoint.release(release.session)
+        return Answer(done=done, text="released" if done else f"no session {release.session} runs here")
+
+    def _read_record(self, record: SessionRecord) -> Callable[[], Answer]:
+        changes = record_json(record.in_force)  # of many points it takes milliseconds
+        return lambda: self._keep(record, changes)
+
+    def _keep(self, record: SessionRecord, changes: bytes) -> Answer:
+        done = self._endpoint.keep(record)
+        if done:
+            self._trace.record(changes)
+        return Answer(done=done, text="kept" if done else f"no session {record.session} of {record.controller} runs")
+
+    def _show(self) -> SessionRecord | Answer:
+        return self._endpoint.last or Answer(done=False, text=f"{self._role.vehicle} has no record of a session")
+
+    def _arm(self) -> Answer:
+        vehicle = self._role.vehicle
+        if self._endpoint.arm():
+            return Answer(done=True, text=f"{vehicle} is armed: the next controller to claim it may drive it")
+        return Answer(done=False, text=f"{vehicle} is held by {self._endpoint.holder}, so there is nothing to arm")
+
+    def _stop(self, by: str | None) -> Answer:
+        self._endpoint.stop(reason=f"stopped by an operator ({by})" if by else "stopped by an operator")
+        return Answer(done=True, text=f"{self._role.vehicle} is at 0 V; `aeroloop op arm` lets it be driven again")
+
+    def _once_kept(self, change: Callable[[], Answer]) -> Callable[[], Answer]:
+        """Queue a change of the latch, and answer when it is on disk. Waits in the topic's thread, not in the loop."""
+        answers: list[Answer] = []
+        changed = threading.Event()
+
+        def apply() -> None:
+            answers.append(change())
+            self.follow_session()
+            changed.set()
+
+        def answer() -> Answer:
+            if not (unkept := self._latch_file.unkept):
+                return answers[0]
+            return answers[0].model_copy(
+                update={"text": f"{answers[0].text}; but a restart of the plant would forget it: {unkept}"}
+            )
+
+        self._role.enqueue(apply)
+        changed.wait(KEPT_S)
+        self._latch_file.wait()
+        return answer
+
+    def _keep_latch(self) -> None:
+        endpoint, latch = self._endpoint, None
+        if endpoint.trip is not None and endpoint.cause is not None and self._since is not None:
+            latch = Latch(
+                cause=endpoint.trip, text=endpoint.cause, operator_only=endpoint.operator_only, since=self._since
+            )
+        self._latch_file.keep(latch)
+
+    def publish_status(self) -> None:
+        """Publish the status."""
+        now = time.monotonic()
+        endpoint = self._endpoint
+        self._latency.turn_when_due()
+        self._role.status(
+            Status(
+                role=self._role.role,
+                state=endpoint.state,
+                session=endpoint.session,
+                cause=endpoint.cause,
+                since=self._since,
+                unkept=self._latch_file.problem,
+                datagrams=self._role.datagrams.endpoint,
+                uptime_s=self._role.uptime_s,
+                ticks=endpoint.ticked + 1,
+                rate_hz=max(0.0, (endpoint.ticked - self._status_tick) / (now - self._status_time)),
+                skipped=self.skipped,
+                received=self._received,
+                sent=self._sent,
+                refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
+                stale=endpoint.stale,
+                saturated=endpoint.saturated,
+                latency_us=summary(self._latency.total),
+                recent_latency_us=summary(self._latency.recent()),
+                timing=report(self.timing) if self.timing else None,
+                notes=self.notes,
+                lacks_recorder="gone" if self._recorder.gone else None,
+                faults=self._faults(),
+            )
+        )
+        self._status_tick, self._status_time = endpoint.ticked, now
+        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
+
+
+class PlantTrace:
+    """Trace of the plant end: a row for every tick of a session, and the operations between ticks.
+
+    The owner adds a row after each measurement was sent, and calls `follow` whenever a session may have begun or ended.
+    All waiting rows are published when a session ends; operations outside of sessions at once, without rows. `publish`
+    is called with every batch; `run` is the random number that identifies this process, drawn if None.
+    """
+
+    def __init__(
+        self, loop: LoopSettings, wire: WireSpec, publish: Callable[[bytes], None], run: int | None = None
+    ) -> None:
+        self._publish = publish
+        self._command_bytes = wire.command.size
+        run = secrets.randbits(64) if run is None else run
+        self._writer = TraceWriter("plant", wire, run, round(loop.trace_s * 1e9))
+
+    def row(self, end: VehicleClaim, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
+        """Add the row of the last tick, and publish a batch that is due. Nothing without a session.
+
+        The arguments are those of `PlantNetwork.after_tick`; `measurement` is None if the tick tripped.
+        """
+        writer = self._writer
+        if not writer.session:
+            return
+        if arrival is None:
+            command, received_ns, received_as = b"", 0, 0
+        else:
+            command, received_ns = arrival
+            if len(command) == self._command_bytes:
+                received_as = 1
+            else:
+                received_as, command = (Sent.SILENT if command == SILENCE else Sent.MALFORMED), b""
+        writer.plant_row(
+            end.ticked,
+            end.session_tick,
+            1 if measurement else 0 if measurement is None else 2,
+            received_as,
+            end.outcome,
+            0 if end.session or end.trip is None else end.trip.number,
+            end.answered,
+            sent_ns,
+            received_ns,
+            measurement or b"",
+            command,
+            end.voltages,
+        )
+        if writer.due(sent_ns):
+            self._publish_batch(final=False)
+
+    def follow(self, end: VehicleClaim) -> None:
+        """Move the end's operations into the trace; publish everything waiting if its session ended or none runs."""
+        writer = self._writer
+        if end.changes:
+            writer.operations += end.changes
+            end.changes.clear()
+        session = end.session or ""
+        if session != writer.session:
+            if writer.session or not writer.empty:  # the last batch is marked final, with or without rows
+                self._publish_batch(final=bool(writer.session))
+            writer.session, writer.record = session, b""
+        elif not session and not writer.empty:
+            self._publish_batch(final=False)
+
+    def record(self, changes: bytes) -> None:
+        """Take over the running session's gains and reference, as `record_json` has them, for later batches."""
+        self._writer.record = changes
+
+    def finish(self) -> None:
+        """Publish everything waiting, before the process ends."""
+        if self._writer.session or not self._writer.empty:
+            self._publish_batch(final=bool(self._writer.session))
+
+    def _publish_batch(self, *, final: bool) -> None:
+        self._publish(self._writer.take(time.monotonic_ns(), time.time_ns(), final=final))

@@ -1,0 +1,311 @@
+"""History: numbered messages, the last of which their publisher keeps, and a subscriber that queries what it lacks.
+
+A message is dropped where a peer does not keep up: no publisher ever waits. A subscriber hands on what it receives at
+once, in the order of arrival, and keeps for each publisher the ranges of numbers that it lacks. It queries these a page
+at a time, the newest first, so no more is under way than a slow link carries.
+"""
+
+from __future__ import annotations
+
+import secrets
+import struct
+import time
+from bisect import bisect_right
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from math import ceil, inf
+from threading import Lock
+from typing import Final, NamedTuple
+
+import zenoh
+from zenoh.handlers import Callback
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Loss, LossReason
+
+KEPT_S: Final = 65.0
+"""Publishers keep what they publish in this time [s]; one that has been silent for so long is gone."""
+ANSWER_S: Final = 3.0
+"""Time-out of a query [s]; what has been silent for so long cannot be reached now."""
+PAGE_BYTES: Final = 16_384
+"""Most bytes of a page with more than one message: 64 kbit/s carry it in 2 s."""
+WAITING_BYTES: Final = 8_388_608
+"""Most bytes that wait to be taken, with 200 for each message; what finds no room stays lacking."""
+SOON_S, SELDOM_S = 0.025, 0.5
+"""Least and longest pause between two queries [s]: a process takes 50 a second."""
+MOST, RANGES = 256, 4096
+"""Publishers that a subscriber knows, and ranges in a query; ranges that it lacks of each publisher."""
+
+_ATTACHMENT: Final = struct.Struct("<qQQ")  # wall clock, publisher, number
+_RANGE: Final = struct.Struct("<QQQ")  # publisher, first number, number after the last
+_PAGE: Final = struct.Struct("<QQQ")  # publisher, oldest number that is kept, how many were published
+_ITEM: Final = struct.Struct("<QqI")  # number, wall clock, length
+_END: Final = 2**64 - 1
+ADDED_BYTES: Final = _PAGE.size + _ITEM.size
+"""What a page adds to its only message; an attachment adds less."""
+
+Range = tuple[int, int]
+"""A number, and the one after the last."""
+
+
+class Delivery(NamedTuple):
+    """A received message; of one that has no number, `number` is 0, and its publisher and time [ns] are None."""
+
+    key: str
+    payload: bytes
+    number: int
+    published_ns: int | None
+    publisher: int | None
+
+
+def attachment(clock_ns: int, publisher: int, number: int) -> bytes:
+    """What goes with a message: time of publication [ns since 1970], publisher, number."""
+    return _ATTACHMENT.pack(clock_ns, publisher, number)
+
+
+def read_sample(sample: zenoh.Sample) -> Delivery:
+    """Convert a sample of a cached publisher, or of any other."""
+    key, payload, attached = str(sample.key_expr), sample.payload.to_bytes(), sample.attachment
+    if attached is None or len(data := attached.to_bytes()) != _ATTACHMENT.size:
+        return Delivery(key, payload, 0, None, None)
+    clock_ns, publisher, number = _ATTACHMENT.unpack(data)
+    return Delivery(key, payload, number, clock_ns, publisher)
+
+
+def query(ranges: Sequence[tuple[int, Range]]) -> bytes:
+    """Query of caches: publishers, each with a range that is wanted, the most wanted first."""
+    return b"".join(_RANGE.pack(publisher, *each) for publisher, each in ranges)
+
+
+def page(data: bytes, publisher: int, kept: Sequence[tuple[int, int, bytes]]) -> bytes | None:
+    """Answer to a query by a publisher that keeps these messages (number, wall clock, payload); None to no query.
+
+    The page has what is wanted from the end of the first range backwards, as much as fits.
+    """
+    if len(data) % _RANGE.size or len(data) > MOST * _RANGE.size:
+        return None
+    oldest, count = (kept[0][0], kept[-1][0] + 1) if kept else (0, 0)
+    parts, size = [_PAGE.pack(publisher, oldest, count)], _PAGE.size
+    ranges = [(first, end) for who, first, end in _RANGE.iter_unpack(data) if who == publisher] or [(0, _END)]
+    for first, end in ranges:
+        for i in range(min(end, count) - oldest - 1, max(first - oldest, 0) - 1, -1):
+            number, clock_ns, payload = kept[i]
+            size += _ITEM.size + len(payload)
+            if len(parts) > 1 and size > PAGE_BYTES:
+                return b"".join(parts)
+            parts += [_ITEM.pack(number, clock_ns, len(payload)) + payload]
+    return b"".join(parts)
+
+
+class CachedPublisher:
+    """Publishes on one key, from any thread, and answers for the last messages. The session outlives the publisher.
+
+    `per_s` bounds the messages per second, in the long run. If `lossless`, for lockstep, it waits for peers that do not
+    keep up instead of dropping.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        per_s: float,
+        *,
+        lossless: bool = False,
+        encoding: zenoh.Encoding = zenoh.Encoding.APPLICATION_JSON,
+    ) -> None:
+        control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        self._publisher = session.declare_publisher(key, encoding=encoding, congestion_control=control)
+        self._id, self._count = secrets.randbits(64), 0
+        self._kept: deque[tuple[int, int, bytes]] = deque(maxlen=ceil(KEPT_S * per_s))
+        self._lock, self._cache_key = Lock(), topics.cache_key(key)
+        # Answered in a thread of Python: in Zenoh's own, all else would wait while a slow peer takes a page.
+        self._queryable = session.declare_queryable(self._cache_key, self._answer)
+
+    def put(self, payload: bytes) -> None:
+        """Publish a message."""
+        with self._lock:
+            number, clock_ns = self._count, time.time_ns()
+            self._count += 1
+            self._kept.append((number, clock_ns, payload))
+            self._publisher.put(payload, attachment=attachment(clock_ns, self._id, number))
+
+    def _answer(self, asked: zenoh.Query) -> None:
+        with asked, suppress(zenoh.ZError):  # closed meanwhile
+            with self._lock:
+                kept = list(self._kept)
+            if (answer := page(asked.payload.to_bytes() if asked.payload else b"", self._id, kept)) is not None:
+                asked.reply(self._cache_key, answer)
+
+
+class _Source:
+    """Numbers of one publisher; what is older than the first contact, `since`, is not lost if a cache drops it."""
+
+    def __init__(self, since: int) -> None:
+        self.since, self.end, self.seen, self.answered = since, 0, 0.0, False
+        self.lacks: list[Range] = []  # ascending
+
+    def extend(self, end: int) -> None:
+        """All numbers before `end` were published."""
+        if end > self.end:
+            adjacent = self.lacks and self.lacks[-1][1] == self.end
+            self.lacks.append((self.lacks.pop()[0] if adjacent else self.end, end))
+            self.end = end
+
+    def remove(self, number: int) -> bool:
+        """Remove a number from what is lacking; whether it was."""
+        at = bisect_right(self.lacks, (number, _END)) - 1
+        if at < 0 or number >= self.lacks[at][1]:
+            return False
+        first, end = self.lacks[at]
+        self.lacks[at : at + 1] = [each for each in ((first, number), (number + 1, end)) if each[0] < each[1]]
+        return True
+
+    def leave(self, before: int, since: int = 0) -> int:
+        """Remove what is lacking before a number; returns how much of it is not older than `since`."""
+        lost = sum(max(0, min(end, before) - max(first, since)) for first, end in self.lacks)
+        self.lacks = [(max(first, before), end) for first, end in self.lacks if end > before]
+        return lost
+
+
+class RecoveringSubscriber:
+    """Subscriber that queries publishers' caches for what it did not receive. The session outlives it.
+
+    `clock` is monotonic [s].
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._session, self._cache_key, self._lock = session, topics.cache_key(key), Lock()
+        self._waiting, self._bytes = list[Delivery](), 0
+        self._sources: dict[tuple[str, int], _Source] = {}  # by key: a page on one key says nothing of another
+        self._lost: Counter[tuple[str, LossReason]] = Counter()
+        self._asked = self._complete = -inf  # the last query, and the last that is complete
+        self._pause, self.news = SOON_S, -inf
+        """When a page last brought a message, by the clock [s]."""
+        self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
+
+    def take(self, *, last: bool = False) -> list[Delivery]:
+        """Messages that wait, each once, in the order of arrival. Never waits.
+
+        Also queries the caches, if the last query is answered: 25 ms later while pages bring messages, and if these are
+        the `last` messages, else ever more seldom.
+        """
+        free = max(self._complete, self.news) >= self._asked
+        if free and self._clock() >= self._asked + (SOON_S if last else self._pause):
+            self._query()
+        with self._lock:
+            taken, self._waiting, self._bytes = self._waiting, [], 0
+        return taken
+
+    @property
+    def recovering(self) -> bool:
+        """Whether an answer is awaited, pages bring messages, or some are lacking that can be reached."""
+        return self._pause < SELDOM_S or not self.complete(self._asked)
+
+    def complete(self, since: float) -> bool:
+        """Whether a query after `since` [s] is answered, and nothing lacks that can be reached."""
+        with self._lock:
+            lacks = any(source.lacks and self._reachable(source) for source in self._sources.values())
+            return self._complete >= since and not lacks
+
+    def losses(self, *, finished: bool = False) -> list[Loss]:
+        """Losses since the last call; if `finished`, all that is lacking is lost."""
+        with self._lock:
+            for (key, _), source in self._sources.items() if finished else ():
+                self._leave(key, source, source.end, "end" if self._reachable(source) and source.answered else "gone")
+            lost, self._lost = self._lost, Counter()
+        return [Loss(key=key, count=count, reason=reason) for (key, reason), count in lost.items()]
+
+    def silent(self) -> dict[str, float]:
+        """For how long nothing was received of publishers that cannot be reached and may still have messages [s]."""
+        with self._lock:
+            ages = {key: self._clock() - source.seen for (key, _), source in self._sources.items()}
+        return {key: age for key, age in ages.items() if ANSWER_S < age < KEPT_S}
+
+    def _query(self) -> None:
+        """Query the caches for what is lacking, of each publisher the newest first, or else for what is newer."""
+        with self._lock:
+            self._asked = asked = self._clock()
+            self._pause = min(2 * self._pause, SELDOM_S)
+            wanted, each_has = list[tuple[int, Range]](), MOST // max(1, len(self._sources))
+            for (key, publisher), source in self._sources.items():
+                if asked - source.seen > KEPT_S:
+                    self._leave(key, source, source.end, "gone")
+                ranges = source.lacks[: -each_has - 1 : -1] or [(source.end, _END)]
+                wanted += [(publisher, each) for each in ranges]
+        with suppress(zenoh.ZError):  # the session is closed
+            self._session.get(
+                self._cache_key,
+                Callback(self._read, lambda: self._completed(asked), indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=ANSWER_S,
+                # An answer has its query's priority and is dropped as it is: it holds up nothing else.
+                priority=zenoh.Priority.DATA_LOW,
+                congestion_control=zenoh.CongestionControl.DROP,
+                payload=query(wanted),
+            )
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        message = read_sample(sample)
+        with self._lock:
+            if message.publisher is None:
+                self._add(message)
+                return
+            source = self._source(message.key, message.publisher, message.number)
+            source.extend(message.number + 1)
+            self._add(message, source)
+            if len(source.lacks) > RANGES:
+                self._leave(message.key, source, source.lacks[1][0], "cache")
+
+    def _read(self, reply: zenoh.Reply) -> None:
+        """Take a page; what is malformed is ignored."""
+        data = reply.ok.payload.to_bytes() if reply.ok is not None else b""
+        at, found = _PAGE.size, list[tuple[int, int, bytes]]()
+        while at + _ITEM.size <= len(data):
+            number, clock_ns, length = _ITEM.unpack_from(data, at)
+            at += _ITEM.size + length
+            found.append((number, clock_ns, data[at - length : at]))
+        if reply.ok is None or at != len(data):
+            return
+        key, (publisher, oldest, count) = topics.cached_key(str(reply.ok.key_expr)), _PAGE.unpack_from(data)
+        with self._lock:
+            source = self._source(key, publisher, count)
+            source.extend(count)
+            new = [self._add(Delivery(key, each[2], each[0], each[1], publisher), source) for each in reversed(found)]
+            self._leave(key, source, oldest, "cache")
+            source.answered = True
+            if any(new):
+                self.news, self._pause = self._clock(), SOON_S
+
+    def _completed(self, asked: float) -> None:
+        self._complete = max(self._complete, asked)
+
+    def _source(self, key: str, publisher: int, since: int) -> _Source:
+        source = self._sources.get((key, publisher))
+        if source is None:
+            if len(self._sources) >= MOST:
+                silent = min(self._sources, key=lambda each: self._sources[each].seen)
+                self._leave(silent[0], self._sources[silent], _END, "gone")
+                del self._sources[silent]
+            source = self._sources[key, publisher] = _Source(since)
+        source.seen = self._clock()
+        return source
+
+    def _add(self, message: Delivery, source: _Source | None = None) -> bool:
+        """Add a message to those that wait, unless there is no room or it is a duplicate."""
+        size = len(message.payload) + 200
+        if (self._bytes and self._bytes + size > WAITING_BYTES) or (source and not source.remove(message.number)):
+            return False
+        self._waiting.append(message)
+        self._bytes += size
+        return True
+
+    def _leave(self, key: str, source: _Source, before: int, reason: LossReason) -> None:
+        since = source.since if reason == "cache" or not source.answered else 0
+        if lost := source.leave(before, since):
+            self._lost[key, reason] += lost
+
+    def _reachable(self, source: _Source) -> bool:
+        return self._clock() - source.seen < ANSWER_S

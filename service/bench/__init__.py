@@ -1,1 +1,0 @@
-"""Bench: what this project takes beside what the machine gives, item by item, in one run."""

@@ -1,0 +1,60 @@
+"""What the predicted tables depend on: errors after each change of what was not fitted, and how open a fit leaves it.
+
+uv run python -m tests.benchmarks.sensitivity
+
+7 bits of the input stand for every row of Tables C.2 and C.3. ± are standard deviations of a least-squares fit to the
+eight figures of Table C.4, which scatter as the published cells do about their column means.
+"""
+
+import numpy as np
+
+from aeroloop.service.config import load
+from aeroloop.service.lab import paper
+from aeroloop.service.lab.cells import Cell, Pool
+from aeroloop.service.lab.tables import CASES
+
+PLANT = load().plant
+PITCH, YAW = PLANT.friction.coulomb
+CHANGES = {
+    "as configured": [],
+    "rate from a gyro": ["plant.sensors.rate=gyro"],
+    "perfect sensors": ["plant.sensors.rate=perfect", "plant.sensors.attitude=perfect"],
+    "rate filter at 25 rad/s": ["plant.sensors.bandwidth=25"],
+    "rotor lag 0.08 s up, 0.091 s down": ["plant.rotor.lag_up_s=0.08", "plant.rotor.lag_down_s=0.0914"],
+    "dead zone 2.5 V": ["plant.rotor.dead_zone_v=2.5"],
+    "thrust 5 % weaker": [f"plant.aero.thrust={(0.95 * np.array(PLANT.aero.thrust)).tolist()}"],
+    "yaw viscous 0.0095 N·m·s/rad": [f"plant.friction.viscous=[{PLANT.friction.viscous[0]}, 0.0095]"],
+    "no Coulomb friction about pitch": [f"plant.friction.coulomb=[0, {YAW}]"],
+    "both as published": [f"plant.friction.coulomb=[{PITCH}, 0.0037]", "plant.aero.centre_of_mass=[0, 0, -0.0038]"],
+    "wind without gusts": ["plant.wind.gust=0"],
+    "loop at 1 kHz (and other gusts)": ["loop.rate_hz=1000"],
+}
+FITTED = "yaw Coulomb friction, N·m", "height, m", "wind about pitch, N·m", "wind about yaw, N·m", "dead zone, V"
+SCALE = np.array([0.0037, 0.0038, 0.01, 0.01, 2.5])
+KEYS = "friction.coulomb=[{p}, {}]|aero.centre_of_mass=[0, 0, {}]|wind.torque=[{}, {}]|rotor.dead_zone_v={}"
+TABLE_C4 = np.array([list(paper.WIND[case][air].values()) for case in CASES for air in ("calm", "wind")])
+
+
+def main() -> None:
+    """Run 60 cells of the tables and 24 of the fit, and print both."""
+    x = np.array([YAW, PLANT.aero.centre_of_mass[2], *PLANT.wind.torque, 0.0])
+    steps = [x, *(x + np.diag(0.1 * SCALE))]
+    probes = [[f"plant.{key}" for key in KEYS.format(*p, p=PITCH).split("|")] for p in steps]
+    row = [Cell(out, 7) for out in paper.OUTPUT_BITS] + [Cell(8, 6, windy=True)]
+    corners = [Cell(*bits, windy) for bits in CASES.values() for windy in (False, True)]
+    with Pool() as pool:
+        tables = np.array(pool.run([(load(overrides=o), cell) for o in CHANGES.values() for cell in row]))
+        fits = np.array(pool.run([(load(overrides=o), cell) for o in probes for cell in corners]))
+    fits = fits.reshape(len(probes), len(corners), 2)
+    for name, (*calm, windy) in zip(CHANGES, tables.reshape(-1, len(row), 2), strict=True):
+        published = np.array([paper.Z_TRACK, paper.U_TOTAL])  # the last of each is fitted
+        errors = np.abs(np.array(calm).T[:, None] / published - 1).reshape(2, -1)[:, :-1].mean(axis=1)
+        print(f"{name:34s} {errors[0]:6.1%} {errors[1]:7.2%} {np.abs(windy / TABLE_C4[3] - 1).mean():6.1%}")
+    J = ((fits[1:] - fits[0]) / TABLE_C4 / paper.SCATTER / 0.1).reshape(len(x), -1).T
+    alone, jointly = SCALE / np.linalg.norm(J, axis=0), SCALE * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    for name, value, one, both in zip(FITTED, x, alone, jointly, strict=True):
+        print(f"{name:34s} {value:.3g} ± {one:.2g} if the others are known, ± {both:.2g} jointly")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""Stored logs read as they did: figures, findings and replays, to the last digit that is printed."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.golden.make import HERE, LOGS, expected
+
+
+def differences(stored: Any, found: Any, where: str = "") -> list[str]:
+    """Values that are not the same, by their path."""
+    if isinstance(stored, dict) and isinstance(found, dict):
+        return [
+            line
+            for key in sorted(stored.keys() | found.keys())
+            for line in differences(stored.get(key, "no key"), found.get(key, "no key"), f"{where}.{key}")
+        ]
+    if isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
+        return [
+            line
+            for i, pair in enumerate(zip(stored, found, strict=True))
+            for line in differences(*pair, f"{where}[{i}]")
+        ]
+    return [] if stored == found else [f"{where}: {stored!r} stored, {found!r} found"]
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_stored_log_gives_the_figures_findings_and_replays_that_it_gave(name: str) -> None:
+    assert differences(json.loads((HERE / f"{name}.json").read_text()), expected(name)) == []

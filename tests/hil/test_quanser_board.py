@@ -1,0 +1,29 @@
+"""Conformance suite against the driver of Quanser's board, as a process that imports the fake for Quanser's package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from aeroloop.service.testing.conformance.test_plant_end import *  # noqa: F403  # the suite
+from aeroloop.service.testing.fork_server import fork_server
+
+SDK = Path(__file__).parents[1] / "support" / "quanser_sdk"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fake_package() -> Iterator[None]:
+    """Let processes find the fake where Quanser's package would be: their server imports from PYTHONPATH, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(SDK))
+        fork_server().close()
+        yield
+        fork_server().close()
+
+
+@pytest.fixture
+def hil_plant() -> str:
+    """The board."""
+    return "quanser"

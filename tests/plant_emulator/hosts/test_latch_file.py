@@ -1,0 +1,286 @@
+"""A trip or a stop outlives the plant's process: its file, and an emulator on Zenoh that ends and starts again."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from aeroloop.plant_emulator.hosts import latch_file
+from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
+from aeroloop.plant_emulator.hosts.latch_file import Latch, LatchFile, state_directory
+from aeroloop.plant_emulator.settings import PlantSettings
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Status
+from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
+
+LOOP, WIRE = LoopSettings(realtime="off", rate_hz=100), WireSpec()
+STOP = Latch(
+    cause=TripCause.OPERATOR, text="stopped: 0 V", operator_only=True, since=datetime(2026, 11, 23, tzinfo=UTC)
+)
+TRIP = Latch(
+    cause=TripCause.ENVELOPE, text="tilted: 0 V", operator_only=False, since=datetime(2026, 11, 24, tzinfo=UTC)
+)
+
+
+@contextmanager
+def kept_in(folder: Path) -> Iterator[LatchFile]:
+    """The file of a plant, as one process has it."""
+    file = LatchFile(folder, "aero")
+    try:
+        yield file
+    finally:
+        file.close()
+
+
+def test_the_next_process_finds_the_newest_latch_and_none_after_it_was_cleared(tmp_path: Path) -> None:
+    for before, after in ((None, TRIP), (TRIP, STOP), (STOP, None), (None, None)):
+        with kept_in(tmp_path / "state") as file:
+            assert file.found == before
+            file.keep(after)
+            file.wait()
+            assert file.unkept is None
+    assert [*(tmp_path / "state").iterdir()] == []
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", STOP.model_dump_json().encode()[:-9], b'{"cause": "sun"}', None])
+def test_a_file_that_cannot_be_read_counts_as_a_stop_and_is_named(tmp_path: Path, damage: bytes | None) -> None:
+    path = tmp_path / "aero.json"
+    path.mkdir() if damage is None else path.write_bytes(damage)
+    with kept_in(tmp_path) as file:
+        assert file.found is not None
+        assert (file.found.cause, file.found.operator_only) == (TripCause.OPERATOR, True)
+        assert str(path) in file.found.text
+
+
+def test_a_full_disk_is_said_leaves_the_file_whole_and_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = [False]
+
+    def fsync(descriptor: int) -> None:
+        if full[0]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        del descriptor
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(latch_file, "RETRY_S", 0.01)
+    with kept_in(tmp_path) as file:
+        file.keep(TRIP)
+        file.wait()
+        full[0] = True
+        file.keep(STOP)
+        file.wait()
+        assert "No space left on device" in str(file.unkept)
+        assert Latch.model_validate_json(file.path.read_bytes()) == TRIP
+        full[0] = False
+        eventually("another attempt", lambda: file.unkept is None)
+        assert Latch.model_validate_json(file.path.read_bytes()) == STOP
+
+
+def test_the_folder_is_systemds_or_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/aeroloop:/var/lib/other")
+    monkeypatch.setenv("XDG_STATE_HOME", "/home/alice/state")
+    assert state_directory() == Path("/var/lib/aeroloop")
+    monkeypatch.delenv("STATE_DIRECTORY")
+    assert state_directory() == Path("/home/alice/state/aeroloop")
+    monkeypatch.delenv("XDG_STATE_HOME")
+    assert state_directory() == Path("~/.local/state/aeroloop")
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer waits for the disk as long as a shared machine takes, which is sometimes half a second and more."""
+    monkeypatch.setattr(latch_file, "KEPT_S", PATIENCE_S)
+
+
+class Plant:
+    """A process of the plant: an emulator on a network of its own, armed at its start."""
+
+    def __init__(self, folder: Path) -> None:
+        self._gathering = Gathering()
+        self._role = Role("plant", "aero", self._gathering.settings, {})
+        settings = PlantSettings(state_directory=folder, armed_at_start=True)
+        self.emulator = EmulatorOnZenoh(self._role, LOOP, WIRE, settings)
+        self._session = self._gathering.join()
+        self.events: list[Event] = []
+        key = topics.key("event", "aero", role="plant")
+        self._session.declare_subscriber(
+            key, lambda sample: self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
+        )
+        self._claims = 0
+        self._thread = threading.Thread(target=self.emulator.run)
+
+    def __enter__(self) -> Plant:
+        self._thread.start()
+        eventually("a status", lambda: b"uptime_s" in self._ask("status", b""))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._role.stop.set()  # as SIGTERM does
+        self._thread.join()
+        self._role.__exit__()
+        self._gathering.__exit__(None, None, None)
+
+    def status(self) -> Status:
+        """Its status."""
+        return Status.model_validate_json(self._ask("status", b""))
+
+    def stop(self) -> Answer:
+        """As `aeroloop op stop` does."""
+        return Answer.model_validate_json(self._ask("stop", Request(by="alice@bench").encode()))
+
+    def arm(self) -> Answer:
+        """As `aeroloop op arm` does."""
+        return Answer.model_validate_json(self._ask("arm", Request().encode()))
+
+    def claim(self, *, auto_arm: bool) -> Grant | Refusal:
+        """As a controller does."""
+        self._claims += 1
+        claim = Claim(
+            controller="c",
+            session=f"s{self._claims}",
+            period_ns=LOOP.period_ns,
+            lockstep=False,
+            auto_arm=auto_arm,
+            wire=WIRE,
+        )
+        payload = self._ask("claim", claim.encode())
+        return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
+
+    def trip(self) -> None:
+        """Trip it in a session; not by an operator."""
+        assert isinstance(self.claim(auto_arm=False), Grant)
+        self._role.enqueue(lambda: self.emulator.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
+        eventually("the trip", lambda: self.emulator.endpoint.trip is not None)
+
+    def _ask(self, topic: str, payload: bytes) -> bytes:
+        answers: list[bytes] = []
+
+        def answered() -> bool:
+            for reply in self._session.get(topics.key(topic, "aero", role="plant"), payload=payload):
+                if reply.ok is not None:
+                    answers.append(reply.ok.payload.to_bytes())
+            return bool(answers)
+
+        eventually(f"an answer to {topic}", answered)
+        return answers[0]
+
+
+def assert_stopped_until_armed(plant: Plant) -> None:
+    for auto_arm in (True, False):
+        refusal = plant.claim(auto_arm=auto_arm)
+        assert isinstance(refusal, Refusal)
+        assert refusal.reason == "stopped by an operator (alice@bench): 0 V; `aeroloop op arm` clears it"
+    assert plant.arm().done
+    assert isinstance(plant.claim(auto_arm=False), Grant)
+
+
+def test_a_stop_holds_in_the_next_process_until_arm_whether_the_plant_was_killed_or_terminated(tmp_path: Path) -> None:
+    with Plant(tmp_path / "terminated") as plant:
+        assert plant.stop().text == "aero is at 0 V; `aeroloop op arm` lets it be driven again"
+        shutil.copytree(tmp_path / "terminated", tmp_path / "killed")  # all that is left if it is killed now
+        since = plant.status().since
+        assert since is not None
+    for how in ("killed", "terminated"):
+        with Plant(tmp_path / how) as plant:
+            status = plant.status()
+            assert (status.state, status.since) == (PlantState.TRIPPED, since)
+            text = (
+                f"stopped by an operator (alice@bench): 0 V ({since:%Y-%m-%d %H:%M:%S} UTC); `aeroloop op arm` clears"
+            )
+            eventually("its event", lambda: any(text in event.text for event in plant.events))  # noqa: B023
+            assert_stopped_until_armed(plant)
+        with Plant(tmp_path / how) as plant:
+            assert isinstance(plant.claim(auto_arm=False), Grant)
+
+
+def test_a_trip_holds_in_the_next_process_until_arm_or_a_claim_with_auto_arm(tmp_path: Path) -> None:
+    with Plant(tmp_path) as plant:
+        plant.trip()
+    with Plant(tmp_path) as plant:
+        refusal = plant.claim(auto_arm=False)
+        assert isinstance(refusal, Refusal)
+        assert "tilted by 80°: 0 V" in refusal.reason
+        assert isinstance(plant.claim(auto_arm=True), Grant)
+    with Plant(tmp_path) as plant:
+        plant.trip()
+        assert plant.stop().done
+    with Plant(tmp_path) as plant:
+        refusal = plant.claim(auto_arm=True)
+        assert isinstance(refusal, Refusal)
+        assert "tilted by 80°: 0 V; then stopped by an operator (alice@bench)" in refusal.reason
+        assert plant.arm().done
+    with Plant(tmp_path) as plant:
+        assert isinstance(plant.claim(auto_arm=False), Grant)
+
+
+def test_the_answer_to_a_stop_waits_for_the_disk_and_0_v_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stuck, freed = threading.Event(), threading.Event()
+    with Plant(tmp_path) as plant:
+        path, on_disk, answers = tmp_path / "aero.json", list[bool](), list[Answer]()
+
+        def fsync(descriptor: int) -> None:
+            stuck.set()
+            assert freed.wait(PATIENCE_S), descriptor
+
+        def stop() -> None:
+            answers.append(plant.stop())
+            on_disk.append(path.exists())
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        operator = threading.Thread(target=stop)
+        operator.start()
+        assert stuck.wait(PATIENCE_S)
+        assert plant.emulator.endpoint.trip is TripCause.OPERATOR
+        ticked = plant.emulator.endpoint.ticked
+        eventually("a loop that goes on", lambda: plant.emulator.endpoint.ticked > ticked + 10)
+        assert answers == []
+        freed.set()
+        operator.join()
+        assert [(answer.done, "forget" in answer.text) for answer in answers] == [(True, False)]
+        assert on_disk == [True]
+
+
+def unwritable(folder: Path) -> Path:
+    """A folder that even root cannot make."""
+    (folder / "file").touch()
+    return folder / "file" / "state"
+
+
+def test_a_plant_that_cannot_keep_a_stop_stops_and_says_so_in_its_answer_and_its_status(tmp_path: Path) -> None:
+    with Plant(unwritable(tmp_path)) as plant:
+        why = f"{tmp_path}/file/state/aero.json cannot be written (Not a directory)"
+        eventually("the status", lambda: why in str(plant.status().unkept))
+        answer = plant.stop()
+        assert answer.done
+        assert "at 0 V" in answer.text
+        assert f"but a restart of the plant would forget it: {why}" in answer.text
+        assert plant.emulator.endpoint.trip is TripCause.OPERATOR
+        assert plant.arm().text == "aero is armed: the next controller to claim it may drive it"
+
+
+def test_a_disk_that_hangs_is_named_in_the_answer_and_in_the_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(latch_file, "KEPT_S", 0.1)
+    with Plant(tmp_path) as plant:
+        freed = threading.Event()
+        monkeypatch.setattr(os, "fsync", lambda _: freed.wait(PATIENCE_S))
+        assert "aero.json is not written yet" in plant.stop().text
+        eventually("the status", lambda: "not written yet" in str(plant.status().unkept))
+        freed.set()

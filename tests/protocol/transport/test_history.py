@@ -1,0 +1,410 @@
+"""History: each message once, and nothing lost that a cache still holds, whatever the network does."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.models import Loss
+from aeroloop.protocol.transport import history
+from aeroloop.protocol.transport.history import (
+    ANSWER_S,
+    KEPT_S,
+    MOST,
+    PAGE_BYTES,
+    CachedPublisher,
+    Delivery,
+    RecoveringSubscriber,
+    attachment,
+    page,
+    query,
+)
+from tests.support.zenoh_network import Gathering, eventually
+
+KEY = "aeroloop/aero/trace/plant"
+ANY = "aeroloop/*/trace/*"
+OURS = 4711
+
+
+class Made:
+    """A publisher and a subscriber, with a network between them that does what a test says.
+
+    Attributes:
+        now: Time of the subscriber's clock [s].
+        count: How many messages were published.
+        queries: Queries that are not answered yet, and what takes their answers.
+        found: Numbers that were delivered, in order.
+    """
+
+    def __init__(self, kept: int, key: str = KEY, publisher: int = OURS, size: int = 0) -> None:
+        self.now = 0.0
+        self.count = 0
+        self.queries: list[tuple[bytes, Any]] = []
+        self.found: list[int] = []
+        self._key, self._publisher, self._size = key, publisher, size
+        self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=kept)
+        self.subscriber = RecoveringSubscriber(self, ANY, lambda: self.now)  # type: ignore[arg-type]  # as a session
+
+    def declare_subscriber(self, _: str, handler: Any) -> Any:
+        self._receive = handler.callback
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def get(self, _: str, handler: Any, *, payload: bytes, **__: object) -> None:
+        self.queries.append((payload, handler))
+
+    def publish(self) -> int:
+        number = self.count
+        self.kept.append((number, 10 * number, b"%d" % number + bytes(self._size)))
+        self.count += 1
+        return number
+
+    def receive(self, number: int, publisher: int | None = None, key: str | None = None) -> None:
+        attached = zenoh.ZBytes(attachment(10 * number, publisher or self._publisher, number))
+        payload = zenoh.ZBytes(b"%d" % number + bytes(self._size))
+        self._receive(SimpleNamespace(key_expr=key or self._key, payload=payload, attachment=attached))
+
+    def answer(self, asked: bytes) -> bytes:
+        found = page(asked, self._publisher, self.kept)
+        assert found is not None
+        return found
+
+    def reply(self, handler: Any, data: bytes, key: str | None = None) -> None:
+        ok = SimpleNamespace(payload=zenoh.ZBytes(data), key_expr=f"{key or self._key}/@cache")
+        handler.callback(SimpleNamespace(ok=ok))
+
+    def take(self) -> list[int]:
+        taken = self.subscriber.take()
+        for each in taken:
+            assert each.payload.rstrip(b"\0") == b"%d" % each.number
+            assert (each.published_ns, each.publisher) == (10 * each.number, self._publisher)
+        self.found += [each.number for each in taken]
+        return [each.number for each in taken]
+
+    def answer_all(self) -> None:
+        """Answer every query, and what follows from it, until nothing is lacking."""
+        self.now += 0.5
+        begun = self.now
+        while not self.subscriber.complete(begun):
+            assert self.now < begun + 1e3, "what is lacking is neither received nor lost"
+            self.take()
+            self.now += 0.5
+            while self.queries:
+                asked, handler = self.queries.pop()
+                self.reply(handler, self.answer(asked))
+                handler.drop()
+        self.take()
+
+    def lost(self, *, finished: bool = False) -> list[tuple[int, str]]:
+        return [(loss.count, loss.reason) for loss in self.subscriber.losses(finished=finished)]
+
+
+@settings(deadline=None)
+@given(
+    kept=st.integers(1, 40),
+    before=st.integers(0, 60),
+    events=st.lists(
+        st.sampled_from(["received", "twice", "dropped", "late", "catch up", "ask", "page", "none"]), max_size=60
+    ),
+    size=st.sampled_from([0, PAGE_BYTES // 5, PAGE_BYTES]),
+)
+def test_what_a_cache_still_has_is_delivered_exactly_once_and_what_is_lost_is_counted_once(
+    kept: int, before: int, events: list[str], size: int
+) -> None:
+    """Whatever is received, dropped, duplicated or reordered, and whatever pages come, or are lost on the way."""
+    made, late, answers = Made(kept, size=size), list[int](), list[tuple[Any, bytes, int]]()
+    since: int | None = None
+    for _ in range(before):
+        made.publish()
+    for event in events:
+        made.now += 0.3
+        if event in ("received", "twice", "dropped", "late"):
+            number = made.publish()
+            if event == "late":
+                late.insert(0, number)
+            for _ in range({"received": 1, "twice": 2}.get(event, 0)):
+                made.receive(number)
+                since = number if since is None else since
+        elif event == "catch up" and late:
+            made.receive(late[0])
+            since = late[0] if since is None else since
+            late.pop(0)
+        made.take()
+        answers += [(handler, made.answer(asked), made.count) for asked, handler in made.queries]
+        made.queries.clear()
+        if event in ("page", "none") and answers:
+            handler, data, count = answers.pop()
+            if event == "page":
+                made.reply(handler, data)
+                since = count if since is None else since
+            handler.drop()
+    for handler, *_ in answers:
+        handler.drop()
+    made.answer_all()
+    for number in late:
+        made.receive(number)
+    made.take()
+    assert len(made.found) == len(set(made.found))
+    assert set(made.found) >= {number for number, _, _ in made.kept}
+    lost = sum(count for count, _ in made.lost(finished=True))
+    assert lost == len(set(range(made.count if since is None else since, made.count)) - set(made.found))
+
+
+def test_the_newest_is_queried_first_and_order_waits_for_nothing() -> None:
+    made = Made(1000, size=PAGE_BYTES // 10)
+    for _ in range(100):
+        made.publish()
+    made.receive(made.publish())
+    assert made.take() == [100]
+    asked, handler = made.queries.pop()
+    made.reply(handler, made.answer(asked))
+    first = made.take()
+    assert first == sorted(first)
+    assert first[-1] == 99
+    assert 5 < len(first) < 15
+    made.receive(made.publish())
+    assert made.take() == [101]
+    made.answer_all()
+    assert sorted(made.found) == list(range(102))
+
+
+def test_after_outages_in_any_order_nothing_is_given_up_while_its_publisher_may_have_it() -> None:
+    """Nothing of it was received for a minute, in the midst of what it has to catch up with."""
+    made = Made(1000, size=PAGE_BYTES // 10)
+    made.receive(made.publish())
+    for _ in range(100):
+        made.publish()
+    made.receive(made.publish())
+    made.take()
+    for _ in range(int(KEPT_S) - 1):  # queries and answers are lost
+        made.now += 1.0
+        made.take()
+        for _, handler in made.queries:
+            handler.drop()
+        made.queries.clear()
+    assert made.lost() == []
+    made.answer_all()
+    assert sorted(made.found) == list(range(102))
+    assert made.lost(finished=True) == []
+
+
+def test_a_loss_says_what_is_known() -> None:
+    """The cache has it no longer; its publisher does not answer; recording ended before it was taken."""
+    made = Made(10)
+    made.receive(made.publish())
+    for _ in range(100):
+        made.publish()
+    made.answer_all()
+    assert made.lost() == [(90, "cache")]
+    assert sorted(made.found) == [0, *range(91, 101)]
+    for _ in range(10):
+        made.publish()
+    made.receive(made.publish())
+    assert made.lost(finished=True) == [(10, "end")]
+    for _ in range(10):
+        made.publish()
+    made.receive(made.publish())
+    made.now += ANSWER_S + 1
+    assert made.lost() == []
+    made.now += KEPT_S
+    made.take()
+    assert made.subscriber.losses() == [Loss(key=KEY, count=10, reason="gone")]
+
+
+def test_what_cannot_be_reached_but_may_have_more_is_named() -> None:
+    made = Made(10)
+    made.receive(made.publish())
+    made.now += ANSWER_S - 0.1
+    assert made.subscriber.silent() == {}
+    made.now += 1.0
+    assert made.subscriber.silent() == {KEY: pytest.approx(ANSWER_S + 0.9)}
+    made.now += KEPT_S
+    assert made.subscriber.silent() == {}
+
+
+def test_what_a_cache_dropped_before_the_first_contact_is_no_loss() -> None:
+    made = Made(10)
+    for _ in range(100):
+        made.publish()
+    made.receive(made.publish())
+    made.answer_all()
+    assert sorted(made.found) == list(range(91, 101))
+    assert made.lost(finished=True) == []
+
+
+def test_what_waits_is_bounded_and_what_finds_no_room_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history, "WAITING_BYTES", 10_000)
+    made = Made(1000, size=1000)
+    for _ in range(500):
+        made.receive(made.publish())
+    assert 1 < len(made.take()) < 10
+    made.answer_all()
+    assert sorted(made.found) == list(range(500))
+    assert made.lost(finished=True) == []
+
+
+def test_nobody_speaks_for_the_publisher_of_another_key() -> None:
+    made = Made(10)
+    made.receive(made.publish())
+    made.receive(5, key="other")
+    made.subscriber.take()
+    _, handler = made.queries.pop()
+    far = Made(10, "other")
+    far.count = 1_000_000
+    far.publish()
+    made.reply(handler, far.answer(b""), "other")
+    made.receive(made.publish())
+    assert [each.number for each in made.subscriber.take() if each.key == KEY] == [1]
+    assert {loss.key for loss in made.subscriber.losses(finished=True)} == {"other"}
+
+
+def test_publishers_that_are_known_are_bounded_and_the_longest_silent_is_forgotten() -> None:
+    made = Made(10)
+    for publisher in range(MOST + 1):
+        made.now += 1e-3
+        made.receive(0, publisher + 1)
+    made.subscriber.take()
+    ((asked, _),) = made.queries
+    assert asked == query([(publisher + 1, (1, 2**64 - 1)) for publisher in range(1, MOST + 1)])
+
+
+def test_one_that_does_not_answer_delays_no_page_of_the_others() -> None:
+    made = Made(10_000, size=PAGE_BYTES // 2)
+    for _ in range(20):
+        made.publish()
+    for _ in range(20):
+        made.now += 0.025
+        made.take()
+        ((asked, handler),) = made.queries
+        made.queries.clear()
+        made.reply(handler, made.answer(asked))  # and is never complete
+    made.take()
+    assert sorted(made.found) == list(range(20))
+
+
+@given(st.binary(max_size=200))
+def test_bad_bytes_are_refused_whole(data: bytes) -> None:
+    """As a page, and as a query."""
+    made = Made(10)
+    made.publish()
+    made.take()
+    ((_, handler),) = made.queries
+    made.reply(handler, data)
+    assert (page(data, OURS, made.kept) is None) == bool(len(data) % 24)
+    assert page(bytes(24 * MOST), OURS, made.kept) is not None
+    assert page(bytes(24 * MOST + 24), OURS, made.kept) is None
+
+
+# ── between two sessions ──
+
+
+@pytest.fixture
+def network() -> Iterator[Gathering]:
+    with Gathering() as gathering:
+        yield gathering
+
+
+def payload(i: int) -> bytes:
+    return f"{i:06}".encode() + bytes(2000)
+
+
+def collect(subscriber: RecoveringSubscriber, wanted: int) -> list[Delivery]:
+    """What is received until there is so much of it, by number."""
+    found: list[Delivery] = []
+
+    def received() -> bool:
+        found.extend(subscriber.take())
+        return len(found) >= wanted
+
+    eventually("receiving", received)
+    time.sleep(0.05)  # a duplicate would follow at once
+    found.extend(subscriber.take())
+    return sorted(found, key=lambda each: each.number)
+
+
+def test_a_subscriber_that_comes_late_or_again_gets_everything_once(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(), KEY, per_s=10)
+    before_ns = time.time_ns()
+    for i in range(300):
+        publisher.put(payload(i))
+    for _ in range(2):
+        session = network.join()
+        received = collect(RecoveringSubscriber(session, ANY), 300)
+        assert [int(each.payload[:6]) for each in received] == [each.number for each in received] == list(range(300))
+        assert {each.key for each in received} == {KEY}
+        assert len({each.publisher for each in received}) == 1
+        stamps = [each.published_ns or 0 for each in received]
+        assert before_ns <= stamps[0]
+        assert stamps == sorted(stamps)
+        session.close()
+
+
+def test_a_cache_keeps_what_it_is_made_for_and_no_more(network: Gathering) -> None:
+    publisher = CachedPublisher(network.join(), KEY, per_s=2)
+    for i in range(1000):
+        publisher.put(payload(i))
+    received = collect(RecoveringSubscriber(network.join(), ANY), 130)
+    assert [each.number for each in received] == list(range(870, 1000))  # 65 s of 2 a second
+
+
+def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:
+    keys = [f"aeroloop/aero/trace/{role}" for role in ("plant", "controller")]
+    publishers = [
+        CachedPublisher(session, key, per_s=1) for session in (network.join(), network.join()) for key in keys
+    ]
+    for publisher in publishers:
+        publisher.put(b"")
+    received = collect(RecoveringSubscriber(network.join(), ANY), 4)
+    assert sorted(each.key for each in received) == sorted(2 * keys)
+    assert len({each.publisher for each in received}) == 4
+
+
+def test_a_plain_publisher_is_received_too_and_carries_no_time(network: Gathering) -> None:
+    session = network.join()
+    subscriber = RecoveringSubscriber(network.join(), ANY)
+    found: list[Delivery] = []
+
+    def received() -> bool:
+        session.put(KEY, b"plain")
+        found.extend(subscriber.take())
+        return bool(found)
+
+    eventually("receiving", received)
+    assert found[0] == Delivery(KEY, b"plain", 0, None, None)
+
+
+def test_a_slow_reader_of_pages_holds_up_no_thread_of_zenoh_s(
+    network: Gathering, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page waits in a thread of Python; frames and messages go on meanwhile."""
+    session, reading = network.join(), network.join()
+    publisher = CachedPublisher(session, KEY, per_s=100)
+    for i in range(100):
+        publisher.put(payload(i))
+    asked: list[str] = []
+    released = SimpleNamespace(now=False)
+
+    def slow(*given: Any, whole: Callable[..., bytes | None] = history.page) -> bytes | None:
+        asked.append("page")
+        eventually("the release", lambda: released.now)
+        return whole(*given)
+
+    monkeypatch.setattr(history, "page", slow)
+    subscriber = RecoveringSubscriber(reading, ANY)
+    session.declare_queryable("t/word", lambda query: query.reply("t/word", b"") if query else None)
+
+    def queried() -> bool:
+        subscriber.take()
+        return bool(asked)
+
+    eventually("the query", queried)
+    eventually("an answer meanwhile", lambda: any(reply.ok for reply in reading.get("t/word", timeout=1.0)))
+    released.now = True
+    assert [each.number for each in collect(subscriber, 100)] == list(range(100))

@@ -1,0 +1,218 @@
+"""A log never invents: figures begin where gains, reference and law's state are known, and are the truth from there."""
+
+from __future__ import annotations
+
+import csv
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from aeroloop.protocol.messages.models import SessionRecord
+from aeroloop.protocol.messages.operator import Change, Gains, Hold, Stream, in_force
+from aeroloop.protocol.messages.trace import RECORD_S, Tail, TraceWriter, read_batch, record_json
+from aeroloop.service.config import load
+from aeroloop.service.figures import Score
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.in_force import InForce, Segment
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.logs.ticks import Ticks
+from aeroloop.service.review.review import read
+from tests.support.made_log import SESSION, VEHICLE, Changes, Logged, lockstep, made, write
+
+TICKS = 2400
+LEVEL = Hold(attitude=(0.0, 0.0, 0.0))
+AWAY = Hold(attitude=(0.0, 12.0, -40.0))
+GOES_AWAY: Changes = {90: (Gains(C2=(0.2, 0.2, 0.2)), None), 200: (None, AWAY)}
+COLUMNS = ["k", "attitude", "desired", "attitude_error", "rate_error", "unquantized", "gains", "state", "voltages"]
+
+
+def ends_of(message: Logged) -> tuple[str, int, int] | None:
+    """End, first and last tick of a batch with rows; None of any other message."""
+    batch = read_batch(message.payload) if "/trace/" in message.key else None
+    if batch is None or not batch.header.rows:
+        return None
+    ticks = batch.columns["tick" if batch.header.end == "controller" else "session_tick"]
+    return batch.header.end, int(ticks[0]), int(ticks[-1])
+
+
+def without(messages: list[Logged], first: int, last: int, end: str | None = None) -> list[Logged]:
+    """The messages without the batches, of one end or both, that begin within these ticks; and without other topics."""
+    kept = []
+    for message in messages:
+        found = ends_of(message)
+        if found is None or not (first <= found[1] <= last and end in (None, found[0])):
+            kept.append(message)
+    return kept
+
+
+def ticks_of(path: Path) -> Ticks:
+    blocks: list[Ticks] = []
+    read(path, watch=blocks.append)
+    return Ticks.joined(blocks)
+
+
+@pytest.fixture(scope="module", params=["periodic", "on_change"])
+def whole(request: pytest.FixtureRequest) -> tuple[list[Logged], str]:
+    settings = load(overrides=["loop.lockstep=true", f'wire.transmit="{request.param}"'])
+    return made(settings, TICKS, GOES_AWAY), request.param
+
+
+def written(path: Path, messages: list[Logged], transmit: str = "periodic") -> Path:
+    return write(path, load(overrides=["loop.lockstep=true", f'wire.transmit="{transmit}"']), messages)
+
+
+def test_a_log_that_begins_late_agrees_with_the_whole_one(whole: tuple[list[Logged], str], tmp_path: Path) -> None:
+    """The operator had moved the body before the recorder came: what is configured is not what was followed."""
+    messages, transmit = whole
+    truth = ticks_of(written(tmp_path / "whole.mcap", messages, transmit))
+    late = written(tmp_path / "late.mcap", without(messages, 0, 800), transmit)
+    known = ticks_of(late)
+    first = int(known.k[0])
+    assert 800 < first < 860
+    since = truth.where(truth.k >= first)
+    for name in COLUMNS:
+        assert (getattr(known, name) == getattr(since, name)).all(), name
+    score = Score(lockstep().wire, lockstep().loop.period, 0.1)
+    score.errors(since.k, since.attitude_error)
+    assert read(late).figures.z_track == score.figures().z_track
+    both = replay([late])
+    assert both.controller is not None
+    assert (both.controller.ticks, both.controller.differ) == (TICKS - first, 0)
+    assert both.unknown == read(late).findings.unknown == []
+    exported = export([late], "csv", tmp_path / "late.csv")
+    assert (exported.rows, exported.unknown) == (len(since.k), [])
+    with (tmp_path / "late.csv").open(newline="") as file:
+        row = next(csv.DictReader(file))
+    assert int(row["tick"]) == first
+    assert float(row["desired_pitch_deg"]) == pytest.approx(12.0)
+
+
+def test_what_was_in_force_before_the_first_change_that_a_late_log_has_is_unknown(tmp_path: Path) -> None:
+    """The first record is of after the change, and no reader knows what was followed before it."""
+    messages = made(lockstep(), TICKS, GOES_AWAY | {1000: (Gains(C2=(0.1, 0.1, 0.1)), LEVEL)})
+    truth = ticks_of(written(tmp_path / "whole.mcap", messages))
+    late = written(tmp_path / "late.mcap", without(messages, 0, 899))
+    (unknown,) = read(late).findings.unknown
+    known = ticks_of(late)
+    assert (unknown.vehicle, unknown.session, unknown.last_tick) == (VEHICLE, SESSION, known.k[0] - 1)
+    assert unknown.first_tick >= 900
+    assert 1000 <= known.k[0] < 1060
+    for name in COLUMNS:
+        assert (getattr(known, name) == getattr(truth.where(truth.k >= known.k[0]), name)).all(), name
+    replayed = replay([late])
+    assert replayed.unknown == export([late], "csv", tmp_path / "late.csv").unknown == [unknown]
+    assert replayed.controller is not None
+    assert (replayed.controller.ticks, replayed.controller.differ) == (len(known.k), 0)
+    assert f"ticks {unknown.first_tick} to {unknown.last_tick} of s1 are left out" in str(unknown)
+
+
+def test_a_change_within_a_gap_is_left_out_with_the_ticks_before_it(
+    whole: tuple[list[Logged], str], tmp_path: Path
+) -> None:
+    messages, transmit = whole
+    truth = ticks_of(written(tmp_path / "whole.mcap", messages, transmit))
+    log = written(tmp_path / "a.mcap", without(messages, 60, 400, "controller"), transmit)
+    known = ticks_of(log)
+    (unknown,) = read(log).findings.unknown
+    assert 60 <= unknown.first_tick < 120
+    assert unknown.last_tick == 199  # the record says that both are in force since tick 200
+    left = truth.where((truth.k < unknown.first_tick) | (truth.k > unknown.last_tick))
+    assert (known.k == left.k).all()
+    assert (known.desired == left.desired).all()
+    assert replay([log]).controller is not None
+    assert not replay([log]).differs
+
+
+def test_the_plants_record_stands_for_a_controller_whose_trace_is_missing(tmp_path: Path) -> None:
+    """Without it nothing is known of the reference, and there is no figure."""
+    messages = [one for one in made(lockstep(), TICKS, GOES_AWAY) if not one.key.endswith("trace/controller")]
+    log = written(tmp_path / "none.mcap", messages)
+    assert read(log).figures.z_track is None
+    (unknown,) = read(log).findings.unknown
+    assert unknown.first_tick == 0
+    assert "does not hold" in str(unknown)
+
+
+def test_without_a_record_and_a_beginning_nothing_is_known(tmp_path: Path) -> None:
+    messages = without(made(lockstep(), 480), 0, 100)  # less than a record's period
+    assert all(b'"record"' not in one.payload for one in messages)
+    log = written(tmp_path / "a.mcap", messages)
+    assert read(log).figures.z_track is None
+    assert replay([log]).unknown == read(log).findings.unknown != []
+
+
+def test_a_second_session_has_its_own_gains_and_reference(tmp_path: Path) -> None:
+    """The record of one session says nothing about another."""
+    changes: Changes = {300: (Gains(C2=(0.1, 0.1, 0.1)), LEVEL), 1100: (Gains(C2=(0.3, 0.3, 0.3)), None)}
+    second = made(lockstep(), TICKS, changes, session="s2", at_ns=3_600_000_000_000)
+    log = written(tmp_path / "a.mcap", [*made(lockstep(), 700, GOES_AWAY), *without(second, 0, 1000)])
+    later = read(log, session="s2").findings
+    assert later.final_error_deg is not None
+    assert later.final_error_deg < 2
+    both = replay([log])
+    assert both.unknown == []
+    assert [(one.session, one.differ) for one in both.sessions] == [("s1", 0), ("s2", 0)]
+
+
+def test_a_batch_has_the_record_once_a_second_and_a_long_one_less_often() -> None:
+    wire = load().wire
+    for points, least_s in ((1, RECORD_S), (600, 2.0)):
+        writer = TraceWriter("plant", wire, 1, 10**8)
+        writer.session = "s"
+        change = Change(session="s", tick=7, gains=Gains(C1=tuple([0.3] * 3)), reference=AWAY)
+        writer.record = record_json([change] * points)
+        batches = [read_batch(writer.take(n * 10**8, 0)) for n in range(1, 200)]
+        with_it = [i for i, batch in enumerate(batches) if batch is not None and batch.tail.record]
+        assert with_it[0] == 0
+        gaps = {b - a for a, b in pairwise(with_it)}
+        assert min(gaps) >= least_s * 10
+        assert (points > 1) or gaps == {10}
+
+
+def test_a_sessions_record_says_what_is_in_force_as_its_changes_do() -> None:
+    changes = [
+        Change(session="s", tick=0, gains=Gains(C1=(0.3,) * 3, C2=(0.1,) * 3), reference=LEVEL),
+        Change(session="s", tick=40, reference=AWAY, within_s=1.0, here=((0.1, 0.2, 0.3),) * 3),
+        Change(session="s", tick=90, gains=Gains(C2=(0.2,) * 3)),
+    ]
+    record = SessionRecord(
+        controller="c", session="s", gains=Gains(C1=(0.3,) * 3, C2=(0.2,) * 3), gains_from="operator", reference=AWAY,
+        reference_from="operator", within_s=1.0, since_tick=40, gains_since_tick=90, here=((0.1, 0.2, 0.3),) * 3,
+    )  # fmt: skip
+    assert record.in_force == in_force(changes)
+    assert Tail.model_validate_json(b'{"record":' + record_json(record.in_force) + b"}").record == in_force(changes)
+    assert record.model_copy(update={"reference": Stream()}).in_force == []
+
+
+@pytest.mark.parametrize(
+    ("records", "segments", "until", "unknown"),
+    [
+        ([], [([0, 50], 99)], 99, [(0, 99)]),
+        ([(0, 60)], [([0, 50], 99)], 99, []),
+        ([(30, 160)], [([100, 150], 199)], 199, [(0, 29)]),
+        ([(120, 160)], [([100, 150], 199)], 199, [(0, 149)]),
+        ([(0, 40), (70, 160)], [([0], 49), ([100, 150], 199)], 199, [(50, 69)]),
+        ([(0, 40), (20, 160)], [([0], 49), ([100, 150], 199)], 199, []),
+        ([(0, 40)], [([0], 49), ([100, 150], 199)], 199, [(50, 199)]),
+        ([(0, 40), (10, 75)], [([0], 49)], 80, [(76, 80)]),
+        ([(10, 75)], [], 80, [(0, 9), (76, 80)]),
+    ],
+)
+def test_ticks_are_known_from_since_when_a_record_says_to_the_next_gap(
+    records: list[tuple[int, int]],
+    segments: list[tuple[list[int], int]],
+    until: int,
+    unknown: list[tuple[int, int]],
+) -> None:
+    """Records as (since, tick of its batch); segments as (first ticks of the batches, last tick)."""
+    found = InForce()
+    for since, tick in records:
+        writer = TraceWriter("controller", load().wire, 1, 1)
+        writer.session = "s"
+        writer.record = record_json([Change(session="s", tick=since, gains=Gains(C1=(0.3,) * 3), reference=LEVEL)])
+        batch = writer.take(10**9, 0)
+        header = read_batch(batch)
+        assert header is not None
+        found.add(header.header, batch, tick)
+    assert found.unknown([Segment(begins, last) for begins, last in segments], (0, until)) == unknown

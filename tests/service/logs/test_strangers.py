@@ -1,0 +1,245 @@
+"""Foreign and malformed messages in a log: every verb gives what it gives without them, and names them."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import Description, Event, Status, Telemetry, Truth
+from aeroloop.service.cli.main import execute
+from aeroloop.service.config import load
+from aeroloop.service.logs.export import export
+from aeroloop.service.logs.recover import recover
+from aeroloop.service.logs.replay import replay
+from aeroloop.service.report.page.page import page
+from aeroloop.service.review.compare import read_runs
+from aeroloop.service.review.report import Findings
+from aeroloop.service.review.review import read, report
+from aeroloop.service.viewers.channels import Decoder
+from tests.support.edited_log import Said, rewrite
+from tests.support.every_message import MESSAGES
+from tests.support.hostile import TOKENS
+from tests.support.made_log import SESSION, START_NS, VEHICLE, description, lockstep, make_log
+
+TICKS = 300
+HUGE = 10**400
+STATUS = Status(
+    role="controller", state="driving", session=SESSION, uptime_s=1.0, ticks=1, rate_hz=500.0, skipped=0
+)  # fmt: skip
+INFINITE = b'"age_us":{"count":1,"p50":1e999,"p99":1,"p999":1,"max":1}'
+TRUTH = Truth(tick=1, attitude=(1.0, 0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0), voltages=(), session=SESSION, session_tick=7)
+WELL_FORMED: dict[str, list[bytes]] = {
+    "event": [
+        Event(role="plant", kind="refused", text="no", session=SESSION, tick=HUGE).encode(),
+        Event(role="plant", kind="armed", text="yes", session=SESSION, tick=-HUGE).encode(),
+    ],
+    "status": [STATUS.encode().replace(b'"age_us":null', INFINITE)],
+    "telemetry": [
+        Telemetry(
+            session=SESSION,
+            tick=HUGE,
+            counter=HUGE,
+            attitude_error=(0.0, 0.0, 0.0),
+            rate_error=(0.0, 0.0, 0.0),
+            desired=(1.0, 0.0, 0.0, 0.0),
+            state={},
+            voltages=(),
+        ).encode()
+    ],
+    "truth": [TRUTH.encode(), TRUTH.model_copy(update={"session_tick": HUGE, "voltages": (0.0, 0.0)}).encode()],
+}
+"""Messages that their model accepts and that make no sense all the same."""
+
+
+def foreign(topic: topics.Topic, role: str) -> Iterator[bytes]:
+    """What a stranger may publish on a topic, and its model does not accept."""
+    chance = random.Random(f"{topic.name} {role}")
+    yield from (b"", b"{}", b"[]", b"null", b"[" * 5000, b'{"a":' * 5000, b'{"tick": 1e999}')
+    yield from (chance.randbytes(size) for size in (1, 111, 112, 113, 400))
+    yield from TOKENS
+    yield from (one.encode() for one in MESSAGES if type(one) is not topic.model)
+    if topic.name == "description":
+        good = description(lockstep(), role)
+        wide = {"rate": {"bits": HUGE}}
+        configs: list[dict[str, object]] = [{"law": 5}, {"wire": wide}, {"plant": []}, {"no such section": 1}]
+        yield from (good.model_copy(update={"config": config}).encode() for config in configs)
+        for wrong in ({"vehicle": "other"}, {"role": "operator"}, {"protocol": HUGE}, {"protocol": 1}):
+            yield good.model_copy(update=wrong).encode()
+
+
+def strangers() -> list[Said]:
+    """All of it on every topic of every daemon, at three instants; and well-formed messages of another vehicle."""
+    found = []
+    for topic in topics.TOPICS.values():
+        if topic.carries == "frame":  # which a log only has as evidence beside the traces
+            continue
+        for role in ("plant", "controller", "recorder") if "{role}" in topic.key else ("plant",):
+            key = topics.key(topic.name, VEHICLE, session=SESSION, role=role)
+            payloads = [*foreign(topic, role), *WELL_FORMED.get(topic.name, ())]
+            for at_ns in (-(10**9), 2 * 10**8, 10**10):
+                found += [Said(key, START_NS + at_ns + i, payload) for i, payload in enumerate(payloads)]
+            others = [one.encode() for one in MESSAGES if type(one) is topic.model and not isinstance(one, Description)]
+            other = topics.key(topic.name, "other", session=SESSION, role=role)
+            found += [Said(other, START_NS + i, payload) for i, payload in enumerate(others)]
+    return found
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good log in lockstep, with truths, statuses and events."""
+    path = tmp_path_factory.mktemp("clean") / "a.mcap"
+    settings = load(overrides=["loop.lockstep=true", 'plant.faults=["motor1:bias=0.5@0.2"]'])
+    make_log(path, TICKS, settings=settings, truth_every=10)
+    return rewrite(path, path.with_name("clean.mcap"))
+
+
+@pytest.fixture(scope="module")
+def dirty(clean: Path) -> Path:
+    """The same with everything that strangers may publish."""
+    return rewrite(clean, clean.with_name("dirty.mcap"), more=strangers())
+
+
+def without_names(findings: Findings) -> Findings:
+    """Findings less what names a file, and less the marks that a stranger's event makes."""
+    marks = [mark for mark in findings.marks if mark.text not in ("no", "yes")]
+    return findings.model_copy(update={"damages": [], "log": None, "marks": marks})
+
+
+READ = ("description", "event", "loss", "status", "trace", "truth")
+
+
+def named(damages: list[str]) -> set[str]:
+    """Topics of which malformed messages are named."""
+    return {line.rpartition(" of ")[2] for line in damages if "malformed: " in line}
+
+
+def test_a_review_a_page_and_a_comparison_are_those_of_the_clean_log(clean: Path, dirty: Path) -> None:
+    good, bad = read(clean).findings, read(dirty).findings
+    assert without_names(bad) == without_names(good)
+    assert good.damages == []
+    assert named(bad.damages) == set(READ)
+    one, other = read_runs([clean, dirty])
+    assert without_names(other.findings) == without_names(one.findings)
+    assert len(page([report([dirty])])) > 10_000
+
+
+def test_both_ends_replay_and_it_is_said_what_was_malformed(
+    clean: Path, dirty: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = replay([clean]), replay([dirty])
+    assert bad.controller == good.controller
+    assert bad.plant == good.plant
+    assert (bad.sessions, bad.reasons, bad.missing) == (good.sessions, {}, [])
+    assert named(bad.damages) == {"description", "trace"}
+    assert execute(["log", "replay", str(dirty)]) == 0
+    assert "malformed: " in capsys.readouterr().out
+
+
+def test_every_table_has_the_rows_of_the_clean_log(clean: Path, dirty: Path, tmp_path: Path) -> None:
+    a, b = (export([log], "csv", tmp_path / f"{log.stem}.csv") for log in (clean, dirty))
+    assert Path(a.out).read_text() == Path(b.out).read_text()
+    assert (b.rows, b.columns, b.sessions) == (a.rows, a.columns, a.sessions)
+    assert named(b.damages) == {"description", "trace", "truth"}
+    for to in ("parquet", "mat"):
+        assert export([dirty], to, tmp_path / f"a.{to}").rows == a.rows
+
+
+def test_a_decoded_log_has_every_channel_of_the_clean_one(clean: Path, dirty: Path, tmp_path: Path) -> None:
+    a, b = (export([log], "mcap", tmp_path / f"{log.stem}-decoded.mcap") for log in (clean, dirty))
+    assert set(a.columns) <= set(b.columns)
+    assert any("malformed: " in line for line in b.damages)
+    assert replay([tmp_path / "dirty-decoded.mcap"]).controller == replay([clean]).controller
+
+
+def test_what_is_recovered_reads_as_the_clean_log(clean: Path, dirty: Path, tmp_path: Path) -> None:
+    assert recover(dirty, tmp_path / "out.mcap").lost == []
+    assert without_names(read(tmp_path / "out.mcap").findings) == without_names(read(clean).findings)
+    assert replay([tmp_path / "out.mcap"]).plant == replay([clean]).plant
+
+
+@pytest.mark.parametrize("rate_hz", [None, 30.0])
+def test_a_viewer_of_a_running_loop_shows_what_is_well_formed(rate_hz: float | None) -> None:
+    decoder = Decoder(rate_hz)
+    for role in ("controller", "plant"):
+        decoder.configure(description(lockstep(), role))
+    for one in strangers():
+        address = topics.read_key(one.key)
+        assert address is not None
+        decoder.take(address, one.data, one.published_ns)
+        decoder.take(address, one.data, 2**64 - 1)
+    assert decoder.malformed > 1000
+
+
+@pytest.mark.parametrize("payload", [b"{}", b"null", b"\xff\xfe"])
+def test_two_bytes_on_a_recorder_s_description_cost_no_replay(clean: Path, tmp_path: Path, payload: bytes) -> None:
+    key = topics.key("description", VEHICLE, role="recorder")
+    path = rewrite(clean, tmp_path / "a.mcap", more=[Said(key, START_NS + 10**8, payload)])
+    assert execute(["log", "replay", str(path)]) == 0
+    recover(path, tmp_path / "b.mcap")
+    assert execute(["log", "replay", str(tmp_path / "b.mcap"), "--json"]) == 0
+
+
+def test_traces_of_a_vehicle_that_no_description_describes_cost_that_vehicle_alone(
+    clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its sessions are named, and as they could not be compared, the exit code is 1."""
+    ghost = [one._replace(key=one.key.replace("/aero/", "/ghost/")) for one in messages(clean) if one.topic == "trace"]
+    path = rewrite(clean, tmp_path / "a.mcap", more=ghost)
+    both, good = replay([path]), replay([clean])
+    assert (both.controller, both.plant) == (good.controller, good.plant)
+    assert execute(["log", "replay", str(path), "--json"]) == 1
+    assert "ghost" in json.dumps(json.loads(capsys.readouterr().out)["reasons"])
+
+
+def messages(path: Path) -> list[Said]:
+    found: list[Said] = []
+
+    def keep(one: Said) -> Said:
+        found.append(one)
+        return one
+
+    rewrite(path, path.with_name("unused.mcap"), keep)
+    return found
+
+
+FIELDS = {"sizes": (4, 4), "rows": (8, 4), "run": (16, 8), "first_row": (24, 8), "monotonic_ns": (32, 8)}
+"""Where a batch's header has them, and in how many bytes."""
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"rows": 2**32 - 1},
+        {"rows": 257},
+        {"first_row": 2**63 + 1},
+        {"monotonic_ns": 2**62},
+        {"first_row": 20},
+        {"first_row": 20, "sizes": 0x0004_0006},
+        {"run": 99},
+        {"run": 99, "first_row": 2**62 - 1},
+    ],
+)
+def test_batches_that_no_end_publishes_are_malformed_messages(
+    clean: Path, tmp_path: Path, wrong: dict[str, int]
+) -> None:
+    """Of more rows than a batch has, rows that another batch has, or a session that another process claimed."""
+    junk = []
+    for end in ("controller", "plant"):
+        one = next(one for one in messages(clean) if one.key.endswith(f"trace/{end}") and len(one.data) > 1000)
+        data = bytearray(one.data)
+        for name, value in wrong.items():
+            at, size = FIELDS[name]
+            data[at : at + size] = value.to_bytes(size, "little")
+        junk.append(one._replace(data=bytes(data)))
+    path = rewrite(clean, tmp_path / "a.mcap", more=junk)
+    found = read(path).findings
+    assert without_names(found) == without_names(read(clean).findings)
+    assert named(found.damages) == {"trace"}
+    assert replay([path]).plants == replay([clean]).plants
+    assert replay([path]).sessions == replay([clean]).sessions
+    assert export([path], "csv", tmp_path / "a.csv").rows == export([clean], "csv", tmp_path / "b.csv").rows

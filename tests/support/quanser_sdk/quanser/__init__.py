@@ -1,0 +1,1 @@
+"""Stands for Quanser's package in processes that tests start."""
