@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Container
+from collections.abc import Container
 from threading import Condition
 from typing import NamedTuple
 
@@ -18,15 +18,44 @@ from zenoh.handlers import Callback
 
 
 class Arrival(NamedTuple):
-    """A received frame.
-
-    Attributes:
-        frame: Its bytes.
-        at_ns: When it was received, on `time.monotonic_ns()`.
-    """
+    """A received frame, and when it was received on `time.monotonic_ns()`."""
 
     frame: bytes
     at_ns: int
+
+
+class Mailbox:
+    """A slot for a frame, written by a receiving thread and read by the loop; a new frame replaces the oldest.
+
+    `changed` is notified when a frame is put; several mailboxes of one reader may share it. `depth` is how many frames
+    it holds, for a reader that needs each of them; the oldest is taken first.
+    """
+
+    def __init__(self, changed: Condition | None = None, depth: int = 1) -> None:
+        self._changed = changed or Condition()
+        self._arrivals: deque[Arrival] = deque(maxlen=depth)
+
+    def put(self, frame: bytes) -> None:
+        """Put a frame in the slot, in place of the oldest if it is full."""
+        arrival = Arrival(frame, time.monotonic_ns())
+        with self._changed:
+            self._arrivals.append(arrival)
+            self._changed.notify()
+
+    @property
+    def pending(self) -> bool:
+        """Whether a received frame waits to be taken."""
+        return bool(self._arrivals)
+
+    def take(self) -> Arrival | None:
+        """Take the oldest frame out of the slot, or None."""
+        return self._arrivals.popleft() if self._arrivals else None
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """As `take`, but wait up to `timeout_s` for a frame."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._arrivals, timeout_s)
+            return self.take()
 
 
 class Link(ABC):
@@ -56,61 +85,15 @@ class Link(ABC):
         """Stop receiving. May be called twice."""
 
 
-class Mailbox:
-    """A slot for a frame, written by a receiving thread and read by the loop; a new frame replaces the oldest.
-
-    Args:
-        changed: Notified when a frame is put; one of its own if None. Several slots of one reader may share one.
-        depth: Frames it holds, for a reader that needs each of them; the oldest is taken first.
-    """
-
-    def __init__(self, changed: Condition | None = None, depth: int = 1) -> None:
-        self._changed = changed or Condition()
-        self._arrivals: deque[Arrival] = deque(maxlen=depth)
-
-    def put(self, frame: bytes) -> None:
-        """Put a frame in the slot, in place of the oldest if it is full."""
-        arrival = Arrival(frame, time.monotonic_ns())
-        with self._changed:
-            self._arrivals.append(arrival)
-            self._changed.notify()
-
-    @property
-    def pending(self) -> bool:
-        """Whether a frame is in the slot."""
-        return bool(self._arrivals)
-
-    def take(self) -> Arrival | None:
-        """Take the oldest frame out of the slot, or None."""
-        return self._arrivals.popleft() if self._arrivals else None
-
-    def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._arrivals, timeout_s)
-            return self.take()
-
-
 class ZenohLink(Link):
     """Frames over Zenoh: express, at real-time priority. The session outlives the link.
 
-    Zenoh's receiving thread fills the mailbox, so times of arrival are exact. If `lossless`, `send` blocks when a peer
-    does not keep up, instead of dropping: for lockstep, where each frame is waited for.
+    Zenoh's receiving thread fills the mailbox, so times of arrival are exact. `lengths` are those of the frames
+    received [bytes]; `refused` counts frames of any other. If `lossless`, `send` blocks when a peer does not keep up,
+    instead of dropping: for lockstep, where each frame is waited for.
 
     A plant's link may have a second session, `also`: frames are received on both, and sent on each that has a
     subscriber, which the controller has on one.
-
-    Args:
-        session: Session of the frames.
-        send_key: Key of the frames sent.
-        receive_key: Key of the frames received.
-        lengths: Lengths of the frames received [bytes]; a frame of another length is refused.
-        lossless: Whether `send` may block.
-        mailbox: Slot for received frames; a new one if None.
-        also: The second session.
-
-    Attributes:
-        refused: Frames of a wrong length so far.
     """
 
     def __init__(
@@ -136,9 +119,7 @@ class ZenohLink(Link):
                 self.refused += 1
 
         handler = Callback(receive, indirect=False)  # in Zenoh's thread: one of Python's would be one wake-up more
-        self._declared: list[Callable[[], None]] = [
-            each.declare_subscriber(receive_key, handler).undeclare for each in sessions
-        ]
+        subscribers = [each.declare_subscriber(receive_key, handler) for each in sessions]
         self._publishers = [
             each.declare_publisher(
                 send_key,
@@ -149,8 +130,7 @@ class ZenohLink(Link):
             )
             for each in sessions
         ]
-        self._declared += [publisher.undeclare for publisher in self._publishers]
-        self._open = True
+        self._declared = [*subscribers, *self._publishers]
 
     def send(self, frame: bytes) -> None:
         """Send a frame."""
@@ -159,7 +139,5 @@ class ZenohLink(Link):
 
     def close(self) -> None:
         """Stop receiving."""
-        if self._open:
-            self._open = False
-            for undeclare in self._declared:
-                undeclare()
+        while self._declared:
+            self._declared.pop(0).undeclare()

@@ -12,8 +12,8 @@ import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
-from aeroloop.protocol.transport.access import access_control
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
+from aeroloop.protocol.transport.zenoh_config import access_control
 from tests.support.certificates import DAY, Authority
 from tests.support.certified_link import attempt, linked, open_session, with_marker
 from tests.support.zenoh_network import PATIENCE_S, eventually, free_port

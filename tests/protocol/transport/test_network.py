@@ -16,9 +16,9 @@ from pydantic import ValidationError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import QUERIES_PER_S, TOPICS, Topic
 from aeroloop.protocol.runtime.processes import listener, name_process
-from aeroloop.protocol.transport.endpoint import accepting
-from aeroloop.protocol.transport.network import visit
+from aeroloop.protocol.transport.network import command_session
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
+from aeroloop.protocol.transport.probe import accepting
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 
@@ -90,9 +90,9 @@ def test_more_processes_than_ports_link_by_gossip() -> None:
 def test_a_command_visits_without_an_endpoint() -> None:
     with Gathering() as gathering:
         member = gathering.join()
-        with visit(gathering.settings) as here:
+        with command_session(gathering.settings) as here:
             linked([member, here.session])
-            assert here.silent() == []
+            assert here.unanswered() == []
             assert [accepts(port) for port in gathering.ports] == [True] + 7 * [False]
 
 
@@ -101,13 +101,13 @@ def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() 
     with Gathering() as gathering, socket.create_server(("127.0.0.1", gathering.ports[0])):
         members = [gathering.join(), gathering.join()]
         linked(members)
-        with visit(gathering.settings) as here:
+        with command_session(gathering.settings) as here:
             linked([*members, here.session])
-            assert here.silent() == [gathering.settings.places[0]]
+            assert here.unanswered() == [gathering.settings.rendezvous_endpoints[0]]
         name_process("plant")
-        assert listener(gathering.settings.places[0]) == (os.getpid(), "plant")
+        assert listener(gathering.settings.rendezvous_endpoints[0]) == (os.getpid(), "plant")
         name_process("pytest")
-        assert listener(gathering.settings.places[0]) == (os.getpid(), None)
+        assert listener(gathering.settings.rendezvous_endpoints[0]) == (os.getpid(), None)
 
 
 @contextmanager

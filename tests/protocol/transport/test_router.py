@@ -16,10 +16,9 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
-from aeroloop.protocol.transport.network import join, visit
-from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
-from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
-from aeroloop.protocol.transport.security import Identity
+from aeroloop.protocol.transport.network import command_session, join, route, zenohd_config
+from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings, protected
+from aeroloop.protocol.transport.zenoh_config import router_config
 from aeroloop.service.host.operator import gather, stop
 from tests.protocol.transport.test_network import Listener, one_line, receives
 from tests.support.certificates import Authority
@@ -67,25 +66,25 @@ def test_a_client_that_starts_first_waits_for_the_router(settings: NetworkSettin
     thread = threading.Thread(target=lambda: joined.append(join(settings)))
     thread.start()
     with pytest.raises(NetworkError):  # a command does not wait
-        visit(settings).__enter__()
+        command_session(settings).__enter__()
     assert not joined
     open_sessions.enter_context(closing(route(settings, ROUTER)))
     thread.join()
     open_sessions.enter_context(closing(joined[0]))
-    with visit(settings) as here:
-        here.settle()
-        assert here.silent() == []
+    with command_session(settings) as here:
+        here.wait_for_links()
+        assert here.unanswered() == []
 
 
 def test_a_command_names_a_router_that_is_missing_or_hangs(settings: NetworkSettings) -> None:
-    with pytest.raises(NetworkError) as caught, visit(settings):
+    with pytest.raises(NetworkError) as caught, command_session(settings):
         pass
     assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
     port = int(settings.rendezvous[0].rpartition(":")[2])
     with (
         socket.create_server(("127.0.0.1", port)),
         pytest.raises(NetworkError, match="accepts connections and does not answer as a router"),
-        visit(settings),
+        command_session(settings),
     ):
         pass
 
@@ -129,9 +128,9 @@ def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
     open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}), ROUTER)))
     near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
     receives(Listener(near, WORD), far, b"over both", WORD)
-    with visit(first.model_copy(update={"connect": second.rendezvous})) as here:
-        here.settle()
-        assert here.silent() == []  # it links to one of them, and the other is well
+    with command_session(first.model_copy(update={"connect": second.rendezvous})) as here:
+        here.wait_for_links()
+        assert here.unanswered() == []  # it links to one of them, and the other is well
 
 
 def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
@@ -143,7 +142,7 @@ def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None
         NetworkSettings.model_validate({**network, "security": {"directory": str(each.folder), "vehicles": ["aero"]}})
         for each in (ours, foreign)
     )
-    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, visit(theirs):
+    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, command_session(theirs):
         pass
     assert "not of this authority" in one_line(caught.value)
 
@@ -159,7 +158,7 @@ def test_the_printed_configuration_is_the_routers_own_and_opens_one(
 ) -> None:
     text = zenohd_config(settings, ROUTER)
     lines = [line for line in text.splitlines() if not line.startswith("//")]
-    assert json.loads("\n".join(lines)) == router_tree(settings, ROUTER)
+    assert json.loads("\n".join(lines)) == router_config(protected(settings, ROUTER))
     router = open_sessions.enter_context(closing(zenoh.open(zenoh.Config.from_json5(text))))
     client = open_sessions.enter_context(closing(join(settings)))
     assert list(client.info.routers_zid()) == [router.zid()]
