@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Container
+from collections.abc import Callable, Container
 from threading import Condition
 from typing import NamedTuple
 
@@ -130,7 +130,8 @@ class ZenohLink(Link):
             )
             for each in sessions
         ]
-        self._declared = [*subscribers, *self._publishers]
+        self._undeclare: list[Callable[[], None]] = [each.undeclare for each in subscribers]
+        self._undeclare += [each.undeclare for each in self._publishers]
 
     def send(self, frame: bytes) -> None:
         """Send a frame."""
@@ -139,5 +140,5 @@ class ZenohLink(Link):
 
     def close(self) -> None:
         """Stop receiving."""
-        while self._declared:
-            self._declared.pop(0).undeclare()
+        while self._undeclare:
+            self._undeclare.pop(0)()
