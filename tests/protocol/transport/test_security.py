@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import socket
+import ssl
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import timedelta
 from itertools import product
 from pathlib import Path
@@ -31,7 +32,7 @@ from aeroloop.protocol.transport.zenoh_config import tls_config
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.vehicle_address import load_vehicle_address
 from tests.support.certificates import DAY, Authority
-from tests.support.zenoh_network import eventually, free_port
+from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
 
 PLANT, CONTROLLER = Identity(("plant",), "aero"), Identity(("controller",), "aero")
 HERE = ("tcp/127.0.0.1:1", "tcp/[::1]:1", "tcp/localhost:1", "udp/127.1.2.3:1", "unixsock-stream//run/a.sock")
@@ -147,6 +148,25 @@ def test_a_peer_without_a_good_certificate_does_not_link(network: Secured, kind:
         bare(certificate, mode="client", connect=connect),
     ):
         pytest.fail(f"it links: {links(plant)}")
+
+
+@pytest.mark.parametrize("kind", ["good", *SPOILED])
+def test_no_byte_of_ours_passes_the_handshake_with_a_listening_stranger(network: Secured, kind: str) -> None:
+    certificate = network.authority.issue("recorder") if kind == "good" else spoiled(network, kind)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, certificate.with_suffix(".key"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE_S)
+        place = f"tls/127.0.0.1:{server.getsockname()[1]}"
+        with join(network.settings.model_copy(update={"rendezvous": [], "connect": [place]}), PLANT):
+            caller, _ = server.accept()
+            caller.settimeout(PATIENCE_S)
+            with (
+                caller,
+                nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
+                context.wrap_socket(caller, server_side=True) as link,
+            ):
+                assert link.recv(1)
 
 
 def test_a_link_closes_when_its_certificate_expires(network: Secured) -> None:
