@@ -24,7 +24,7 @@ from aeroloop.protocol.transport.can_format import (
     carried_bytes,
     check_widths,
 )
-from aeroloop.protocol.transport.link import Link, Mailbox
+from aeroloop.protocol.transport.link import Link
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
@@ -40,7 +40,7 @@ End = Literal["plant", "controller"]
 class CanLink(Link):
     """One end's frames and heartbeats on a bus. A thread of its own receives.
 
-    `changed` is notified when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
+    In lockstep an empty frame may stand for a silent tick.
 
     Attributes:
         peer: The other end's last heartbeat, or None.
@@ -62,6 +62,7 @@ class CanLink(Link):
         lockstep: bool = False,
     ) -> None:
         check_widths(settings, wire)
+        super().__init__(changed)
         received: Literal["measurement", "command"] = "command" if end == "plant" else "measurement"
         sent = [MEASUREMENT_ID + settings.node, PLANT_HEARTBEAT_ID + settings.node]
         taken = [COMMAND_ID + settings.node, CONTROLLER_HEARTBEAT_ID + settings.node]
@@ -72,7 +73,6 @@ class CanLink(Link):
         self._settings = settings
         self._size = getattr(wire, received).size
         self._may_be_silent = len(SILENCE) in wire.lengths(received, lockstep=lockstep)
-        self._mailbox = Mailbox(changed)
         self._reopen_due = 0.0
         self._open = False
         self.peer: Heartbeat | None = None
@@ -181,7 +181,7 @@ class CanLink(Link):
             padded = len(data) == size or (len(data) > size > CLASSIC_BYTES and not any(data[size:]))
             if silent or padded:
                 self.peer_ns = now
-                self._mailbox.put(data[:size])
+                self.put(data[:size])
             else:
                 self.refused += 1
         elif identifier == self._peer_beat_id:

@@ -25,7 +25,7 @@ class Arrival(NamedTuple):
 
 
 class Mailbox:
-    """A slot for a frame, written by a receiving thread and read by the loop; a new frame replaces the oldest.
+    """A slot for frames, written by a receiving thread and read by the loop; a new frame replaces the oldest.
 
     `changed` is notified when a frame is put; several mailboxes of one reader may share it. `depth` is how many frames
     it holds, for a reader that needs each of them; the oldest is taken first.
@@ -58,27 +58,12 @@ class Mailbox:
             return self.take()
 
 
-class Link(ABC):
-    """Sends frames, and receives frames in a mailbox; implemented for each transport."""
-
-    _mailbox: Mailbox
+class Link(Mailbox, ABC):
+    """A mailbox for the frames received, and a way to send some; implemented for each transport."""
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
         """Send a frame. Blocks only to hand it over, and never raises for a lost peer."""
-
-    @property
-    def pending(self) -> bool:
-        """Whether a received frame waits to be taken."""
-        return self._mailbox.pending
-
-    def take(self) -> Arrival | None:
-        """The newest frame not yet taken, or None."""
-        return self._mailbox.take()
-
-    def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame."""
-        return self._mailbox.wait(timeout_s)
 
     @abstractmethod
     def close(self) -> None:
@@ -104,17 +89,18 @@ class ZenohLink(Link):
         lengths: Container[int],
         *,
         lossless: bool = False,
-        mailbox: Mailbox | None = None,
+        changed: Condition | None = None,
+        depth: int = 1,
         also: zenoh.Session | None = None,
     ) -> None:
+        super().__init__(changed, depth)
         sessions = [session] if also is None else [also, session]
-        self._mailbox = mailbox = mailbox or Mailbox()
         self.refused = 0
 
         def receive(sample: zenoh.Sample) -> None:
             frame = sample.payload.to_bytes()
             if len(frame) in lengths:
-                mailbox.put(frame)
+                self.put(frame)
             else:
                 self.refused += 1
 

@@ -10,7 +10,7 @@ import zenoh
 
 from aeroloop.protocol.messages.topics import key
 from aeroloop.protocol.transport.endpoint import Endpoint
-from aeroloop.protocol.transport.link import Mailbox, ZenohLink
+from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network import FrameSession
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
@@ -64,16 +64,15 @@ def test_a_connection_has_datagrams_for_frames_and_a_stream_for_what_zenoh_decla
 def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[FrameSession, FrameSession]) -> None:
     with Gathering() as gathering:
         main, other = gathering.join(), gathering.join()
-        box = Mailbox()
-        plant = ZenohLink(main, MEASUREMENT, COMMAND, range(256), mailbox=box, also=pair[0].session)
+        plant = ZenohLink(main, MEASUREMENT, COMMAND, range(256), also=pair[0].session)
         for session in (other, pair[1].session):
             assert session is not None
-            controller = ZenohLink(session, COMMAND, MEASUREMENT, range(256), mailbox=(received := Mailbox()))
+            controller = ZenohLink(session, COMMAND, MEASUREMENT, range(256))
 
-            def there_and_back(link: ZenohLink = controller, at: Mailbox = received, box: Mailbox = box) -> bool:
+            def there_and_back(link: ZenohLink = controller) -> bool:
                 link.send(b"command")
                 plant.send(b"measurement")
-                there, back = box.take(), at.take()
+                there, back = plant.take(), link.take()
                 return there is not None and back is not None
 
             eventually("a frame each way", there_and_back)
