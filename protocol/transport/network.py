@@ -177,8 +177,8 @@ class FrameSession:
     """How long claims wait for the link to a plant [s]: at 20 % loss a handshake takes up to 4 s, usually 0.02 s."""
 
     def __init__(self, settings: NetworkSettings, identity: Identity) -> None:
-        self._settings = settings
-        self._identity = identity
+        self._network = protected(settings, identity)
+        self._endpoints = _datagram_endpoints(self._network.settings)
         self._deadline = 0.0
         self.session: zenoh.Session | None = None
         self.endpoint = ""
@@ -186,7 +186,7 @@ class FrameSession:
     @property
     def wanted(self) -> bool:
         """Whether frames are to travel by datagrams, so that a plant's endpoint is worth asking for."""
-        return self._settings.mixed
+        return self._network.settings.mixed
 
     @property
     def linked(self) -> bool:
@@ -195,25 +195,22 @@ class FrameSession:
 
     def listen(self) -> None:
         """Listen at the first free one of this host's endpoints, if datagrams are wanted; `endpoint` then names it."""
-        if self.wanted:
-            network = protected(self._settings, self._identity)
-            for each in _datagram_endpoints(network):
-                if Endpoint.parse(each).is_free:
-                    with suppress(zenoh.ZError):  # taken in the meantime
-                        self.session, self.endpoint = _frame_session(network, listen=[each]), each
-                        return
+        for each in self._endpoints if self.wanted else []:
+            if Endpoint.parse(each).is_free:
+                with suppress(zenoh.ZError):  # taken in the meantime
+                    self.session, self.endpoint = self._open(listen=[each]), each
+                    return
 
     def connect(self, endpoint: str) -> bool | None:
         """Connect to a plant's endpoint; whether there is a link. None while that is not decided, for up to `LINK_S`.
 
         An endpoint that is not among the network's own is refused: a status from elsewhere leads nowhere.
         """
-        network = protected(self._settings, self._identity)
-        if endpoint not in _datagram_endpoints(network):
+        if endpoint not in self._endpoints:
             return False
         if endpoint != self.endpoint or self.session is None:
             self.close()
-            self.session, self.endpoint = _frame_session(network, connect=[endpoint]), endpoint
+            self.session, self.endpoint = self._open(connect=[endpoint]), endpoint
             self._deadline = time.monotonic() + self.LINK_S
         soon = min(time.monotonic() + 0.2, self._deadline)
         while not self.linked and time.monotonic() < soon:
@@ -226,21 +223,22 @@ class FrameSession:
             self.session.close()
             self.session = None
 
+    def _open(self, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
+        """Open a session at these endpoints and no others, and without compression. Raises zenoh.ZError."""
+        settings = self._network.settings
+        lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS)
+        only: dict[str, Any] = {"rendezvous": [*listen, *connect], "ports": 1, "listen": [], "connect": []}
+        only |= {"gossip": False, "transport": "tcp", "lease_ms": lease_ms}
+        network = self._network._replace(settings=settings.model_copy(update=only))
+        return _open(zenoh_config(network, "peer", list(listen), list(connect)))
 
-def _datagram_endpoints(network: Protected) -> list[str]:
+
+def _datagram_endpoints(settings: NetworkSettings) -> list[str]:
     """The endpoints of datagrams beside those of the rendezvous: the same address and port, by UDP; not on loopback."""
     carriers = {"tcp": "udp", "tls": "quic"}
     words = "?rel=1;mixed_rel=1"  # Zenoh's for a QUIC connection with a reliable stream and with datagrams
-    beyond = [each for each in map(Endpoint.parse, network.settings.rendezvous_endpoints) if each.leaves_host]
+    beyond = [each for each in map(Endpoint.parse, settings.rendezvous_endpoints) if each.leaves_host]
     return [str(replace(each, protocol=carriers[each.protocol], words=words)) for each in beyond]
-
-
-def _frame_session(network: Protected, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
-    """Open a session at these endpoints and no others. Raises zenoh.ZError."""
-    only: dict[str, Any] = {"rendezvous": [*listen, *connect], "ports": 1, "listen": [], "connect": [], "gossip": False}
-    only |= {"transport": "tcp", "lease_ms": max(network.settings.lease_ms, PATIENT_LEASE_MS)}  # nothing is compressed
-    network = network._replace(settings=network.settings.model_copy(update=only))
-    return _open(zenoh_config(network, "peer", list(listen), list(connect)))
 
 
 def _join_router(network: Protected) -> zenoh.Session:

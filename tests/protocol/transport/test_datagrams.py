@@ -95,7 +95,11 @@ def test_each_plant_of_a_host_listens_at_a_port_of_its_own() -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [NetworkSettings(), NetworkSettings(transport="tcp", rendezvous=[FAR]), NetworkSettings(rendezvous=[])],
+    [
+        NetworkSettings(),
+        NetworkSettings(transport="tcp", rendezvous=[FAR], insecure=True),
+        NetworkSettings(rendezvous=[]),
+    ],
 )
 def test_on_loopback_or_where_not_wanted_there_are_none(settings: NetworkSettings) -> None:
     plant = FrameSession(settings, PLANT)

@@ -54,7 +54,7 @@ class Made:
         self.subscriber = RecoveringSubscriber(self, ANY, lambda: self.now)  # type: ignore[arg-type]  # as a session
 
     def declare_subscriber(self, _: str, handler: Any) -> Any:
-        self._receive = handler.callback
+        self.receive_sample = handler.callback
         return SimpleNamespace(undeclare=lambda: None)
 
     def get(self, _: str, handler: Any, *, payload: bytes, **__: object) -> None:
@@ -69,7 +69,7 @@ class Made:
     def receive(self, number: int, publisher: int | None = None, key: str | None = None) -> None:
         attached = zenoh.ZBytes(attachment(10 * number, publisher or self._publisher, number))
         payload = zenoh.ZBytes(b"%d" % number + bytes(self._size))
-        self._receive(SimpleNamespace(key_expr=key or self._key, payload=payload, attachment=attached))
+        self.receive_sample(SimpleNamespace(key_expr=key or self._key, payload=payload, attachment=attached))
 
     def answer(self, asked: bytes) -> bytes:
         found = page(asked, self._publisher, self.kept)
@@ -228,6 +228,22 @@ def test_what_cannot_be_reached_but_may_have_more_is_named() -> None:
     assert found == [{}, {KEY: pytest.approx(ANSWER_S + 0.9)}, {}]
 
 
+def test_what_a_cache_dropped_before_the_first_contact_is_no_loss() -> None:
+    made = Made(10)
+    for _ in range(100):
+        made.publish()
+    made.receive(made.publish())
+    made.answer_all()
+    assert sorted(made.found) == list(range(91, 101))
+    assert made.lost(finished=True) == []
+
+
+def test_a_plain_publisher_is_received_too_and_carries_no_time() -> None:
+    made = Made(10)
+    made.receive_sample(SimpleNamespace(key_expr=KEY, payload=zenoh.ZBytes(b"plain"), attachment=None))
+    assert made.subscriber.take() == [Delivery(KEY, b"plain", 0, None, None)]
+
+
 def test_what_waits_is_bounded_and_what_finds_no_room_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "WAITING_BYTES", 10_000)
     made = Made(1000, size=1000)
@@ -353,20 +369,6 @@ def test_all_publishers_of_a_topic_answer(network: Gathering) -> None:
     received = collect(RecoveringSubscriber(network.join(), ANY), 4)
     assert sorted(each.key for each in received) == sorted(2 * keys)
     assert len({each.publisher for each in received}) == 4
-
-
-def test_a_plain_publisher_is_received_too_and_carries_no_time(network: Gathering) -> None:
-    session = network.join()
-    subscriber = RecoveringSubscriber(network.join(), ANY)
-    found: list[Delivery] = []
-
-    def received() -> bool:
-        session.put(KEY, b"plain")
-        found.extend(subscriber.take())
-        return bool(found)
-
-    eventually("receiving", received)
-    assert found[0] == Delivery(KEY, b"plain", 0, None, None)
 
 
 def test_a_slow_reader_of_pages_holds_up_no_thread_of_zenoh_s(
