@@ -14,17 +14,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Final, Literal
 
 from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import topics
 
 if TYPE_CHECKING:
     from cryptography import x509
 
 # `cryptography` is imported where it is used: only a process with certificates waits for it.
 
-CertifiedRole = Literal["plant", "controller", "operator", "observer", "recorder", "router"]
-ROLES: Final[tuple[CertifiedRole, ...]] = get_args(CertifiedRole)
+ROUTER: Final = "router"
+ROLES: Final[tuple[str, ...]] = (*topics.ROLES, ROUTER)
 OF_ONE_VEHICLE: Final = ("plant", "controller")
 """Roles whose certificates name a vehicle; the others' may."""
 AUTHORITY: Final = "ca.pem"
@@ -43,7 +44,7 @@ class Certificate:
     """A role's certificate, as read from `file`, of one vehicle or of every one (None)."""
 
     file: Path
-    role: CertifiedRole
+    role: str
     vehicle: str | None
     x509: x509.Certificate
 
@@ -73,7 +74,7 @@ def common_name(role: str, vehicle: str | None) -> str:
     return role if vehicle is None else f"{role}/{vehicle}"
 
 
-def read_common_name(text: str) -> tuple[CertifiedRole, str | None] | None:
+def read_common_name(text: str) -> tuple[str, str | None] | None:
     """Role and vehicle of a common name; None of what no certificate of a role has."""
     role, slash, vehicle = text.partition("/")
     if role not in ROLES or bool(slash) != bool(vehicle) or (role in OF_ONE_VEHICLE and not vehicle):

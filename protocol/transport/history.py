@@ -258,19 +258,20 @@ class RecoveringSubscriber:
 
     def _read(self, reply: zenoh.Reply) -> None:
         """Take a page; what is malformed is ignored."""
-        data = reply.ok.payload.to_bytes() if reply.ok is not None else b""
-        at, found = _PAGE.size, list[tuple[int, int, bytes]]()
+        if reply.ok is None or len(data := reply.ok.payload.to_bytes()) < _PAGE.size:
+            return
+        key, (publisher, oldest, count) = topics.cached_key(str(reply.ok.key_expr)), _PAGE.unpack_from(data)
+        at, found = _PAGE.size, list[Delivery]()
         while at + _ITEM.size <= len(data):
             number, clock_ns, length = _ITEM.unpack_from(data, at)
             at += _ITEM.size + length
-            found.append((number, clock_ns, data[at - length : at]))
-        if reply.ok is None or at != len(data):
+            found.append(Delivery(key, data[at - length : at], number, clock_ns, publisher))
+        if at != len(data):
             return
-        key, (publisher, oldest, count) = topics.cached_key(str(reply.ok.key_expr)), _PAGE.unpack_from(data)
         with self._lock:
             source = self._source(key, publisher, count)
             source.extend(count)
-            new = [self._add(Delivery(key, each[2], each[0], each[1], publisher), source) for each in reversed(found)]
+            new = [self._add(each, source) for each in reversed(found)]
             self._give_up(source, oldest, "cache")
             source.answered = True
             if any(new):

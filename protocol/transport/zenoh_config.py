@@ -16,8 +16,8 @@ from itertools import product
 from typing import Any, Final, Literal
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.topics import ACTIONS, ROLES, TOPICS, Action, Topic
-from aeroloop.protocol.transport.certificate import AUTHORITY, OF_ONE_VEHICLE, Certificate, common_name
+from aeroloop.protocol.messages.topics import ACTIONS, TOPICS, Action, Topic
+from aeroloop.protocol.transport.certificate import AUTHORITY, OF_ONE_VEHICLE, ROLES, ROUTER, Certificate, common_name
 from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.history import PAGE_BYTES
 from aeroloop.protocol.transport.network_settings import Protected
@@ -139,7 +139,6 @@ def tls_config(certificate: Certificate) -> dict[str, Any]:
 
 # ── access rules ──
 
-ROUTER: Final = "router"
 _MESSAGES: Final[dict[Action, tuple[str, ...]]] = {
     "publish": ("put",),
     "subscribe": ("declare_subscriber",),
@@ -166,7 +165,7 @@ def access_control(*vehicles: str, loopback: bool = True) -> dict[str, Any]:
         everything = ["delete", *(message for messages in _MESSAGES.values() for message in messages)]
         rules.append(_rule("everything", everything, ["ingress", "egress"], ["**", topics.cache_key("**")]))
         policies.append({"rules": ["everything"], "subjects": ["loopback", "Unix socket"]})
-    for role, vehicle in product((*ROLES, ROUTER), vehicles):
+    for role, vehicle in product(ROLES, vehicles):
         name = common_name(role, vehicle)
         subjects.append({"id": name, "cert_common_names": [name] if role in OF_ONE_VEHICLE else [name, role]})
         found = _rules(role, vehicle)
