@@ -39,7 +39,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches_per_s, record_json
 from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
-from aeroloop.protocol.transport.link import Arrival, Mailbox, ZenohLink
+from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
@@ -226,7 +226,7 @@ class ZenohNetwork(PlantNetwork):
             receive_key=topics.key("command", vehicle, session=claim.session),
             lengths=self._endpoint.wire.lengths("command", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
-            mailbox=Mailbox(self._changed),
+            changed=self._changed,
             also=self._role.datagrams.session,
         )
         self._watch(claim.controller)

@@ -2,7 +2,7 @@
 
 Every key starts with `aeroloop/<vehicle>/`. Frames travel under the session's own keys, so that frames of another
 controller, or of another wire spec, cannot arrive. Services and the recorder look topics up here, and a network with
-certificates takes its access rules from here (transport/access.py).
+certificates takes its access rules from here (transport/zenoh_config.py).
 """
 
 from __future__ import annotations

@@ -29,12 +29,9 @@ from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
 from aeroloop.protocol.runtime.processes import name_process
 from aeroloop.protocol.runtime.throttle import Throttle
-from aeroloop.protocol.transport.datagrams import Datagrams
 from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
-from aeroloop.protocol.transport.network import VISIT_S, join, visit
-from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.router import route
-from aeroloop.protocol.transport.security import Identity
+from aeroloop.protocol.transport.network import COMMAND_S, FrameSession, command_session, join, route
+from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 
@@ -68,12 +65,12 @@ class OccupiedError(AeroloopError):
 
 
 def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
-    with visit(network, identity=Identity(("plant",), vehicle), patient=True) as here:
-        here.settle()
-        if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=VISIT_S)):
+    with command_session(network, identity=Identity(("plant",), vehicle), patient=True) as here:
+        here.wait_for_links()
+        if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=COMMAND_S)):
             return
         where = ""
-        for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=VISIT_S):
+        for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
             if reply.ok is not None:
                 with suppress(ValidationError):
                     where = f" ({Status.model_validate_json(reply.ok.payload.to_bytes()).process})"
@@ -92,7 +89,7 @@ class Role:
 
     Raises:
         NetworkError: The network cannot be joined.
-        SecurityError, CertificateError: Its links cannot be secured.
+        CertificateError: Its links cannot be secured.
         OccupiedError: It is a plant's, and the vehicle has one.
     """
 
@@ -116,7 +113,7 @@ class Role:
         certificate = protected(network, identity).certificate
         self._certificate_until = certificate.not_after if certificate else None
         self.zenoh = (route if role == "router" else join)(network, identity)
-        self.datagrams = Datagrams(network, identity)
+        self.datagrams = FrameSession(network, identity)
         self.process = f"{socket.gethostname()}, pid {os.getpid()}"
         self._status: tuple[float, Status] | None = None  # when it was taken
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time

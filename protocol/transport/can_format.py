@@ -42,18 +42,6 @@ class CanError(AeroloopError):
     """The bus cannot be used; one line with the reason and what to do."""
 
 
-def carried_bytes(size: int) -> int:
-    """Length of the CAN payload that carries this many bytes.
-
-    Raises:
-        CanError: None does.
-    """
-    for length in FD_LENGTHS:
-        if length >= size:
-            return length
-    raise CanError(f"a frame of {size} bytes does not fit into CAN FD's {FD_LENGTHS[-1]}: give its signals fewer bits")
-
-
 class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     """The CAN bus, and which node of it is the plant. `options` go to python-can's interface as they are."""
 
@@ -74,9 +62,17 @@ class CanSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
     options: dict[str, Any] = Field(default={}, description="for the interface, such as bitrate = 1000000")
 
 
+def carried_bytes(size: int) -> int:
+    """Length of the CAN payload that carries this many bytes. Raises CanError if none does."""
+    for length in FD_LENGTHS:
+        if length >= size:
+            return length
+    raise CanError(f"a frame of {size} bytes does not fit into CAN FD's {FD_LENGTHS[-1]}: give its signals fewer bits")
+
+
 def check_widths(settings: CanSettings, wire: WireSpec) -> None:
     """Raise CanError if a frame does not fit the bus, with what would fit."""
-    longest = FD_LENGTHS[-1] if settings.fd else CLASSIC_BYTES
+    bus, longest = ("CAN FD", FD_LENGTHS[-1]) if settings.fd else ("classic CAN", CLASSIC_BYTES)
     for name, frame, signals in (
         ("measurement", wire.measurement, "wire.attitude.bits and wire.rate.bits"),
         ("command", wire.command, "wire.voltage.bits"),
@@ -84,13 +80,10 @@ def check_widths(settings: CanSettings, wire: WireSpec) -> None:
         if frame.size <= longest:
             continue
         sizes = {n: FrameFormat([n] * len(frame.widths), wire.counter_bits).size for n in range(MIN_BITS, MAX_BITS + 1)}
-        widest = max(bits for bits, size in sizes.items() if size <= longest)
-        ways = [f"{signals} to {widest} at the most"]
-        if not settings.fd and frame.size <= FD_LENGTHS[-1]:
-            ways.insert(0, "set can.fd = true")
+        ways = ["set can.fd = true"] if not settings.fd and frame.size <= FD_LENGTHS[-1] else []
+        ways.append(f"{signals} to {max(bits for bits, size in sizes.items() if size <= longest)} at the most")
         if FrameFormat(frame.widths, MIN_COUNTER_BITS).size <= longest:
             ways.append(f"wire.counter_bits = {MIN_COUNTER_BITS} with can.short_counter = true")
-        bus = "CAN FD" if settings.fd else "classic CAN"
         problem = f"a {name} frame has {frame.size} bytes, and a {bus} frame holds {longest}"
         raise CanError(f"{problem}: {', or '.join(ways)}")
 

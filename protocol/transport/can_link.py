@@ -24,7 +24,7 @@ from aeroloop.protocol.transport.can_format import (
     carried_bytes,
     check_widths,
 )
-from aeroloop.protocol.transport.link import Link, Mailbox
+from aeroloop.protocol.transport.link import Link
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
@@ -32,8 +32,7 @@ _BUS_OFF: Final = 0x40  # of a SocketCAN error frame's id
 _RECEIVE_S: Final = 0.1
 _SEND_S: Final = 0.002
 _REOPEN_S: Final = 0.5
-_UNSENT: Final = 20
-"""Failed sends in a row after which the bus counts as lost."""
+_UNSENT: Final = 20  # failed sends in a row after which the bus counts as lost
 
 End = Literal["plant", "controller"]
 
@@ -41,7 +40,7 @@ End = Literal["plant", "controller"]
 class CanLink(Link):
     """One end's frames and heartbeats on a bus. A thread of its own receives.
 
-    `changed` is notified when a frame is received; see Mailbox. In lockstep an empty frame may stand for a silent tick.
+    In lockstep an empty frame may stand for a silent tick.
 
     Attributes:
         peer: The other end's last heartbeat, or None.
@@ -53,8 +52,6 @@ class CanLink(Link):
         CanError: The bus cannot be opened, or a frame does not fit it.
     """
 
-    _mailbox: Mailbox
-
     def __init__(
         self,
         settings: CanSettings,
@@ -65,16 +62,17 @@ class CanLink(Link):
         lockstep: bool = False,
     ) -> None:
         check_widths(settings, wire)
-        plant = end == "plant"
+        super().__init__(changed)
+        received: Literal["measurement", "command"] = "command" if end == "plant" else "measurement"
+        sent = [MEASUREMENT_ID + settings.node, PLANT_HEARTBEAT_ID + settings.node]
+        taken = [COMMAND_ID + settings.node, CONTROLLER_HEARTBEAT_ID + settings.node]
+        if end == "controller":
+            sent, taken = taken, sent
+        self._send_id, self._beat_id = sent
+        self._receive_id, self._peer_beat_id = taken
         self._settings = settings
-        self._send_id = (MEASUREMENT_ID if plant else COMMAND_ID) + settings.node
-        self._receive_id = (COMMAND_ID if plant else MEASUREMENT_ID) + settings.node
-        self._beat_id = (PLANT_HEARTBEAT_ID if plant else CONTROLLER_HEARTBEAT_ID) + settings.node
-        self._peer_beat_id = (CONTROLLER_HEARTBEAT_ID if plant else PLANT_HEARTBEAT_ID) + settings.node
-        self._receives = wire.command if plant else wire.measurement
-        self._lengths = wire.lengths("command" if plant else "measurement", lockstep=lockstep)
-        self._mailbox = Mailbox(changed)
-        self._unsent = 0
+        self._size = getattr(wire, received).size
+        self._may_be_silent = len(SILENCE) in wire.lengths(received, lockstep=lockstep)
         self._reopen_due = 0.0
         self._open = False
         self.peer: Heartbeat | None = None
@@ -103,11 +101,10 @@ class CanLink(Link):
     def reopen(self) -> bool:
         """Reopen the bus after a fault; whether that succeeded."""
         self.close()
-        try:
+        with suppress(CanError):
             self._connect()
-        except CanError:
-            return False
-        return True
+            return True
+        return False
 
     def mend(self) -> bool:
         """As `reopen`, but twice a second at the most; False in between."""
@@ -130,12 +127,11 @@ class CanLink(Link):
         settings = self._settings
         try:
             self._bus = can.Bus(
-                interface=settings.interface, channel=settings.channel, fd=settings.fd, **settings.options
+                channel=settings.channel, interface=settings.interface, fd=settings.fd, **settings.options
             )
         except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise CanError(
-                f"cannot open the CAN bus {settings.interface}:{settings.channel}: {str(error).splitlines()[0]}"
-            ) from None
+            bus = f"{settings.interface}:{settings.channel}"
+            raise CanError(f"cannot open the CAN bus {bus}: {str(error).splitlines()[0]}") from None
         self._open, self.fault, self._unsent = True, None, 0
         self._receiver = threading.Thread(target=self._receive, args=(self._bus,), name="can", daemon=True)
         self._receiver.start()
@@ -149,13 +145,8 @@ class CanLink(Link):
         if not self._open or self.fault is not None:
             return
         fd = len(payload) > CLASSIC_BYTES
-        message = can.Message(
-            arbitration_id=identifier,
-            is_extended_id=False,
-            is_fd=fd,
-            bitrate_switch=fd,
-            data=payload.ljust(carried_bytes(len(payload)), b"\0"),
-        )
+        data = payload.ljust(carried_bytes(len(payload)), b"\0")
+        message = can.Message(arbitration_id=identifier, is_extended_id=False, is_fd=fd, bitrate_switch=fd, data=data)
         try:
             self._bus.send(message, timeout=_SEND_S)
             self._unsent = 0
@@ -184,22 +175,17 @@ class CanLink(Link):
                 self._accept(message.arbitration_id, bytes(message.data))
 
     def _accept(self, identifier: int, data: bytes) -> None:
-        now = time.monotonic_ns()
+        now, size = time.monotonic_ns(), self._size
         if identifier == self._receive_id:
-            size = self._receives.size
-            if data == SILENCE and len(SILENCE) in self._lengths:
+            silent = data == SILENCE and self._may_be_silent
+            padded = len(data) == size or (len(data) > size > CLASSIC_BYTES and not any(data[size:]))
+            if silent or padded:
                 self.peer_ns = now
-                self._mailbox.put(data)
-                return
-            if len(data) < size or any(data[size:]) or (len(data) != size and size <= CLASSIC_BYTES):
+                self.put(data[:size])
+            else:
                 self.refused += 1
-                return
-            self.peer_ns = now
-            self._mailbox.put(data[:size])
         elif identifier == self._peer_beat_id:
-            heartbeat = Heartbeat.unpack(data, now)
-            if heartbeat is None:
+            if heartbeat := Heartbeat.unpack(data, now):
+                self.peer, self.peer_ns = heartbeat, now
+            else:
                 self.refused += 1
-                return
-            self.peer_ns = now
-            self.peer = heartbeat

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import re
-import select
 import socket
-import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from ipaddress import ip_address
 from typing import Final
 
-ACCEPT_S: Final = 0.25
-"""How long `accepting` waits for a connection [s]."""
-TLS: Final = ("tls", "quic")
-"""Protocols whose links are encrypted, both ends with a certificate."""
-DATAGRAMS: Final = ("udp", "quic")
-"""Protocols over UDP."""
-LOCAL: Final = ("unixsock-stream", "unixpipe", "shm")
-"""Protocols that stay on this host, where the file's mode says who may connect."""
+TLS: Final = ("tls", "quic")  # links are encrypted, both ends with a certificate
+LOCAL: Final = ("unixsock-stream", "unixpipe", "shm")  # stays on this host; the file's mode says who may connect
 _FORM: Final = re.compile(
     r"(?P<protocol>[a-z][a-z0-9_-]*)/(?P<host>\[[^]]*\]|[^:?#\s]+)(:(?P<port>\d+))?(?P<words>[?#]\S*)?"
 )
@@ -27,14 +19,7 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An endpoint.
-
-    Attributes:
-        protocol: Such as `tcp`.
-        host: Name or address, one of IPv6 in brackets; a path for a Unix socket.
-        port: None where it has none.
-        words: What follows, from `?` or `#` on.
-    """
+    """An endpoint. An IPv6 `host` is in brackets, that of a Unix socket is a path; `words` begin with `?` or `#`."""
 
     protocol: str
     host: str
@@ -70,11 +55,6 @@ class Endpoint:
         return self.host.strip("[]"), self.port or 0
 
     @property
-    def family(self) -> socket.AddressFamily:
-        """Family of its sockets."""
-        return socket.AF_INET6 if self.host.startswith("[") else socket.AF_INET
-
-    @property
     def on_loopback(self) -> bool:
         """Whether its links stay within this host."""
         if self.protocol in LOCAL or self.host == "localhost":
@@ -99,12 +79,13 @@ class Endpoint:
         """Whether this process could listen at it: it is an address of this host, and its port is free."""
         if self.port is None:
             return True  # only Zenoh can find out
+        family = socket.AF_INET6 if self.host.startswith("[") else socket.AF_INET
         with suppress(OSError):
-            if self.protocol in DATAGRAMS:
-                with socket.socket(self.family, socket.SOCK_DGRAM) as probe:
+            if self.protocol in ("udp", "quic"):
+                with socket.socket(family, socket.SOCK_DGRAM) as probe:
                     probe.bind(self.address)
             else:
-                socket.create_server(self.address, family=self.family).close()
+                socket.create_server(self.address, family=family).close()
             return True
         return False
 
@@ -112,32 +93,3 @@ class Endpoint:
     def is_own(self) -> bool:
         """Whether its address is this host's."""
         return self.at_port(0).is_free
-
-
-def accepting(endpoints: list[str]) -> list[str]:
-    """Those of some endpoints of TCP or TLS at which a process accepts connections; waits briefly for the others."""
-    attempts: dict[int, tuple[socket.socket, str]] = {}
-    found = []
-    for text in endpoints:
-        endpoint = Endpoint.parse(text)
-        if endpoint.protocol in ("tcp", "tls") and endpoint.port is not None:
-            attempt = socket.socket(endpoint.family)
-            attempt.setblocking(False)
-            with suppress(OSError):
-                attempt.connect_ex(endpoint.address)
-            attempts[attempt.fileno()] = attempt, text
-    deadline = time.monotonic() + ACCEPT_S
-    waiting = select.poll()
-    for number in attempts:
-        waiting.register(number, select.POLLOUT)
-    while attempts and (left := deadline - time.monotonic()) > 0:
-        for number, _ in waiting.poll(left * 1000):
-            waiting.unregister(number)
-            attempt, text = attempts.pop(number)
-            with suppress(OSError):
-                attempt.getpeername()  # raises if it is not connected
-                found.append(text)
-            attempt.close()
-    for attempt, _ in attempts.values():
-        attempt.close()
-    return found

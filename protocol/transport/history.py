@@ -14,6 +14,7 @@ from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from math import ceil, inf
 from threading import Lock
 from typing import Final, NamedTuple
@@ -24,29 +25,21 @@ from zenoh.handlers import Callback
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, LossReason
 
-KEPT_S: Final = 65.0
-"""Publishers keep what they publish in this time [s]; one that has been silent for so long is gone."""
-ANSWER_S: Final = 3.0
-"""Time-out of a query [s]; what has been silent for so long cannot be reached now."""
-PAGE_BYTES: Final = 16_384
-"""Most bytes of a page with more than one message: 64 kbit/s carry it in 2 s."""
-WAITING_BYTES: Final = 8_388_608
-"""Most bytes that wait to be taken, with 200 for each message; what finds no room stays lacking."""
-SOON_S, SELDOM_S = 0.025, 0.5
-"""Least and longest pause between two queries [s]: a process takes 50 a second."""
-MOST, RANGES = 256, 4096
-"""Publishers that a subscriber knows, and ranges in a query; ranges that it lacks of each publisher."""
+KEPT_S: Final = 65.0  # for so long publishers keep what they publish; one that has been silent for so long is gone
+ANSWER_S: Final = 3.0  # time-out of a query; what has been silent for so long cannot be reached now
+SOON_S, SELDOM_S = 0.025, 0.5  # pause between two queries while pages bring messages, and else
+PAGE_BYTES: Final = 16_384  # of a page with more than one message: 64 kbit/s carry it in 2 s
+WAITING_BYTES: Final = 8_388_608  # that wait to be taken, with 200 for each message; what finds no room stays lacking
+MOST: Final = 256  # publishers that a subscriber knows, ranges that it lacks of each, and ranges in a query
 
 _ATTACHMENT: Final = struct.Struct("<qQQ")  # wall clock, publisher, number
 _RANGE: Final = struct.Struct("<QQQ")  # publisher, first number, number after the last
 _PAGE: Final = struct.Struct("<QQQ")  # publisher, oldest number that is kept, how many were published
 _ITEM: Final = struct.Struct("<QqI")  # number, wall clock, length
 _END: Final = 2**64 - 1
-ADDED_BYTES: Final = _PAGE.size + _ITEM.size
-"""What a page adds to its only message; an attachment adds less."""
+ADDED_BYTES: Final = _PAGE.size + _ITEM.size  # of a page with one message; an attachment adds less
 
-Range = tuple[int, int]
-"""A number, and the one after the last."""
+Range = tuple[int, int]  # a number, and the one after the last
 
 
 class Delivery(NamedTuple):
@@ -138,12 +131,17 @@ class CachedPublisher:
                 asked.reply(self._cache_key, answer)
 
 
+@dataclass
 class _Source:
-    """Numbers of one publisher; what is older than the first contact, `since`, is not lost if a cache drops it."""
+    """Numbers of one publisher on one key: a page on one key says nothing of another."""
 
-    def __init__(self, since: int) -> None:
-        self.since, self.end, self.seen, self.answered = since, 0, 0.0, False
-        self.lacks: list[Range] = []  # ascending
+    key: str
+    publisher: int
+    since: int  # number of the first contact: what is older is not lost if a cache drops it
+    seen: float  # when something was last received of it [s]
+    end: int = 0  # after the last number that is known
+    answered: bool = False
+    lacks: list[Range] = field(default_factory=list)  # ascending
 
     def extend(self, end: int) -> None:
         """All numbers before `end` were published."""
@@ -161,38 +159,30 @@ class _Source:
         self.lacks[at : at + 1] = [each for each in ((first, number), (number + 1, end)) if each[0] < each[1]]
         return True
 
-    def leave(self, before: int, since: int = 0) -> int:
-        """Remove what is lacking before a number; returns how much of it is not older than `since`."""
-        lost = sum(max(0, min(end, before) - max(first, since)) for first, end in self.lacks)
-        self.lacks = [(max(first, before), end) for first, end in self.lacks if end > before]
-        return lost
-
 
 class RecoveringSubscriber:
     """Subscriber that queries publishers' caches for what it did not receive. The session outlives it.
 
-    `clock` is monotonic [s].
+    `clock` is monotonic [s]; by it, `news` is when a page last brought a message.
     """
 
     def __init__(self, session: zenoh.Session, key: str, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._session, self._cache_key, self._lock = session, topics.cache_key(key), Lock()
+        self._session, self._cache_key, self._clock, self._lock = session, topics.cache_key(key), clock, Lock()
         self._waiting, self._bytes = list[Delivery](), 0
-        self._sources: dict[tuple[str, int], _Source] = {}  # by key: a page on one key says nothing of another
+        self._sources: dict[tuple[str, int], _Source] = {}
         self._lost: Counter[tuple[str, LossReason]] = Counter()
-        self._asked = self._complete = -inf  # the last query, and the last that is complete
-        self._pause, self.news = SOON_S, -inf
-        """When a page last brought a message, by the clock [s]."""
+        self._asked = self._complete = self.news = -inf  # the last query, and the last that is complete
         self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
     def take(self, *, last: bool = False) -> list[Delivery]:
         """Messages that wait, each once, in the order of arrival. Never waits.
 
         Also queries the caches, if the last query is answered: 25 ms later while pages bring messages, and if these are
-        the `last` messages, else ever more seldom.
+        the `last` messages, else twice a second.
         """
-        free = max(self._complete, self.news) >= self._asked
-        if free and self._clock() >= self._asked + (SOON_S if last else self._pause):
+        paging = self.news >= self._asked
+        due = self._asked + (SOON_S if last or paging else SELDOM_S)
+        if (paging or self._complete >= self._asked) and self._clock() >= due:
             self._query()
         with self._lock:
             taken, self._waiting, self._bytes = self._waiting, [], 0
@@ -201,43 +191,50 @@ class RecoveringSubscriber:
     @property
     def recovering(self) -> bool:
         """Whether an answer is awaited, pages bring messages, or some are lacking that can be reached."""
-        return self._pause < SELDOM_S or not self.complete(self._asked)
+        return self.news >= self._asked or not self.complete(self._asked)
 
     def complete(self, since: float) -> bool:
         """Whether a query after `since` [s] is answered, and nothing lacks that can be reached."""
         with self._lock:
-            lacks = any(source.lacks and self._reachable(source) for source in self._sources.values())
+            lacks = any(source.lacks and self._age(source) < ANSWER_S for source in self._sources.values())
             return self._complete >= since and not lacks
 
     def losses(self, *, finished: bool = False) -> list[Loss]:
         """Losses since the last call; if `finished`, all that is lacking is lost."""
         with self._lock:
-            for (key, _), source in self._sources.items() if finished else ():
-                self._leave(key, source, source.end, "end" if self._reachable(source) and source.answered else "gone")
+            for source in self._sources.values() if finished else ():
+                there = self._age(source) < ANSWER_S and source.answered
+                self._give_up(source, source.end, "end" if there else "gone")
             lost, self._lost = self._lost, Counter()
         return [Loss(key=key, count=count, reason=reason) for (key, reason), count in lost.items()]
 
     def silent(self) -> dict[str, float]:
         """For how long nothing was received of publishers that cannot be reached and may still have messages [s]."""
         with self._lock:
-            ages = {key: self._clock() - source.seen for (key, _), source in self._sources.items()}
+            ages = {source.key: self._age(source) for source in self._sources.values()}
         return {key: age for key, age in ages.items() if ANSWER_S < age < KEPT_S}
+
+    def _age(self, source: _Source) -> float:
+        return self._clock() - source.seen
 
     def _query(self) -> None:
         """Query the caches for what is lacking, of each publisher the newest first, or else for what is newer."""
         with self._lock:
             self._asked = asked = self._clock()
-            self._pause = min(2 * self._pause, SELDOM_S)
             wanted, each_has = list[tuple[int, Range]](), MOST // max(1, len(self._sources))
-            for (key, publisher), source in self._sources.items():
-                if asked - source.seen > KEPT_S:
-                    self._leave(key, source, source.end, "gone")
+            for source in self._sources.values():
+                if self._age(source) > KEPT_S:
+                    self._give_up(source, source.end, "gone")
                 ranges = source.lacks[: -each_has - 1 : -1] or [(source.end, _END)]
-                wanted += [(publisher, each) for each in ranges]
+                wanted += [(source.publisher, each) for each in ranges]
+
+        def completed() -> None:
+            self._complete = max(self._complete, asked)
+
         with suppress(zenoh.ZError):  # the session is closed
             self._session.get(
                 self._cache_key,
-                Callback(self._read, lambda: self._completed(asked), indirect=False),
+                Callback(self._read, completed, indirect=False),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=ANSWER_S,
@@ -256,41 +253,40 @@ class RecoveringSubscriber:
             source = self._source(message.key, message.publisher, message.number)
             source.extend(message.number + 1)
             self._add(message, source)
-            if len(source.lacks) > RANGES:
-                self._leave(message.key, source, source.lacks[1][0], "cache")
+            if len(source.lacks) > MOST:
+                self._give_up(source, source.lacks[1][0], "cache")
 
     def _read(self, reply: zenoh.Reply) -> None:
         """Take a page; what is malformed is ignored."""
-        data = reply.ok.payload.to_bytes() if reply.ok is not None else b""
-        at, found = _PAGE.size, list[tuple[int, int, bytes]]()
+        if reply.ok is None or len(data := reply.ok.payload.to_bytes()) < _PAGE.size:
+            return
+        key, (publisher, oldest, count) = topics.cached_key(str(reply.ok.key_expr)), _PAGE.unpack_from(data)
+        at, found = _PAGE.size, list[Delivery]()
         while at + _ITEM.size <= len(data):
             number, clock_ns, length = _ITEM.unpack_from(data, at)
             at += _ITEM.size + length
-            found.append((number, clock_ns, data[at - length : at]))
-        if reply.ok is None or at != len(data):
+            found.append(Delivery(key, data[at - length : at], number, clock_ns, publisher))
+        if at != len(data):
             return
-        key, (publisher, oldest, count) = topics.cached_key(str(reply.ok.key_expr)), _PAGE.unpack_from(data)
         with self._lock:
             source = self._source(key, publisher, count)
             source.extend(count)
-            new = [self._add(Delivery(key, each[2], each[0], each[1], publisher), source) for each in reversed(found)]
-            self._leave(key, source, oldest, "cache")
+            new = [self._add(each, source) for each in reversed(found)]
+            self._give_up(source, oldest, "cache")
             source.answered = True
             if any(new):
-                self.news, self._pause = self._clock(), SOON_S
-
-    def _completed(self, asked: float) -> None:
-        self._complete = max(self._complete, asked)
+                self.news = self._clock()
 
     def _source(self, key: str, publisher: int, since: int) -> _Source:
-        source = self._sources.get((key, publisher))
-        if source is None:
+        now = self._clock()
+        if (key, publisher) not in self._sources:
             if len(self._sources) >= MOST:
-                silent = min(self._sources, key=lambda each: self._sources[each].seen)
-                self._leave(silent[0], self._sources[silent], _END, "gone")
-                del self._sources[silent]
-            source = self._sources[key, publisher] = _Source(since)
-        source.seen = self._clock()
+                silent = min(self._sources.values(), key=lambda each: each.seen)
+                self._give_up(silent, _END, "gone")
+                del self._sources[silent.key, silent.publisher]
+            self._sources[key, publisher] = _Source(key, publisher, since, now)
+        source = self._sources[key, publisher]
+        source.seen = now
         return source
 
     def _add(self, message: Delivery, source: _Source | None = None) -> bool:
@@ -302,10 +298,10 @@ class RecoveringSubscriber:
         self._bytes += size
         return True
 
-    def _leave(self, key: str, source: _Source, before: int, reason: LossReason) -> None:
+    def _give_up(self, source: _Source, before: int, reason: LossReason) -> None:
+        """Give up what is lacking before a number, and count it: from the first contact on, or all that a cache had."""
         since = source.since if reason == "cache" or not source.answered else 0
-        if lost := source.leave(before, since):
-            self._lost[key, reason] += lost
-
-    def _reachable(self, source: _Source) -> bool:
-        return self._clock() - source.seen < ANSWER_S
+        lost = sum(max(0, min(end, before) - max(first, since)) for first, end in source.lacks)
+        source.lacks = [(max(first, before), end) for first, end in source.lacks if end > before]
+        if lost:
+            self._lost[source.key, reason] += lost

@@ -18,50 +18,17 @@ from zenoh.handlers import Callback
 
 
 class Arrival(NamedTuple):
-    """A received frame.
-
-    Attributes:
-        frame: Its bytes.
-        at_ns: When it was received, on `time.monotonic_ns()`.
-    """
+    """A received frame, and when it was received on `time.monotonic_ns()`."""
 
     frame: bytes
     at_ns: int
 
 
-class Link(ABC):
-    """Sends frames, and receives frames in a mailbox; implemented for each transport."""
-
-    _mailbox: Mailbox
-
-    @abstractmethod
-    def send(self, frame: bytes) -> None:
-        """Send a frame. Blocks only to hand it over, and never raises for a lost peer."""
-
-    @property
-    def pending(self) -> bool:
-        """Whether a received frame waits to be taken."""
-        return self._mailbox.pending
-
-    def take(self) -> Arrival | None:
-        """The newest frame not yet taken, or None."""
-        return self._mailbox.take()
-
-    def wait(self, timeout_s: float) -> Arrival | None:
-        """As `take`, but wait up to `timeout_s` for a frame."""
-        return self._mailbox.wait(timeout_s)
-
-    @abstractmethod
-    def close(self) -> None:
-        """Stop receiving. May be called twice."""
-
-
 class Mailbox:
-    """A slot for a frame, written by a receiving thread and read by the loop; a new frame replaces the oldest.
+    """A slot for frames, written by a receiving thread and read by the loop; a new frame replaces the oldest.
 
-    Args:
-        changed: Notified when a frame is put; one of its own if None. Several slots of one reader may share one.
-        depth: Frames it holds, for a reader that needs each of them; the oldest is taken first.
+    `changed` is notified when a frame is put; several mailboxes of one reader may share it. `depth` is how many frames
+    it holds, for a reader that needs each of them; the oldest is taken first.
     """
 
     def __init__(self, changed: Condition | None = None, depth: int = 1) -> None:
@@ -77,7 +44,7 @@ class Mailbox:
 
     @property
     def pending(self) -> bool:
-        """Whether a frame is in the slot."""
+        """Whether a received frame waits to be taken."""
         return bool(self._arrivals)
 
     def take(self) -> Arrival | None:
@@ -91,26 +58,27 @@ class Mailbox:
             return self.take()
 
 
+class Link(Mailbox, ABC):
+    """A mailbox for the frames received, and a way to send some; implemented for each transport."""
+
+    @abstractmethod
+    def send(self, frame: bytes) -> None:
+        """Send a frame. Blocks only to hand it over, and never raises for a lost peer."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop receiving. May be called twice."""
+
+
 class ZenohLink(Link):
     """Frames over Zenoh: express, at real-time priority. The session outlives the link.
 
-    Zenoh's receiving thread fills the mailbox, so times of arrival are exact. If `lossless`, `send` blocks when a peer
-    does not keep up, instead of dropping: for lockstep, where each frame is waited for.
+    Zenoh's receiving thread fills the mailbox, so times of arrival are exact. `lengths` are those of the frames
+    received [bytes]; `refused` counts frames of any other. If `lossless`, `send` blocks when a peer does not keep up,
+    instead of dropping: for lockstep, where each frame is waited for.
 
     A plant's link may have a second session, `also`: frames are received on both, and sent on each that has a
     subscriber, which the controller has on one.
-
-    Args:
-        session: Session of the frames.
-        send_key: Key of the frames sent.
-        receive_key: Key of the frames received.
-        lengths: Lengths of the frames received [bytes]; a frame of another length is refused.
-        lossless: Whether `send` may block.
-        mailbox: Slot for received frames; a new one if None.
-        also: The second session.
-
-    Attributes:
-        refused: Frames of a wrong length so far.
     """
 
     def __init__(
@@ -121,24 +89,23 @@ class ZenohLink(Link):
         lengths: Container[int],
         *,
         lossless: bool = False,
-        mailbox: Mailbox | None = None,
+        changed: Condition | None = None,
+        depth: int = 1,
         also: zenoh.Session | None = None,
     ) -> None:
+        super().__init__(changed, depth)
         sessions = [session] if also is None else [also, session]
-        self._mailbox = mailbox = mailbox or Mailbox()
         self.refused = 0
 
         def receive(sample: zenoh.Sample) -> None:
             frame = sample.payload.to_bytes()
             if len(frame) in lengths:
-                mailbox.put(frame)
+                self.put(frame)
             else:
                 self.refused += 1
 
         handler = Callback(receive, indirect=False)  # in Zenoh's thread: one of Python's would be one wake-up more
-        self._declared: list[Callable[[], None]] = [
-            each.declare_subscriber(receive_key, handler).undeclare for each in sessions
-        ]
+        subscribers = [each.declare_subscriber(receive_key, handler) for each in sessions]
         self._publishers = [
             each.declare_publisher(
                 send_key,
@@ -149,8 +116,8 @@ class ZenohLink(Link):
             )
             for each in sessions
         ]
-        self._declared += [publisher.undeclare for publisher in self._publishers]
-        self._open = True
+        self._undeclare: list[Callable[[], None]] = [each.undeclare for each in subscribers]
+        self._undeclare += [each.undeclare for each in self._publishers]
 
     def send(self, frame: bytes) -> None:
         """Send a frame."""
@@ -159,7 +126,5 @@ class ZenohLink(Link):
 
     def close(self) -> None:
         """Stop receiving."""
-        if self._open:
-            self._open = False
-            for undeclare in self._declared:
-                undeclare()
+        while self._undeclare:
+            self._undeclare.pop(0)()

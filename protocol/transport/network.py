@@ -1,12 +1,11 @@
-"""Network: opens this process's Zenoh session, peer to peer or at a router, without multicast.
+"""Network: opens Zenoh's sessions of this process, peer to peer or at a router, without multicast.
 
 Every peer listens at the first free of `network.ports` consecutive ports from `network.rendezvous` on, and connects to
 all of them. So a newcomer joins at any process that answers, and no process is needed by the others: order of start,
 end or halt of any of them does not matter. Peers also learn each other's addresses by gossip and link directly.
 
-A client links to a router alone (`router.py`), does not listen, and waits until there is one.
-
-An operator's command does not listen: it visits, and finds which processes accept a connection but do not answer.
+A client links to a router alone, does not listen, and waits until there is one. An operator's command does not listen
+either, and finds which processes accept a connection but do not answer.
 """
 
 from __future__ import annotations
@@ -16,169 +15,240 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from importlib.metadata import version
 from math import inf
 from typing import Any, Final
 
 import zenoh
 
 from aeroloop.protocol.transport.certificate import Certificate
-from aeroloop.protocol.transport.endpoint import Endpoint, accepting
-from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings, Protected, protected
-from aeroloop.protocol.transport.refusal import refusal
-from aeroloop.protocol.transport.security import READER, Identity
-from aeroloop.protocol.transport.session_tree import (
-    HANDSHAKE_MS,
-    PATIENT_LEASE_MS,
-    RETRY_MS,
-    open_tree,
-    reason,
-    session_tree,
+from aeroloop.protocol.transport.endpoint import Endpoint
+from aeroloop.protocol.transport.network_settings import (
+    READER,
+    Identity,
+    NetworkError,
+    NetworkSettings,
+    Protected,
+    protected,
 )
+from aeroloop.protocol.transport.probe import accepting, refusal
+from aeroloop.protocol.transport.zenoh_config import PATIENT_LEASE_MS, THREADS, router_config, zenoh_config
 
 log: Final = logging.getLogger("aeroloop")
-VISIT_S: Final = 0.5
+COMMAND_S: Final = 0.5
 """How long a command waits for a process that accepts a connection to answer [s]; usual is some 10 ms."""
-SETTLE_S: Final = 0.1
+DECLARED_S: Final = 0.1
 """Declarations follow a new link within this time [s]; usual is a millisecond."""
 POLL_S: Final = 0.005
-ROUTER_AGAIN_S: Final = 0.2
-"""Pause before a client that finds no router looks again [s]."""
-ROUTER_PATIENCE_S: Final = 3.0
-"""After this time without a router a client logs a warning [s]: it may have started first."""
-
-
-class Visit:
-    """A session of a command: it has no endpoint of its own, and links to every process that answers.
-
-    Attributes:
-        session: The session.
-        certificate: Its own; None where no link needs one.
-    """
-
-    def __init__(self, session: zenoh.Session, places: list[str], certificate: Certificate | None) -> None:
-        self.session = session
-        self.certificate = certificate
-        self._places = places
-        self._silent: list[str] | None = None
-
-    def settle(self, wait_s: float = VISIT_S) -> None:
-        """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
-        begun = time.monotonic()
-        while (passed := time.monotonic() - begun) < SETTLE_S or (passed < wait_s and self.silent()):
-            time.sleep(POLL_S)
-
-    def silent(self) -> list[str]:
-        """Endpoints at which a process accepts connections and has not answered as Zenoh so far.
-
-        Tried are only those without a link, at the first call: after a connection that ends before its handshake,
-        Zenoh's listener of TLS accepts none for 0.1 s.
-        """
-        if self._silent is None:
-            self._silent = accepting(unlinked(self.session, self._places))
-        if self._silent:
-            self._silent = unlinked(self.session, self._silent)
-        return self._silent
+ROUTER_AGAIN_S: Final = 0.2  # pause before a client that finds no router looks again
+ROUTER_PATIENCE_S: Final = 3.0  # a client logs a warning after this time without a router: it may have started first
 
 
 def join(settings: NetworkSettings, identity: Identity = READER, *, listen: bool = True) -> zenoh.Session:
     """Open a session that meets the others at the rendezvous. The caller closes it.
 
-    Args:
-        settings: Where.
-        identity: What the process is.
-        listen: Whether others can connect to this process: yes for a role, no for a command that only queries.
+    `identity` is what the process is. `listen` is whether others can connect to it: yes for a role, no for a command
+    that only queries.
 
     Raises:
-        NetworkError: A `listen` endpoint cannot be opened, or a client's settings name no router.
-        SecurityError, CertificateError: Its links cannot be secured, see `protected`.
+        NetworkError: A `listen` endpoint cannot be opened, a client's settings name no router, or links cannot be
+            secured as configured.
+        CertificateError: A certificate is needed, and this process has none that is good.
     """
     network = protected(settings, identity)
     if listen:
-        warn_of_plain(network)
+        _warn_of_plain(network)
     if settings.mode == "client":
         return _join_router(network)
-    places, further = network.settings.places, network.settings.listen
-    for place in places if listen else []:
-        if Endpoint.parse(place).is_free:
+    meeting, further = network.settings.rendezvous_endpoints, network.settings.listen
+    for each in meeting if listen else []:
+        if Endpoint.parse(each).is_free:
             with suppress(zenoh.ZError):  # taken in the meantime
-                return _open(network, [place, *further], [other for other in places if other != place])
-    first = Endpoint.parse(places[0]) if listen and places else None
-    any_port = [str(first.at_port(0))] if first is not None and first.is_own else []
+                return _open(zenoh_config(network, "peer", [each, *further], [one for one in meeting if one != each]))
+    any_port = [str(first.at_port(0)) for first in map(Endpoint.parse, meeting[:1]) if first.is_own]
     try:
-        return _open(network, [*further, *any_port] if listen else [], places)
+        return _open(zenoh_config(network, "peer", [*further, *any_port] if listen else [], meeting))
     except zenoh.ZError as error:
         raise NetworkError(
-            f"cannot listen on {', '.join(further)}: {reason(error)}; give free ones with --set network.listen="
+            f"cannot listen on {', '.join(further)}: {_reason(error)}; give free ones with --set network.listen="
             f"'{json.dumps([str(Endpoint.parse(each).at_port(0)) for each in settings.listen])}'"
         ) from None
 
 
+def route(settings: NetworkSettings, identity: Identity) -> zenoh.Session:
+    """Open a router's session, which passes on what its clients publish and query. Closing and errors as of `join`."""
+    network = protected(settings, identity)
+    _warn_of_plain(network)
+    config = router_config(network)
+    try:
+        return _open(config)
+    except zenoh.ZError as error:
+        raise NetworkError(
+            f"cannot listen on {', '.join(config['listen']['endpoints']) or 'nothing'}: {_reason(error)}; "
+            "name a free endpoint of this host in network.rendezvous or network.listen"
+        ) from None
+
+
+def zenohd_config(settings: NetworkSettings, identity: Identity) -> str:
+    """A router's configuration as JSON5, for a stock `zenohd` of the same version. Raises as `join`."""
+    return (
+        f"// Router of aeroloop, for zenohd {version('eclipse-zenoh')}:\n"
+        f"// ZENOH_RUNTIME='{THREADS}' zenohd --config FILE\n"
+        f"{json.dumps(router_config(protected(settings, identity)), indent=2)}\n"
+    )
+
+
+class CommandSession:
+    """A session of a command: it has no endpoint of its own, and links to every process that answers.
+
+    `certificate` is its own; None where no link needs one.
+    """
+
+    def __init__(self, session: zenoh.Session, endpoints: list[str], certificate: Certificate | None) -> None:
+        self.session = session
+        self.certificate = certificate
+        self._endpoints = endpoints
+        self._accepting: list[str] | None = None
+
+    def wait_for_links(self, wait_s: float = COMMAND_S) -> None:
+        """Wait until every process that accepts connections is linked and has declared what it has, or for `wait_s`."""
+        begun = time.monotonic()
+        while (passed := time.monotonic() - begun) < DECLARED_S or (passed < wait_s and self.unanswered()):
+            time.sleep(POLL_S)
+
+    def unanswered(self) -> list[str]:
+        """Endpoints at which a process accepts connections and has not answered as Zenoh so far.
+
+        Tried are only those without a link, at the first call: after a connection that ends before its handshake,
+        Zenoh's listener of TLS accepts none for 0.1 s.
+        """
+        if self._accepting is None:
+            self._accepting = accepting(self._unlinked(self._endpoints))
+        return self._unlinked(self._accepting)
+
+    def _unlinked(self, endpoints: list[str]) -> list[str]:
+        """Those of some endpoints without a link of this session's own; one that the peer has made is none."""
+        linked = {str(link.dst) for link in self.session.info.links()}
+        return [each for each in endpoints if each not in linked]
+
+
 @contextmanager
-def visit(
-    settings: NetworkSettings, wait_s: float = VISIT_S, identity: Identity = READER, *, patient: bool = False
-) -> Iterator[Visit]:
+def command_session(
+    settings: NetworkSettings, wait_s: float = COMMAND_S, identity: Identity = READER, *, patient: bool = False
+) -> Iterator[CommandSession]:
     """Open a session for a few queries that take at most `wait_s`. If `patient`, a client waits for a router.
 
     Why an attempt to connect ends earlier, and no other follows: closing a session waits for a handshake in progress.
 
     Raises:
-        NetworkError: It is a client's, and no router answers.
+        NetworkError: It is a client's, and no router answers; else as `join`.
     """
     wait_ms = round(wait_s * 1000)
     network = protected(settings, identity)
-    places = network.settings.places
+    meeting = network.settings.rendezvous_endpoints
     try:
         if patient and settings.mode == "client":
             session = _join_router(network)
         else:
-            session = _open(network, [], places, handshake_ms=wait_ms * 4 // 5, retry_ms=(2 * wait_ms, 2 * wait_ms))
+            retry_ms = (2 * wait_ms, 2 * wait_ms)
+            session = _open(zenoh_config(network, settings.mode, [], meeting, wait_ms * 4 // 5, retry_ms))
     except zenoh.ZError:
         raise NetworkError(_no_router(network)) from None
     with closing(session):  # a client is linked from the start
-        met = [*network.settings.connect, *places] if settings.mode == "peer" else []
-        yield Visit(session, met, network.certificate)
+        met = [*network.settings.connect, *meeting] if settings.mode == "peer" else []
+        yield CommandSession(session, met, network.certificate)
 
 
-def open_session(network: Protected, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
-    """Open a session at these endpoints and no others. Raises zenoh.ZError."""
-    at = [*listen, *connect]
-    here: dict[str, Any] = {
-        "rendezvous": at,
-        "ports": 1,
-        "listen": [],
-        "connect": [],
-        "gossip": False,
-        "transport": "tcp",
-        "mode": "peer",
-    }
-    here["lease_ms"] = max(network.settings.lease_ms, PATIENT_LEASE_MS)
-    only = network._replace(settings=network.settings.model_copy(update=here))
-    return _open(only, list(listen), list(connect))
+class FrameSession:
+    """A second session of a loop's two ends, which carries their frames over UDP; none on loopback, or if not set.
+
+    Over TCP, and so over TLS, one lost packet holds back all that follow until it has been sent again: 0.2 s and more,
+    in which the plant's watchdog trips. A lost frame needs nothing: the next one replaces it. So between hosts frames
+    get a session of their own: a QUIC connection, whose datagrams carry them and whose stream carries what Zenoh
+    declares. Why not a second link of the first session: its first link carries the declarations, and if that is UDP,
+    a lost packet costs a subscription for good.
+
+    The plant listens at the first free port of its host's endpoints, by UDP, and names the `endpoint` in its status.
+    The controller connects to it before it claims; without such a link its frames stay on the first session.
+    """
+
+    LINK_S = 5.0
+    """How long claims wait for the link to a plant [s]: at 20 % loss a handshake takes up to 4 s, usually 0.02 s."""
+
+    def __init__(self, settings: NetworkSettings, identity: Identity) -> None:
+        self._network = protected(settings, identity)
+        self._endpoints = _datagram_endpoints(self._network.settings)
+        self._deadline = 0.0
+        self.session: zenoh.Session | None = None
+        self.endpoint = ""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether frames are to travel by datagrams, so that a plant's endpoint is worth asking for."""
+        return self._network.settings.mixed
+
+    @property
+    def linked(self) -> bool:
+        """Whether there is a link to a peer now."""
+        return self.session is not None and bool(self.session.info.peers_zid())
+
+    def listen(self) -> None:
+        """Listen at the first free one of this host's endpoints, if datagrams are wanted; `endpoint` then names it."""
+        for each in self._endpoints if self.wanted else []:
+            if Endpoint.parse(each).is_free:
+                with suppress(zenoh.ZError):  # taken in the meantime
+                    self.session, self.endpoint = self._open(listen=[each]), each
+                    return
+
+    def connect(self, endpoint: str) -> bool | None:
+        """Connect to a plant's endpoint; whether there is a link. None while that is not decided, for up to `LINK_S`.
+
+        An endpoint that is not among the network's own is refused: a status from elsewhere leads nowhere.
+        """
+        if endpoint not in self._endpoints:
+            return False
+        if endpoint != self.endpoint or self.session is None:
+            self.close()
+            self.session, self.endpoint = self._open(connect=[endpoint]), endpoint
+            self._deadline = time.monotonic() + self.LINK_S
+        soon = min(time.monotonic() + 0.2, self._deadline)
+        while not self.linked and time.monotonic() < soon:
+            time.sleep(POLL_S)
+        return self.linked or (None if time.monotonic() < self._deadline else False)
+
+    def close(self) -> None:
+        """Close the session, if there is one."""
+        if self.session is not None:
+            self.session.close()
+            self.session = None
+
+    def _open(self, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
+        """Open a session at these endpoints and no others, and without compression. Raises zenoh.ZError."""
+        settings = self._network.settings
+        lease_ms = max(settings.lease_ms, PATIENT_LEASE_MS)
+        only: dict[str, Any] = {"rendezvous": [*listen, *connect], "ports": 1, "listen": [], "connect": []}
+        only |= {"gossip": False, "transport": "tcp", "lease_ms": lease_ms}
+        network = self._network._replace(settings=settings.model_copy(update=only))
+        return _open(zenoh_config(network, "peer", list(listen), list(connect)))
 
 
-def unlinked(session: zenoh.Session, places: list[str]) -> list[str]:
-    """Those of some endpoints to which a session has no link of its own; one that the peer has made is none."""
-    linked = {str(link.dst) for link in session.info.links()}
-    return [place for place in places if place not in linked]
-
-
-def warn_of_plain(network: Protected) -> None:
-    """Log a warning where links are plain text, because that is allowed."""
-    plain = [each for each in network.settings.endpoints if Endpoint.parse(each).is_plain]
-    if network.settings.insecure and plain:
-        log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
+def _datagram_endpoints(settings: NetworkSettings) -> list[str]:
+    """The endpoints of datagrams beside those of the rendezvous: the same address and port, by UDP; not on loopback."""
+    carriers = {"tcp": "udp", "tls": "quic"}
+    words = "?rel=1;mixed_rel=1"  # Zenoh's for a QUIC connection with a reliable stream and with datagrams
+    beyond = [each for each in map(Endpoint.parse, settings.rendezvous_endpoints) if each.leaves_host]
+    return [str(replace(each, protocol=carriers[each.protocol], words=words)) for each in beyond]
 
 
 def _join_router(network: Protected) -> zenoh.Session:
     """Link to a router, as soon as one answers; Zenoh links again whenever the link is lost."""
-    places = network.settings.places
+    if not [*network.settings.connect, *network.settings.rendezvous]:
+        raise NetworkError('network.mode = "client" needs a router in network.rendezvous')
     warn_at = time.monotonic() + ROUTER_PATIENCE_S
     while True:
-        try:
-            return _open(network, [], places)
-        except zenoh.ZError:
-            if not [*network.settings.connect, *places]:
-                raise NetworkError('network.mode = "client" needs a router in network.rendezvous') from None
+        with suppress(zenoh.ZError):
+            return _open(zenoh_config(network, "client", [], network.settings.rendezvous))
         if time.monotonic() > warn_at:
             log.warning("waiting for a router: %s", _no_router(network))
             warn_at = inf
@@ -187,18 +257,24 @@ def _join_router(network: Protected) -> zenoh.Session:
 
 def _no_router(network: Protected) -> str:
     """One line about routers that do not answer."""
-    places = [*network.settings.connect, *network.settings.places]
-    for place in accepting(places):
-        why = refusal(place, network.certificate) if network.certificate else None
-        return why or f"a process at {place} accepts connections and does not answer as a router"
-    return f"no router answers at {', '.join(places)}; is `aeroloop router` running?"
+    routers = [*network.settings.connect, *network.settings.rendezvous]
+    for each in accepting(routers):
+        why = refusal(each, network.certificate) if network.certificate else None
+        return why or f"a process at {each} accepts connections and does not answer as a router"
+    return f"no router answers at {', '.join(routers)}; is `aeroloop router` running?"
 
 
-def _open(
-    network: Protected,
-    listen: list[str],
-    places: list[str],
-    handshake_ms: int = HANDSHAKE_MS,
-    retry_ms: tuple[int, int] = RETRY_MS,
-) -> zenoh.Session:
-    return open_tree(session_tree(network, network.settings.mode, listen, places, handshake_ms, retry_ms))
+def _warn_of_plain(network: Protected) -> None:
+    """Log a warning where links are plain text, because that is allowed."""
+    plain = [each for each in network.settings.endpoints if Endpoint.parse(each).is_plain]
+    if network.settings.insecure and plain:
+        log.warning("network.insecure: links at %s are plain text, open to anyone on that network", plain[0])
+
+
+def _open(config: dict[str, Any]) -> zenoh.Session:
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+
+
+def _reason(error: Exception) -> str:
+    """Zenoh's message without the source locations it carries."""
+    return str(error).split(" at /")[0].split(": [")[0].rstrip(". ")

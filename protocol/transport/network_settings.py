@@ -1,19 +1,26 @@
-"""Network settings: where a process meets the others, and how its links are protected."""
+"""Network settings: where a process meets the others, and which of its links become mutual TLS.
+
+An endpoint of TCP on another host than this becomes one of TLS; on loopback it stays as it is, unless
+`network.loopback_secured`. A process uses the certificate of its role and vehicle, to connect and to listen. Names of
+hosts do not matter: what a peer may do follows from its certificate's common name alone.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NamedTuple
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.transport.certificate import Certificate
-from aeroloop.protocol.transport.endpoint import Endpoint
-from aeroloop.protocol.transport.security import Identity, SecurityError, SecuritySettings, certificate_for, secured
+from aeroloop.protocol.messages.topics import NAME
+from aeroloop.protocol.transport.certificate import Certificate, own_certificate
+from aeroloop.protocol.transport.endpoint import LOCAL, TLS, Endpoint
 
 
 class NetworkError(AeroloopError):
-    """The network cannot be joined; one line with the reason and what to do."""
+    """The network cannot be joined as configured; one line with the reason and what to do."""
 
 
 def _endpoint(text: str) -> str:
@@ -23,6 +30,27 @@ def _endpoint(text: str) -> str:
 
 
 EndpointText = Annotated[str, AfterValidator(_endpoint)]
+
+
+class SecuritySettings(BaseModel, extra="forbid"):
+    """Certificates of this host."""
+
+    directory: str = Field(
+        default="",
+        description="folder of this host's certificates, as `aeroloop host keys` makes it; every link beyond loopback "
+        "is then mutual TLS; empty for none",
+    )
+
+    vehicles: list[Annotated[str, Field(pattern=f"^{NAME}$")]] = Field(
+        default=[],
+        description="vehicles whose peers have rights here; the configured one always, further ones for a recorder, an "
+        "operator or an observer of several",
+    )
+
+    @property
+    def folder(self) -> Path | None:
+        """The directory, with `~` expanded."""
+        return Path(self.directory).expanduser() if self.directory else None
 
 
 class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
@@ -78,34 +106,39 @@ class NetworkSettings(BaseModel, extra="forbid", coerce_numbers_to_str=True):
         return value if isinstance(value, list | tuple) else [value] if value else []
 
     @property
-    def places(self) -> list[str]:
+    def rendezvous_endpoints(self) -> list[str]:
         """Every endpoint at which a process may be met: the rendezvous, port by port; by a client, the routers."""
         if self.mode == "client":
             return self.rendezvous
-        return [str(place) for first in self.rendezvous for place in Endpoint.parse(first).ports(self.ports)]
-
-    @property
-    def mixed(self) -> bool:
-        """Whether each kind of traffic has a transport of its own: between peers beyond loopback, if so set."""
-        return (
-            self.transport == "mixed"
-            and self.mode == "peer"
-            and any(Endpoint.parse(each).leaves_host for each in self.rendezvous)
-        )
+        return [str(each) for first in self.rendezvous for each in Endpoint.parse(first).ports(self.ports)]
 
     @property
     def endpoints(self) -> list[str]:
         """Every endpoint that is connected to or listened on."""
-        return [*self.places, *self.connect, *self.listen]
+        return [*self.rendezvous_endpoints, *self.connect, *self.listen]
+
+    @property
+    def mixed(self) -> bool:
+        """Whether each kind of traffic has a transport of its own: between peers beyond loopback, if so set."""
+        beyond = any(Endpoint.parse(each).leaves_host for each in self.rendezvous)
+        return self.transport == "mixed" and self.mode == "peer" and beyond
+
+
+class Identity(NamedTuple):
+    """What a process is: the first of `roles` that the directory has a certificate of; of any vehicle if None."""
+
+    roles: tuple[str, ...]
+    vehicle: str | None = None
+
+
+READER: Final = Identity(("operator", "observer"))
+"""A command or a viewer, of any vehicle."""
 
 
 class Protected(NamedTuple):
     """A process's own network, with the endpoints that it opens in place of the configured ones.
 
-    Attributes:
-        settings: The network.
-        certificate: Its certificate; None where no link needs one.
-        vehicles: Those whose peers it takes messages of, if it has a certificate.
+    `certificate` is None where no link needs one. With one, messages are taken of peers of these `vehicles` only.
     """
 
     settings: NetworkSettings
@@ -114,24 +147,39 @@ class Protected(NamedTuple):
 
 
 def protected(settings: NetworkSettings, identity: Identity) -> Protected:
-    """Replace endpoints by those of mutual TLS where `security.secured` says so, and find this process's certificate.
+    """Replace endpoints by those of mutual TLS where they must be, and find this process's certificate.
 
     Raises:
-        SecurityError: An endpoint must not be opened as configured.
+        NetworkError: An endpoint must not be opened as configured.
         CertificateError: A certificate is needed, and this process has none that is good.
     """
-    insecure, loopback = settings.insecure, settings.loopback_secured
-    update = {
-        name: [
-            secured(each, settings.security, insecure=insecure, loopback_secured=loopback)
-            for each in getattr(settings, name)
-        ]
-        for name in ("rendezvous", "listen", "connect")
-    }
-    network = settings.model_copy(update=update)
-    certificate = certificate_for(network.endpoints, settings.security, identity)
-    own = (identity.vehicle, certificate.vehicle) if certificate else ()
-    named = [name for name in (*own, *settings.security.vehicles) if name is not None]
-    if certificate and not named:
-        raise SecurityError(f"{certificate.file} is good for every vehicle: name them in network.security.vehicles")
+    names = ("rendezvous", "listen", "connect")
+    update = {name: [opened(text, settings) for text in getattr(settings, name)] for name in names}
+    network, folder = settings.model_copy(update=update), settings.security.folder
+    if folder is None or not any(Endpoint.parse(each).protocol in TLS for each in network.endpoints):
+        return Protected(network, None)
+    certificate = own_certificate(folder, *identity)
+    named = [name for name in (identity.vehicle, certificate.vehicle, *settings.security.vehicles) if name is not None]
+    if not named:
+        raise NetworkError(f"{certificate.file} is good for every vehicle: name them in network.security.vehicles")
     return Protected(network, certificate, tuple(dict.fromkeys(named)))
+
+
+def opened(text: str, settings: NetworkSettings) -> str:
+    """The endpoint that is opened in place of a configured one. Raises NetworkError."""
+    endpoint = Endpoint.parse(text)
+    must = endpoint.is_plain or (settings.loopback_secured and endpoint.protocol not in (*TLS, *LOCAL))
+    if settings.security.directory:
+        if must and endpoint.protocol != "tcp":
+            raise NetworkError(f"{endpoint} is plain text: name a tcp or tls endpoint, which mutual TLS protects")
+        return str(replace(endpoint, protocol="tls")) if must else text
+    if endpoint.protocol in TLS or (must and settings.loopback_secured):
+        raise NetworkError(
+            f"{endpoint} needs certificates: make them with `aeroloop host keys`, and set network.security.directory"
+        )
+    if must and not settings.insecure:
+        raise NetworkError(
+            f"{endpoint} would be plain text beyond this host, and anyone there could drive the vehicle: set "
+            "network.security.directory (see `aeroloop host keys`), or network.insecure = true on a network of your own"
+        )
+    return text

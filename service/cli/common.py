@@ -203,7 +203,7 @@ def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options
     begun, stop = _stop_on_signals()
     from aeroloop.protocol.runtime.role import Role
     from aeroloop.protocol.transport.lingering import no_linger
-    from aeroloop.protocol.transport.session_tree import THREADS
+    from aeroloop.protocol.transport.zenoh_config import THREADS
     from aeroloop.service.daemon.claim import controller_name
 
     os.environ.setdefault("ZENOH_RUNTIME", THREADS)

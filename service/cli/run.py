@@ -179,8 +179,8 @@ def router(
     """Run a router for clients (network.mode = "client") until SIGTERM."""
     settings = settings_of(options.config, options.overrides)
     if print_config:
-        from aeroloop.protocol.transport.router import zenohd_config
-        from aeroloop.protocol.transport.security import Identity
+        from aeroloop.protocol.transport.network import zenohd_config
+        from aeroloop.protocol.transport.network_settings import Identity
 
         with guarded():
             typer.echo(zenohd_config(settings.network, Identity(("router",), settings.vehicle)), nl=False)

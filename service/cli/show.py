@@ -43,7 +43,7 @@ def dbc(config: Config = None, overrides: Overrides = None) -> None:
     """Print the DBC file of the configured wire and CAN node."""
     settings = settings_of(config, overrides)
 
-    from aeroloop.protocol.transport.dbc import dbc as describe
+    from aeroloop.service.viewers.dbc import dbc as describe
 
     with checked():
         text = describe(settings.wire, settings.can.node, settings.loop.period_ns)

@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Rele
 from aeroloop.protocol.messages.operator import Answer
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.transport.link import Mailbox, ZenohLink
+from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
@@ -70,7 +70,7 @@ class ClaimClient:
             receive_key=topics.key("measurement", role.vehicle, session=claim.session),
             lengths=self._wire.lengths("measurement", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
-            mailbox=Mailbox(depth=MAILBOX if sparse else 1),
+            depth=MAILBOX if sparse else 1,
         )
         answer = self._query(claim)
         if isinstance(answer, Grant):

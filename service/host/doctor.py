@@ -21,9 +21,8 @@ from aeroloop.protocol.runtime.realtime import prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming, summary
 from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
-from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.refusal import PLAIN_S, refusal
-from aeroloop.protocol.transport.security import Identity
+from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
+from aeroloop.protocol.transport.probe import PLAIN_S, refusal
 from aeroloop.protocol.wire.loop import LoopSettings
 
 CHECK_S: Final = 5.0
@@ -66,7 +65,7 @@ def diagnose(
         network: Where to try the certificates; None: nowhere.
 
     Raises:
-        SecurityError, CertificateError: The network's links cannot be secured.
+        NetworkError, CertificateError: The network's links cannot be secured.
     """
     findings = [*_settings(), *(_certificates(keys) if keys else ()), *(refused(network) if network else ())]
     refusals = prepare_process(loop.model_copy(update={"realtime": "try"}))
@@ -122,7 +121,7 @@ def refused(network: NetworkSettings) -> list[Finding]:
     """Try each usable certificate of this host at every endpoint of the network, all at once: where it is refused.
 
     Raises:
-        SecurityError, CertificateError: The network's links cannot be secured.
+        NetworkError, CertificateError: The network's links cannot be secured.
     """
     from aeroloop.service.host.keys import show
 
@@ -134,7 +133,7 @@ def refused(network: NetworkSettings) -> list[Finding]:
         (place, certificate)
         for certificate in found
         for settings in [protected(network, Identity((certificate.role,), certificate.vehicle)).settings]
-        for place in [*settings.places, *settings.connect]
+        for place in [*settings.rendezvous_endpoints, *settings.connect]
     ]
     with ThreadPoolExecutor(max(1, len(tries))) as pool:
         lines = list(pool.map(lambda each: refusal(each[0], each[1], PLAIN_S), tries))

@@ -36,8 +36,8 @@ from aeroloop.protocol.transport.certificate import (
     common_name,
     file_of,
     load,
-    names_of,
     read_certificate,
+    subject_field,
 )
 
 KEY: Final = "ca.key"
@@ -123,7 +123,7 @@ def show(directory: Path) -> list[KeyFile]:
     first = KeyFile(
         file=AUTHORITY,
         role="authority",
-        name=names_of(ca)[0],
+        name=subject_field(ca, "CN"),
         valid_until=ca.not_valid_after_utc,
         days_left=days_left,
         fingerprint=ca.fingerprint(SHA256()).hex(),
@@ -146,7 +146,7 @@ def _shown(file: Path) -> KeyFile:
         name=found.name,
         valid_until=found.not_after,
         days_left=found.days_left,
-        fingerprint=found.fingerprint,
+        fingerprint=found.x509.fingerprint(SHA256()).hex(),
     )
     role, _, vehicle = file.stem.partition(".")
     try:

@@ -24,10 +24,9 @@ from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
 from aeroloop.protocol.runtime.processes import listener
 from aeroloop.protocol.transport.endpoint import Endpoint
-from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, Visit, visit
-from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.refusal import refusal
-from aeroloop.protocol.transport.security import READER, Identity
+from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session
+from aeroloop.protocol.transport.network_settings import READER, Identity, NetworkSettings
+from aeroloop.protocol.transport.probe import refusal
 
 ANSWER_S: Final = 1.0
 
@@ -68,9 +67,9 @@ def gather(network: NetworkSettings) -> Gathered:
             if address.role not in roles or status.session:
                 roles[address.role] = status
 
-    with visit(network) as here:
-        here.settle()
-        for reply in _get(here.session, topics.key("status", "*"), b"", VISIT_S):
+    with command_session(network) as here:
+        here.wait_for_links()
+        for reply in _get(here.session, topics.key("status", "*"), b"", COMMAND_S):
             received(reply)
         silent = _unanswered(here)
     if not statuses:
@@ -89,7 +88,7 @@ def send(network: NetworkSettings, vehicle: str, topic: str, message: Message) -
     Raises:
         OperatorError: No role answers, or it refuses.
     """
-    with visit(network, ANSWER_S, Identity(topics.TOPICS[topic].senders, vehicle)) as here:
+    with command_session(network, ANSWER_S, Identity(topics.TOPICS[topic].senders, vehicle)) as here:
         answers: list[Answer] = []
         deadline = time.monotonic() + ANSWER_S
         while not answers and time.monotonic() < deadline:
@@ -123,8 +122,8 @@ def stop(network: NetworkSettings, vehicle: str | None = None) -> Stopped:
 
     A process that does not answer is no failure where it is known to be no plant.
     """
-    outcome = _stop(network, vehicle or "*", VISIT_S)
-    return _stop(network, vehicle or "*", 4 * VISIT_S) if outcome.failures else outcome
+    outcome = _stop(network, vehicle or "*", COMMAND_S)
+    return _stop(network, vehicle or "*", 4 * COMMAND_S) if outcome.failures else outcome
 
 
 def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
@@ -135,11 +134,13 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
         if reply.ok is not None and address is not None:
             answers[address.vehicle].append(Answer.model_validate_json(reply.ok.payload.to_bytes()).text)
 
-    with visit(network, wait_s, Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)) as here:
+    with command_session(
+        network, wait_s, Identity(topics.TOPICS["stop"].senders, None if vehicle == "*" else vehicle)
+    ) as here:
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < wait_s:
             # A plant declares its token last, so one with a token answers.
-            for token in _get(here.session, topics.key("alive", vehicle, role="plant"), None, VISIT_S):
+            for token in _get(here.session, topics.key("alive", vehicle, role="plant"), None, COMMAND_S):
                 address = topics.read_key(str(token.ok.key_expr)) if token.ok is not None else None
                 if address is not None and address.vehicle not in answers:
                     answers[address.vehicle] = []
@@ -151,10 +152,10 @@ def _stop(network: NetworkSettings, vehicle: str, wait_s: float) -> Stopped:
                         target=zenoh.QueryTarget.ALL,
                         consolidation=zenoh.ConsolidationMode.NONE,
                     )
-            if passed > SETTLE_S and not here.silent() and all(answers.values()):
+            if passed > DECLARED_S and not here.unanswered() and all(answers.values()):
                 break
             time.sleep(POLL_S)
-        unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > VISIT_S)
+        unanswered = _unanswered(here, but=("controller", "recorder", "router"), why=wait_s > COMMAND_S)
         alone = _without_plant(here.session, answers) if network.mode == "client" and vehicle == "*" else []
     failures = [f"the plant of {name} does not answer" for name, texts in answers.items() if not texts]
     failures += [f"{name} has a controller, and no plant of it answers" for name in alone]
@@ -175,7 +176,7 @@ def _user() -> str:
 
 def _without_plant(session: zenoh.Session, answered: Container[str]) -> list[str]:
     """Vehicles that have a controller and did not answer: a router has forgotten a plant that hangs."""
-    tokens = _get(session, topics.key("alive", "*"), None, VISIT_S)
+    tokens = _get(session, topics.key("alive", "*"), None, COMMAND_S)
     found = [topics.read_key(str(token.ok.key_expr)) for token in tokens if token.ok is not None]
     controlled = {each.vehicle for each in found if each and each.role and each.role.startswith("controller")}
     return sorted(name for name in controlled if name not in answered)
@@ -190,8 +191,8 @@ def show(network: NetworkSettings, vehicle: str, *, last: bool = False) -> Sessi
         OperatorError: No controller answers, or the plant has no record.
     """
     found: list[SessionRecord] = []
-    with visit(network, identity=READER._replace(vehicle=vehicle)) as here:
-        here.settle()
+    with command_session(network, identity=READER._replace(vehicle=vehicle)) as here:
+        here.wait_for_links()
         for reply in _get(here.session, topics.key("show", vehicle), Request().encode(), ANSWER_S):
             with suppress(ValidationError):  # a plant without a record answers so
                 record = SessionRecord.model_validate_json(reply.ok.payload.to_bytes() if reply.ok else b"")
@@ -220,13 +221,13 @@ def _answers(session: zenoh.Session, topic: str, vehicle: str, message: Message)
     return [Answer.model_validate_json(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 
-def _unanswered(here: Visit, but: Sequence[str] = (), *, why: bool = True) -> list[str]:
+def _unanswered(here: CommandSession, but: Sequence[str] = (), *, why: bool = True) -> list[str]:
     """A line about each process that accepts connections and does not answer; not of some roles of this host.
 
     `why`: also find out whether certificates are the reason, which takes a while.
     """
     lines = []
-    for place in here.silent():
+    for place in here.unanswered():
         process = listener(place) if Endpoint.parse(place).is_own else None
         if process is None or process.role not in but:
             name = f"the {process}" if process else "the process"

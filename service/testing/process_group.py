@@ -25,9 +25,9 @@ import zenoh
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.transport.can_format import CanSettings
-from aeroloop.protocol.transport.endpoint import accepting
 from aeroloop.protocol.transport.network import POLL_S, join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
+from aeroloop.protocol.transport.probe import accepting
 from aeroloop.service.config import ENV_PREFIX, Settings
 from aeroloop.service.recording.rolling import parts
 from aeroloop.service.testing.fork_server import ForkedProcess, fork_server
@@ -131,7 +131,7 @@ class ProcessGroup:
 
     def _start_router(self) -> None:
         self.start("router")
-        while not accepting(self._settings.network.places):
+        while not accepting(self._settings.network.rendezvous_endpoints):
             self._check("router")
             time.sleep(POLL_S)
 

@@ -84,7 +84,7 @@ def flood(rendezvous: str, name: str, seconds: float) -> None:
     """Flood a topic, as a stranger that links to every process at a rendezvous."""
     os.nice(19)
     topic = topics.TOPICS[name]
-    places = NetworkSettings(rendezvous=[rendezvous]).places
+    places = NetworkSettings(rendezvous=[rendezvous]).rendezvous_endpoints
     tree = {"connect": {"endpoints": places, "exit_on_failure": False}, **NO_SCOUTING}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(tree))) as session:
         keys = cycle([topics.key(name, "aero", session="s", role="plant")] * 3 + [topics.key(name, "*")])

@@ -65,7 +65,7 @@ def test_what_is_not_a_certificate_s_right_neither_moves_nor_trips_a_plant(hil: 
     alive = hil.processes.zenoh.liveliness().get(topics.key("alive", "aero"))
     tokens = [str(reply.ok.key_expr) for reply in alive if reply.ok]
     assert "aeroloop/aero/alive/plant" in tokens
-    places = [place.replace("tcp/", "tls/") for place in hil.settings.network.places]
+    places = [place.replace("tcp/", "tls/") for place in hil.settings.network.rendezvous_endpoints]
     with ExitStack() as stack:
         joined = {
             who: stack.enter_context(open_session(ours.issue(*who, file="-".join(who)), connect=places))

@@ -16,8 +16,7 @@ from subprocess import Popen
 from typing import Final, Literal, NamedTuple
 
 from aeroloop.protocol.messages.models import Event, Loss, Status
-from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.security import SecuritySettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
 from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.review.review import read
 from aeroloop.service.testing.hil_log import HilLog

@@ -46,7 +46,7 @@ class Gathering:
 
     def __init__(self) -> None:
         self.settings = NetworkSettings(rendezvous=[free_rendezvous()])
-        self.ports = [int(place.rpartition(":")[2]) for place in self.settings.places]
+        self.ports = [int(place.rpartition(":")[2]) for place in self.settings.rendezvous_endpoints]
         self._members: list[zenoh.Session] = []
 
     def join(self, settings: NetworkSettings | None = None) -> zenoh.Session:

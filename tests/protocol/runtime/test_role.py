@@ -15,8 +15,7 @@ from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.role import AT_ONCE, LONG_S, WAITING, Role
 from aeroloop.protocol.transport.certificate import read_certificate
-from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.security import SecuritySettings
+from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
 from aeroloop.service.host.operator import gather
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import socket
-import ssl
-from contextlib import nullcontext
-from pathlib import Path
 from typing import Final
 
 import pytest
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import ROLES, TOPICS, Action, RoleName, Topic
-from aeroloop.protocol.transport.access import access_control
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
-from tests.support.certificates import DAY, Authority
+from aeroloop.protocol.transport.zenoh_config import access_control
+from tests.support.certificates import Authority
 from tests.support.certified_link import attempt, linked, open_session, with_marker
-from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
+from tests.support.zenoh_network import eventually, free_port
 
 ACTIONS: Final[tuple[Action, ...]] = ("publish", "subscribe", "query", "answer", "hold", "watch")
 KEYS: Final = [
@@ -146,85 +142,20 @@ def test_a_router_s_certificate_passes_what_any_role_may_and_no_other_vehicle_s(
 def test_a_certificate_of_every_vehicle_has_the_rights_of_each_that_is_named(
     authority: Authority, role: RoleName
 ) -> None:
-    every = authority.issue(role)
+    every, rules = authority.issue(role), with_marker(access_control("aero", "bero", loopback=False))
     keys = [key for key in KEYS if "/aero/" in key]
-    others = [key.replace("/aero/", "/bero/") for key in keys] + [key.replace("/aero/", "/cero/") for key in keys]
-    with linked(
-        authority.folder / "plant.aero.pem", with_marker(access_control("aero", "bero", loopback=False)), every
-    ) as pair:
+    others = [key.replace("/aero/", f"/{other}/") for other in ("bero", "cero") for key in keys]
+    with linked(authority.folder / "plant.aero.pem", rules, every) as pair:
         achieved = attempt(pair, keys + others)
     for action in ACTIONS:
         mine = allowed(role, action)
         assert achieved[action] == mine | {key.replace("/aero/", "/bero/") for key in mine}
 
 
-@pytest.mark.parametrize(("open_here", "achieved"), [(True, True), (False, False)])
-def test_plain_links_on_loopback_are_free_unless_they_are_secured(
-    authority: Authority, open_here: bool, achieved: bool
-) -> None:
-    with linked(
-        authority.folder / "plant.aero.pem",
-        with_marker(access_control("aero", loopback=open_here)),
-        authority.folder / "observer.aero.pem",
-        protocol="tcp",
-    ) as pair:
+@pytest.mark.parametrize("free", [True, False])
+def test_plain_links_on_loopback_are_free_unless_they_are_secured(authority: Authority, free: bool) -> None:
+    guard, hand = authority.folder / "plant.aero.pem", authority.folder / "observer.aero.pem"
+    with linked(guard, with_marker(access_control("aero", loopback=free)), hand, protocol="tcp") as pair:
         found = attempt(pair, [*KEYS, "t/word"])
-    assert all(found.values()) == any(found.values()) == achieved
-    assert found["publish"] == ({*KEYS, "t/word"} if achieved else set())
-
-
-BAD: Final = ("expired", "not yet valid", "foreign", "none")
-
-
-def held(ours: Authority, foreign: Authority, kind: str) -> Path | None:
-    """The certificate of a kind of stranger, which says that it is an operator; None of the one without."""
-    match kind:
-        case "good":
-            return ours.issue("operator", "aero")
-        case "expired":
-            return ours.issue("operator", "aero", file=kind, ends=-DAY)
-        case "not yet valid":
-            return ours.issue("operator", "aero", file=kind, begins=DAY, ends=2 * DAY)
-        case "foreign":
-            return foreign.issue("operator", "aero")
-    return None
-
-
-@pytest.mark.parametrize("kind", ["good", *BAD])
-def test_no_byte_of_a_connecting_stranger_passes_the_handshake(authority: Authority, tmp_path: Path, kind: str) -> None:
-    """TLS 1.3 shows a client in an alert what the listening end has against its certificate."""
-    certificate = held(authority, Authority(tmp_path), kind)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    if certificate:
-        context.load_cert_chain(certificate, certificate.with_suffix(".key"))
-    port, access = free_port(), access_control("aero", loopback=False)
-    with (
-        open_session(authority.folder / "plant.aero.pem", listen=[f"tls/127.0.0.1:{port}"], access=access),
-        context.wrap_socket(socket.create_connection(("127.0.0.1", port), PATIENCE_S)) as link,
-        nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
-    ):
-        link.sendall(b"\3\0abc")  # not Zenoh's: it answers by a close
-        assert link.recv(1)
-
-
-@pytest.mark.parametrize("kind", ["good", *BAD[:-1]])
-def test_no_byte_of_ours_passes_the_handshake_with_a_listening_stranger(
-    authority: Authority, tmp_path: Path, kind: str
-) -> None:
-    certificate = held(authority, Authority(tmp_path), kind)
-    assert certificate is not None
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate, certificate.with_suffix(".key"))
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(PATIENCE_S)
-        place, access = f"tls/127.0.0.1:{server.getsockname()[1]}", access_control("aero", loopback=False)
-        with open_session(authority.folder / "plant.aero.pem", connect=[place], access=access):
-            caller, _ = server.accept()
-            caller.settimeout(PATIENCE_S)
-            with (
-                caller,
-                nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
-                context.wrap_socket(caller, server_side=True) as link,
-            ):
-                assert link.recv(1)
+    assert all(found.values()) == any(found.values()) == free
+    assert found["publish"] == ({*KEYS, "t/word"} if free else set())

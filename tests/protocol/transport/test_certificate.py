@@ -31,7 +31,7 @@ def test_a_common_name_says_role_and_vehicle_and_is_no_domain(role: str, vehicle
     assert "/" in common_name(role, vehicle) or "." not in role
 
 
-@pytest.mark.parametrize("text", [None, "", "pilot", "plant", "plant/", "/aero", "plant.aero", "operator/"])
+@pytest.mark.parametrize("text", ["", "pilot", "plant", "plant/", "/aero", "plant.aero", "operator/"])
 def test_any_other_common_name_is_none_of_a_role(text: str | None) -> None:
     assert read_common_name(text) is None
 

@@ -1,4 +1,4 @@
-"""Datagrams: a session of the frames alone, by QUIC, beside a plant's places, for networks beyond loopback."""
+"""FrameSession: a session of the frames alone, by QUIC, beside a plant's places, for networks beyond loopback."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.messages.topics import key
-from aeroloop.protocol.transport import datagrams
-from aeroloop.protocol.transport.datagrams import Datagrams
 from aeroloop.protocol.transport.endpoint import Endpoint
-from aeroloop.protocol.transport.link import Mailbox, ZenohLink
-from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.transport.security import Identity
+from aeroloop.protocol.transport.link import ZenohLink
+from aeroloop.protocol.transport.network import FrameSession
+from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import Gathering, eventually
@@ -31,7 +29,7 @@ def beyond(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(params=["plain", "certificates"])
-def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Datagrams, Datagrams]]:
+def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[FrameSession, FrameSession]]:
     """A plant's, which listens, and a controller's, which is connected to it."""
     request.getfixturevalue("beyond")
     settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
@@ -41,7 +39,7 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Datag
             authority.issue(role, "aero")
         security = settings.security.model_copy(update={"directory": str(authority.folder)})
         settings = settings.model_copy(update={"security": security, "loopback_secured": True})
-    plant, controller = Datagrams(settings, PLANT), Datagrams(settings, CONTROLLER)
+    plant, controller = FrameSession(settings, PLANT), FrameSession(settings, CONTROLLER)
     plant.listen()
     eventually("a link", lambda: bool(controller.connect(plant.endpoint)))
     assert plant.endpoint.startswith("quic/" if request.param == "certificates" else "udp/")
@@ -57,25 +55,24 @@ def links(session: zenoh.Session | None) -> set[str]:
 
 
 def test_a_connection_has_datagrams_for_frames_and_a_stream_for_what_zenoh_declares(
-    pair: tuple[Datagrams, Datagrams],
+    pair: tuple[FrameSession, FrameSession],
 ) -> None:
     for end in pair:
         assert links(end.session) == {str(zenoh.Reliability.BEST_EFFORT), str(zenoh.Reliability.RELIABLE)}
 
 
-def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[Datagrams, Datagrams]) -> None:
+def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[FrameSession, FrameSession]) -> None:
     with Gathering() as gathering:
         main, other = gathering.join(), gathering.join()
-        box = Mailbox()
-        plant = ZenohLink(main, MEASUREMENT, COMMAND, range(256), mailbox=box, also=pair[0].session)
+        plant = ZenohLink(main, MEASUREMENT, COMMAND, range(256), also=pair[0].session)
         for session in (other, pair[1].session):
             assert session is not None
-            controller = ZenohLink(session, COMMAND, MEASUREMENT, range(256), mailbox=(received := Mailbox()))
+            controller = ZenohLink(session, COMMAND, MEASUREMENT, range(256))
 
-            def there_and_back(link: ZenohLink = controller, at: Mailbox = received, box: Mailbox = box) -> bool:
+            def there_and_back(link: ZenohLink = controller) -> bool:
                 link.send(b"command")
                 plant.send(b"measurement")
-                there, back = box.take(), at.take()
+                there, back = plant.take(), link.take()
                 return there is not None and back is not None
 
             eventually("a frame each way", there_and_back)
@@ -86,29 +83,33 @@ def test_a_plant_takes_and_sends_frames_on_either_session(pair: tuple[Datagrams,
 @pytest.mark.usefixtures("beyond")
 def test_each_plant_of_a_host_listens_at_a_port_of_its_own() -> None:
     settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
-    plants = [Datagrams(settings, PLANT), Datagrams(settings, PLANT)]
+    plants = [FrameSession(settings, PLANT), FrameSession(settings, PLANT)]
     for plant in plants:
         plant.listen()
     found = {plant.endpoint.partition("?")[0] for plant in plants}
     assert len(found) == 2
-    assert found <= {place.replace("tcp", "udp") for place in settings.places}
+    assert found <= {place.replace("tcp", "udp") for place in settings.rendezvous_endpoints}
     for plant in plants:
         plant.close()
 
 
 @pytest.mark.parametrize(
     "settings",
-    [NetworkSettings(), NetworkSettings(transport="tcp", rendezvous=[FAR]), NetworkSettings(rendezvous=[])],
+    [
+        NetworkSettings(),
+        NetworkSettings(transport="tcp", rendezvous=[FAR], insecure=True),
+        NetworkSettings(rendezvous=[]),
+    ],
 )
 def test_on_loopback_or_where_not_wanted_there_are_none(settings: NetworkSettings) -> None:
-    plant = Datagrams(settings, PLANT)
+    plant = FrameSession(settings, PLANT)
     plant.listen()
     assert not plant.wanted
     assert (plant.session, plant.endpoint) == (None, "")
 
 
 def test_an_endpoint_that_is_not_of_the_network_is_not_connected_to() -> None:
-    controller = Datagrams(NetworkSettings(rendezvous=[FAR], insecure=True), CONTROLLER)
+    controller = FrameSession(NetworkSettings(rendezvous=[FAR], insecure=True), CONTROLLER)
     assert controller.wanted
     assert controller.connect("udp/192.0.2.2:7447?rel=1;mixed_rel=1") is False
     assert controller.session is None
@@ -116,8 +117,11 @@ def test_an_endpoint_that_is_not_of_the_network_is_not_connected_to() -> None:
 
 @pytest.mark.usefixtures("beyond")
 def test_a_link_that_does_not_come_about_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(datagrams, "LINK_S", 0.01)
+    monkeypatch.setattr(FrameSession, "LINK_S", 0.01)
     settings = NetworkSettings(rendezvous=[free_rendezvous()], insecure=True)
-    controller = Datagrams(settings, CONTROLLER)
-    eventually("giving up", lambda: controller.connect(f"udp/{settings.places[0][4:]}?rel=1;mixed_rel=1") is False)
+    controller = FrameSession(settings, CONTROLLER)
+    eventually(
+        "giving up",
+        lambda: controller.connect(f"udp/{settings.rendezvous_endpoints[0][4:]}?rel=1;mixed_rel=1") is False,
+    )
     controller.close()

@@ -4,60 +4,57 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Container, Iterator
 
 import pytest
 import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
 
-from aeroloop.protocol.transport.link import Arrival, Link, Mailbox, ZenohLink
+from aeroloop.protocol.transport.link import Link, Mailbox, ZenohLink
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
-
-def test_an_empty_mailbox_gives_nothing() -> None:
-    assert Mailbox().take() is None
-
-
-def test_the_newest_frame_wins_and_is_given_once() -> None:
-    mailbox = Mailbox()
-    before = time.monotonic_ns()
-    for frame in (b"1", b"2", b"3"):
-        mailbox.put(frame)
-    after = time.monotonic_ns()
-    arrival = mailbox.take()
-    assert arrival is not None
-    assert arrival.frame == b"3"
-    assert before <= arrival.at_ns <= after
-    assert mailbox.take() is None
+Sessions = tuple[zenoh.Session, zenoh.Session]
+SETTLE_S = 0.05
+"""What should not arrive would have arrived by then: a frame takes less than a millisecond."""
 
 
-def test_waiting_takes_what_is_there_without_waiting() -> None:
+@given(depth=st.integers(1, 3), frames=st.lists(st.none() | st.binary(max_size=2)))
+def test_a_mailbox_gives_each_frame_once_and_a_new_one_replaces_the_oldest(
+    depth: int, frames: list[bytes | None]
+) -> None:
+    """None takes a frame, with and without waiting for it."""
+    mailbox, expected, since = Mailbox(depth=depth), deque[bytes](maxlen=depth), time.monotonic_ns()
+    for i, frame in enumerate(frames):
+        assert mailbox.pending == bool(expected)
+        if frame is not None:
+            mailbox.put(frame)
+            expected.append(frame)
+        elif (arrival := mailbox.wait(0.0) if i % 2 else mailbox.take()) is not None:
+            assert arrival.frame == expected.popleft()
+            assert since <= arrival.at_ns <= time.monotonic_ns()
+            since = arrival.at_ns
+        else:
+            assert not expected
+
+
+def test_waiting_for_nothing_ends_at_the_timeout_also_after_a_frame_was_taken() -> None:
     mailbox = Mailbox()
     mailbox.put(b"1")
+    assert mailbox.take() is not None
     started = time.monotonic()
-    arrival = mailbox.wait(PATIENCE_S)
-    assert arrival is not None
-    assert arrival.frame == b"1"
-    assert time.monotonic() - started < PATIENCE_S
-    assert mailbox.take() is None
-
-
-@pytest.mark.parametrize("timeout_s", [0.0, 0.05])
-def test_waiting_for_nothing_ends_at_the_timeout(timeout_s: float) -> None:
-    started = time.monotonic()
-    assert Mailbox().wait(timeout_s) is None
-    assert timeout_s <= time.monotonic() - started < timeout_s + PATIENCE_S
+    assert mailbox.wait(SETTLE_S) is None
+    assert SETTLE_S <= time.monotonic() - started < SETTLE_S + PATIENCE_S
 
 
 def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
-    # Two threads wait for each other in turn, so that each is asleep when its frame comes; one wake-up that is missed
-    # would take the whole timeout.
-    there, back = Mailbox(), Mailbox()
-    rounds = 200
+    """Two threads wait for each other in turn: one wake-up that is missed would take the whole timeout."""
+    there, back, rounds = Mailbox(), Mailbox(), 200
 
     def echo() -> None:
         for _ in range(rounds):
-            arrival = there.wait(PATIENCE_S)
-            if arrival is not None:
+            if (arrival := there.wait(PATIENCE_S)) is not None:
                 back.put(arrival.frame)
 
     thread = threading.Thread(target=echo, daemon=True)
@@ -65,22 +62,19 @@ def test_a_frame_put_by_another_thread_wakes_the_waiting_one() -> None:
     started = time.monotonic()
     for i in range(rounds):
         there.put(b"%d" % i)
-        arrival = back.wait(PATIENCE_S)
-        assert arrival is not None
-        assert arrival.frame == b"%d" % i
-        assert time.monotonic() - started < PATIENCE_S
+        assert receive(back) == b"%d" % i
     thread.join(PATIENCE_S)
-    assert not thread.is_alive()
+    assert time.monotonic() - started < PATIENCE_S
 
 
-ANY = range(256)
-"""Lengths of frames, where a test is not about them."""
-SETTLE_S = 0.1
-"""What should not arrive would have arrived by then: a frame takes less than a millisecond."""
+def receive(at: Link | Mailbox, wait_s: float = PATIENCE_S) -> bytes | None:
+    """The next frame."""
+    arrival = at.wait(wait_s)
+    return None if arrival is None else arrival.frame
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+def pair() -> Iterator[Sessions]:
     """Two sessions that see each other."""
     with Gathering() as gathering:
         a, b = gathering.join(), gathering.join()
@@ -88,39 +82,26 @@ def pair() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
         yield a, b
 
 
-def connect(sender: Link, receiver: Link) -> None:
-    """Send until the first frame arrives: a put right after a subscription may be lost. Then nothing is under way."""
-    seen: list[Arrival] = []
-
-    def received() -> bool:
-        sender.send(b"hello")
-        arrival = receiver.wait(0.05)
-        if arrival is not None:
-            seen.append(arrival)
-        return bool(seen)
-
-    eventually("the first frame", received)
-    sender.send(b"ready")
-    eventually("the last of the greetings", lambda: (got := receiver.take()) is not None and got.frame == b"ready")
-
-
 def links(
-    pair: tuple[zenoh.Session, zenoh.Session],
-    session: str = "s1",
-    *,
-    lossless: bool = True,
-    lengths: Container[int] = ANY,
+    pair: Sessions, session: str = "s1", *, lossless: bool = True, lengths: Container[int] = range(256)
 ) -> tuple[ZenohLink, ZenohLink]:
     """Both ends of a link, connected in both directions. Lossless, so that a slow machine drops nothing."""
     plant = ZenohLink(pair[0], f"t/{session}/measurement", f"t/{session}/command", lengths, lossless=lossless)
     controller = ZenohLink(pair[1], f"t/{session}/command", f"t/{session}/measurement", lengths, lossless=lossless)
-    connect(plant, controller)
-    connect(controller, plant)
+    for sender, receiver in ((plant, controller), (controller, plant)):  # a put right after a subscription may be lost
+
+        def received(sender: Link = sender, receiver: Link = receiver) -> bool:
+            sender.send(b"hello")
+            return receive(receiver, 0.05) is not None
+
+        eventually("the first frame", received)
+        sender.send(b"ready")
+        eventually("the last", lambda r=receiver: (got := r.take()) is not None and got.frame == b"ready")  # type: ignore[misc]  # bound now
     return plant, controller
 
 
 @pytest.mark.parametrize("lossless", [True, False])
-def test_frames_arrive_both_ways_as_they_were_sent(pair: tuple[zenoh.Session, zenoh.Session], lossless: bool) -> None:
+def test_frames_arrive_both_ways_as_they_were_sent(pair: Sessions, lossless: bool) -> None:
     plant, controller = links(pair, lossless=lossless)
     for i in range(50):
         before = time.monotonic_ns()
@@ -130,46 +111,28 @@ def test_frames_arrive_both_ways_as_they_were_sent(pair: tuple[zenoh.Session, ze
         assert measurement.frame == bytes([i]) * 7
         assert before <= measurement.at_ns <= time.monotonic_ns()
         controller.send(bytes([i, 255]))
-        command = plant.wait(PATIENCE_S)
-        assert command is not None
-        assert command.frame == bytes([i, 255])
-    assert plant.take() is None
-    assert controller.take() is None
+        assert receive(plant) == bytes([i, 255])
+    assert plant.take() is controller.take() is None
 
 
-def test_of_many_frames_only_the_newest_is_given(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_of_many_frames_only_the_newest_is_given(pair: Sessions) -> None:
     plant, controller = links(pair)
     marker, marked = links(pair, "s2")
+    assert not controller.pending
     for i in range(100):
         plant.send(bytes([i]))
     plant.send(b"last")
     marker.send(b"after it")
-    assert marked.wait(PATIENCE_S) is not None  # both links are of one connection, which keeps the order
-    newest = controller.take()
-    assert newest is not None
-    assert newest.frame == b"last"
+    assert receive(marked) is not None  # both links are of one connection, which keeps the order
+    assert controller.pending
+    assert receive(controller) == b"last"
+    assert not controller.pending
     assert controller.take() is None
-
-
-def test_a_frame_that_waits_is_pending_until_it_is_taken(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
-    plant, controller = links(pair)
-    assert not controller.pending
-    plant.send(b"old")
-    eventually("the frame", lambda: controller.pending)
-    taken = controller.take()
-    assert taken is not None
-    assert taken.frame == b"old"
-    assert not controller.pending
-    plant.send(b"old")
-    eventually("the frame", lambda: controller.pending)
-    plant.send(b"new")
-    eventually("the newer frame", lambda: (got := controller.take()) is not None and got.frame == b"new")
-    assert not controller.pending
 
 
 @pytest.mark.parametrize("lossless", [True, False])
 def test_a_frame_of_a_wrong_length_is_counted_and_never_takes_the_place_of_a_good_one(
-    pair: tuple[zenoh.Session, zenoh.Session], lossless: bool
+    pair: Sessions, lossless: bool
 ) -> None:
     plant, controller = links(pair, lossless=lossless, lengths={5, 0})
     for sender, receiver in ((plant, controller), (controller, plant)):
@@ -178,65 +141,25 @@ def test_a_frame_of_a_wrong_length_is_counted_and_never_takes_the_place_of_a_goo
             for sent in (b"long..", frame, b"four", bytes(200)):
                 sender.send(sent)
             eventually("the refusals", lambda r=receiver, n=before: r.refused == n + 3)  # type: ignore[misc]
-            assert receiver.pending
-            arrival = receiver.wait(PATIENCE_S)
-            assert arrival is not None
-            assert arrival.frame == frame
+            assert receive(receiver) == frame
             assert receiver.take() is None
 
 
-def test_a_frame_that_was_taken_does_not_end_the_next_wait() -> None:
-    mailbox = Mailbox()
-    mailbox.put(b"1")
-    assert mailbox.take() is not None
-    started = time.monotonic()
-    assert mailbox.wait(0.05) is None
-    assert time.monotonic() - started >= 0.05
-
-
-def test_a_mailbox_holds_as_many_frames_as_its_depth_and_gives_the_oldest_first() -> None:
-    mailbox = Mailbox(depth=3)
-    for frame in (b"1", b"2", b"3", b"4"):
-        mailbox.put(frame)
-    taken = [arrival.frame for arrival in iter(mailbox.take, None)]
-    assert taken == [b"2", b"3", b"4"]
-
-
-def test_a_link_receives_only_its_own_session(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_a_link_receives_only_its_own_session_and_nothing_once_it_is_closed(pair: Sessions) -> None:
     plant, controller = links(pair)
     other_plant, other_controller = links(pair, "s2")
     other_plant.send(b"theirs")
-    assert other_controller.wait(PATIENCE_S) is not None
+    assert receive(other_controller) == b"theirs"
     assert controller.wait(SETTLE_S) is None
-    plant.send(b"ours")
-    assert controller.wait(PATIENCE_S) is not None
-    assert other_controller.wait(SETTLE_S) is None
-
-
-def test_waiting_for_a_frame_that_does_not_come_ends_at_the_timeout(
-    pair: tuple[zenoh.Session, zenoh.Session],
-) -> None:
-    plant, _ = links(pair)
-    started = time.monotonic()
-    assert plant.wait(0.05) is None
-    assert time.monotonic() - started >= 0.05
-
-
-def test_a_closed_link_receives_nothing_and_closing_twice_does_no_harm(
-    pair: tuple[zenoh.Session, zenoh.Session],
-) -> None:
-    plant, controller = links(pair)
-    marker, marked = links(pair, "s2")
     controller.close()
     controller.close()
     plant.send(b"late")
-    marker.send(b"after it")
-    assert marked.wait(PATIENCE_S) is not None  # the sessions outlive the link
+    other_plant.send(b"after it")
+    assert receive(other_controller) == b"after it"  # the sessions outlive the link
     assert controller.wait(SETTLE_S) is None
-    assert not pair[1].is_closed()
 
 
-def test_sending_to_a_peer_that_went_away_raises_nothing(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_sending_to_a_peer_that_went_away_raises_nothing(pair: Sessions) -> None:
     plant, _ = links(pair)
     pair[1].close()
     for _ in range(10):

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import QUERIES_PER_S, TOPICS, Topic
 from aeroloop.protocol.runtime.processes import listener, name_process
-from aeroloop.protocol.transport.endpoint import accepting
-from aeroloop.protocol.transport.network import visit
+from aeroloop.protocol.transport.network import command_session
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
+from aeroloop.protocol.transport.probe import accepting
 from tests.support.zenoh_network import Gathering, accepts, eventually, free_port
 
 
@@ -57,7 +57,8 @@ def linked(members: Iterable[zenoh.Session]) -> None:
         eventually("linking", lambda m=member: peers(m) == everyone - {str(m.zid())})  # type: ignore[misc]  # bound now
 
 
-def test_each_process_listens_at_a_port_of_its_own_and_links_to_all() -> None:
+def test_each_process_listens_at_a_port_of_its_own_and_links_to_all_and_a_command_to_each() -> None:
+    """Messages bear no time of Zenoh's: a frame carries what the loop needs, and a log's times are in attachments."""
     with Gathering() as gathering:
         members = []
         for taken in range(4):
@@ -66,6 +67,11 @@ def test_each_process_listens_at_a_port_of_its_own_and_links_to_all() -> None:
         linked(members)
         ear = Listener(members[3], "t/word")
         receives(ear, members[0], b"from the first")
+        assert set(ear.stamped) == {False}
+        with command_session(gathering.settings) as here:
+            linked([*members, here.session])
+            assert here.unanswered() == []
+            assert [accepts(port) for port in gathering.ports] == [port < 4 for port in range(8)]
 
 
 @pytest.mark.parametrize("first_to_go", range(3))
@@ -87,27 +93,18 @@ def test_more_processes_than_ports_link_by_gossip() -> None:
         linked([gathering.join(settings) for _ in range(5)])
 
 
-def test_a_command_visits_without_an_endpoint() -> None:
-    with Gathering() as gathering:
-        member = gathering.join()
-        with visit(gathering.settings) as here:
-            linked([member, here.session])
-            assert here.silent() == []
-            assert [accepts(port) for port in gathering.ports] == [True] + 7 * [False]
-
-
 def test_a_process_that_accepts_and_does_not_answer_is_named_and_stops_nobody() -> None:
     """A halted process is such a one: the kernel accepts for it."""
     with Gathering() as gathering, socket.create_server(("127.0.0.1", gathering.ports[0])):
         members = [gathering.join(), gathering.join()]
         linked(members)
-        with visit(gathering.settings) as here:
+        with command_session(gathering.settings) as here:
             linked([*members, here.session])
-            assert here.silent() == [gathering.settings.places[0]]
+            assert here.unanswered() == [gathering.settings.rendezvous_endpoints[0]]
         name_process("plant")
-        assert listener(gathering.settings.places[0]) == (os.getpid(), "plant")
+        assert listener(gathering.settings.rendezvous_endpoints[0]) == (os.getpid(), "plant")
         name_process("pytest")
-        assert listener(gathering.settings.places[0]) == (os.getpid(), None)
+        assert listener(gathering.settings.rendezvous_endpoints[0]) == (os.getpid(), None)
 
 
 @contextmanager
@@ -144,37 +141,29 @@ def one_line(error: BaseException) -> str:
 
 def test_a_port_held_by_another_program_is_passed_over() -> None:
     with Gathering() as gathering, rude_program() as port:
-        settings = NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1)
-        linked([gathering.join(settings)])
+        linked([gathering.join(NetworkSettings(rendezvous=[f"tcp/127.0.0.1:{port}"], ports=1))])
         assert accepts(port)
 
 
-def test_a_listen_endpoint_in_use_is_reported_in_one_line() -> None:
-    with Gathering() as gathering, rude_program() as port:
+@pytest.mark.parametrize(("protocol", "kind"), [("tcp", socket.SOCK_STREAM), ("udp", socket.SOCK_DGRAM)])
+def test_a_listen_endpoint_in_use_is_reported_in_one_line(protocol: str, kind: socket.SocketKind) -> None:
+    with Gathering() as gathering, socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", 0))
+        endpoint = f"{protocol}/127.0.0.1:{taken.getsockname()[1]}"
         for rendezvous in ([], gathering.settings.rendezvous):
             with pytest.raises(NetworkError) as caught:
-                gathering.join(NetworkSettings(rendezvous=rendezvous, listen=[f"tcp/127.0.0.1:{port}"]))
+                gathering.join(NetworkSettings(rendezvous=rendezvous, listen=[endpoint]))
             text = one_line(caught.value)
-            assert f"cannot listen on tcp/127.0.0.1:{port}" in text
-            assert "--set network.listen=" in text
+            assert f"cannot listen on {endpoint}" in text
+            assert f"--set network.listen='[\"{protocol}/127.0.0.1:0\"]'" in text
             assert ".rs" not in text  # Zenoh's own source locations are of no use to the user
         assert not any(accepts(each) for each in gathering.ports)  # what failed to join holds nothing
 
 
 def test_a_process_of_another_host_than_the_rendezvous_joins_by_udp_too() -> None:
-    """It cannot listen there, at any port, and was once refused for it, with an address of TCP to try."""
+    """It cannot listen there, at any port."""
     with Gathering() as gathering:
         gathering.join(NetworkSettings(rendezvous=["udp/192.0.2.1:7447"], ports=1, insecure=True))
-
-
-def test_a_listen_endpoint_of_udp_in_use_is_reported_with_one_of_udp() -> None:
-    with Gathering() as gathering, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        place = f"udp/127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(NetworkError) as caught:
-            gathering.join(NetworkSettings(rendezvous=[], listen=[place]))
-        assert f"cannot listen on {place}" in one_line(caught.value)
-        assert "--set network.listen='[\"udp/127.0.0.1:0\"]'" in str(caught.value)
 
 
 def test_an_address_that_cannot_be_reached_is_no_process_that_accepts() -> None:
@@ -190,14 +179,6 @@ def test_without_a_rendezvous_a_peer_is_found_by_its_endpoint() -> None:
         assert list(alone.info.peers_zid()) == []
         caller = gathering.join(NetworkSettings(rendezvous=[], connect=[place]))
         receives(Listener(alone, "t/word"), caller, b"found")
-
-
-def test_messages_bear_no_time_of_zenohs() -> None:
-    """A frame carries what the loop needs and no more; a log's times are in attachments."""
-    with Gathering() as gathering:
-        speaker, listener = gathering.join(gathering.settings), Listener(gathering.join(gathering.settings), "t/word")
-        receives(listener, speaker, b"now")
-        assert set(listener.stamped) == {False}
 
 
 @pytest.mark.parametrize("broken", [{"lease_ms": 99}, {"lease_ms": 60_001}, {"listen": "tcp/127.0.0.1:0"}, {"port": 1}])

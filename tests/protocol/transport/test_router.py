@@ -16,30 +16,40 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
-from aeroloop.protocol.transport.network import join, visit
-from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
-from aeroloop.protocol.transport.router import route, router_tree, zenohd_config
-from aeroloop.protocol.transport.security import Identity
+from aeroloop.protocol.transport.network import command_session, join, route, zenohd_config
+from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings, protected
+from aeroloop.protocol.transport.zenoh_config import router_config
 from aeroloop.service.host.operator import gather, stop
 from tests.protocol.transport.test_network import Listener, one_line, receives
 from tests.support.certificates import Authority
 from tests.support.zenoh_network import eventually, free_port
 
+SPEAKING = "controller", "aero"
 ROUTER, SPEAKER = Identity(("router",)), Identity(("controller",), "aero")
 WORD, ALIVE = topics.key("telemetry", "aero"), topics.key("alive", "aero", role="controller-1-abcd")
 """What a controller may publish and hold, and an operator receive."""
 
 
+def of(authority: Authority) -> NetworkSettings:
+    """A network of clients with certificates of an authority, which are issued here."""
+    for role, vehicle in (("router", None), ("operator", None), ("recorder", None), ("plant", "aero"), SPEAKING):
+        authority.issue(role, vehicle)
+    return NetworkSettings.model_validate(
+        {
+            "mode": "client",
+            "rendezvous": f"tls/127.0.0.1:{free_port()}",
+            "loopback_secured": True,
+            "security": {"directory": str(authority.folder), "vehicles": ["aero"]},
+        }
+    )
+
+
 @pytest.fixture(params=["tcp", "tls"])
 def settings(request: pytest.FixtureRequest, tmp_path: Path) -> NetworkSettings:
     """Of clients and their router, in plain text and with certificates."""
-    authority = Authority(tmp_path)
-    for role, vehicle in (("router", None), ("operator", None), ("controller", "aero")):
-        authority.issue(role, vehicle)
-    keys = {"security": {"directory": str(tmp_path), "vehicles": ["aero"]}, "loopback_secured": True}
-    secured = keys if request.param == "tls" else {}
-    rendezvous = [f"{request.param}/127.0.0.1:{free_port()}"]
-    return NetworkSettings.model_validate({"mode": "client", "rendezvous": rendezvous, **secured})
+    if request.param == "tls":
+        return of(Authority(tmp_path))
+    return NetworkSettings(mode="client", rendezvous=[f"tcp/127.0.0.1:{free_port()}"])
 
 
 @pytest.fixture
@@ -62,30 +72,29 @@ def test_clients_link_to_the_router_alone_and_receive_through_it(
     assert set(ear.stamped) == {False}  # a router stamps messages by default
 
 
-def test_a_client_that_starts_first_waits_for_the_router(settings: NetworkSettings, open_sessions: ExitStack) -> None:
+def test_a_client_that_starts_first_waits_for_the_router_and_a_command_names_it(
+    settings: NetworkSettings, open_sessions: ExitStack
+) -> None:
     joined: list[zenoh.Session] = []
     thread = threading.Thread(target=lambda: joined.append(join(settings)))
     thread.start()
-    with pytest.raises(NetworkError):  # a command does not wait
-        visit(settings).__enter__()
+    with pytest.raises(NetworkError) as caught, command_session(settings):
+        pass
+    assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
     assert not joined
     open_sessions.enter_context(closing(route(settings, ROUTER)))
     thread.join()
     open_sessions.enter_context(closing(joined[0]))
-    with visit(settings) as here:
-        here.settle()
-        assert here.silent() == []
+    with command_session(settings) as here:
+        here.wait_for_links()
+        assert here.unanswered() == []
 
 
-def test_a_command_names_a_router_that_is_missing_or_hangs(settings: NetworkSettings) -> None:
-    with pytest.raises(NetworkError) as caught, visit(settings):
-        pass
-    assert one_line(caught.value) == f"no router answers at {settings.rendezvous[0]}; is `aeroloop router` running?"
-    port = int(settings.rendezvous[0].rpartition(":")[2])
+def test_a_command_names_a_router_that_hangs(settings: NetworkSettings) -> None:
     with (
-        socket.create_server(("127.0.0.1", port)),
+        socket.create_server(("127.0.0.1", int(settings.rendezvous[0].rpartition(":")[2]))),
         pytest.raises(NetworkError, match="accepts connections and does not answer as a router"),
-        visit(settings),
+        command_session(settings),
     ):
         pass
 
@@ -129,40 +138,31 @@ def test_two_routers_are_one_network(open_sessions: ExitStack) -> None:
     open_sessions.enter_context(closing(route(second.model_copy(update={"connect": first.rendezvous}), ROUTER)))
     near, far = (open_sessions.enter_context(closing(join(settings))) for settings in (first, second))
     receives(Listener(near, WORD), far, b"over both", WORD)
-    with visit(first.model_copy(update={"connect": second.rendezvous})) as here:
-        here.settle()
-        assert here.silent() == []  # it links to one of them, and the other is well
+    with command_session(first.model_copy(update={"connect": second.rendezvous})) as here:
+        here.wait_for_links()
+        assert here.unanswered() == []  # it links to one of them, and the other is well
 
 
 def test_a_foreign_certificate_gets_no_link_and_one_line(tmp_path: Path) -> None:
-    ours, foreign = Authority(tmp_path / "ours"), Authority(tmp_path / "foreign")
-    ours.issue("router")
-    foreign.issue("operator")
-    network = {"mode": "client", "rendezvous": f"tls/127.0.0.1:{free_port()}", "loopback_secured": True}
-    mine, theirs = (
-        NetworkSettings.model_validate({**network, "security": {"directory": str(each.folder), "vehicles": ["aero"]}})
-        for each in (ours, foreign)
-    )
-    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, visit(theirs):
+    mine = of(Authority(tmp_path / "ours"))
+    theirs = of(Authority(tmp_path / "foreign")).model_copy(update={"rendezvous": mine.rendezvous})
+    with closing(route(mine, ROUTER)), pytest.raises(NetworkError) as caught, command_session(theirs):
         pass
     assert "not of this authority" in one_line(caught.value)
 
 
-def test_a_router_that_cannot_listen_says_so_in_one_line(settings: NetworkSettings) -> None:
-    with closing(route(settings, ROUTER)), pytest.raises(NetworkError) as caught:
-        route(settings, ROUTER)
-    assert f"cannot listen on {settings.rendezvous[0]}" in one_line(caught.value)
-
-
-def test_the_printed_configuration_is_the_routers_own_and_opens_one(
+def test_the_printed_configuration_is_the_routers_own_opens_one_and_a_second_cannot_listen(
     settings: NetworkSettings, open_sessions: ExitStack
 ) -> None:
     text = zenohd_config(settings, ROUTER)
     lines = [line for line in text.splitlines() if not line.startswith("//")]
-    assert json.loads("\n".join(lines)) == router_tree(settings, ROUTER)
+    assert json.loads("\n".join(lines)) == router_config(protected(settings, ROUTER))
     router = open_sessions.enter_context(closing(zenoh.open(zenoh.Config.from_json5(text))))
     client = open_sessions.enter_context(closing(join(settings)))
     assert list(client.info.routers_zid()) == [router.zid()]
+    with pytest.raises(NetworkError) as caught:
+        route(settings, ROUTER)
+    assert f"cannot listen on {settings.rendezvous[0]}" in one_line(caught.value)
 
 
 def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
@@ -178,15 +178,7 @@ def test_a_stop_of_all_fails_for_a_vehicle_whose_plant_a_router_has_forgotten(
 
 def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions: ExitStack) -> None:
     """The router has rules, too: a claim of the controller passes it, one of a recorder does not."""
-    authority = Authority(tmp_path)
-    for role in ("router", "recorder", "operator"):
-        authority.issue(role)
-    for role in ("plant", "controller"):
-        authority.issue(role, "aero")
-    network = NetworkSettings.model_validate(
-        {"mode": "client", "rendezvous": f"tls/127.0.0.1:{free_port()}", "loopback_secured": True,
-         "security": {"directory": str(tmp_path), "vehicles": ["aero"]}}
-    )  # fmt: skip
+    network = of(Authority(tmp_path))
     names = ("router", "plant", "controller", "recorder")
     roles = {name: open_sessions.enter_context(Role(name, "aero", network, {})) for name in names}
     claims: list[bytes] = []

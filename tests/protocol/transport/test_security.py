@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import socket
+import ssl
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import timedelta
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,60 +17,54 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.transport.certificate import CertificateError, read_certificate
-from aeroloop.protocol.transport.network import join, visit
-from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
-from aeroloop.protocol.transport.refusal import PLAIN_S, refusal
-from aeroloop.protocol.transport.security import (
+from aeroloop.protocol.transport.network import command_session, join
+from aeroloop.protocol.transport.network_settings import (
     READER,
     Identity,
-    SecurityError,
+    NetworkError,
+    NetworkSettings,
     SecuritySettings,
-    secured,
-    tls_tree,
+    opened,
+    protected,
 )
+from aeroloop.protocol.transport.probe import PLAIN_S, refusal
+from aeroloop.protocol.transport.zenoh_config import tls_config
 from aeroloop.service.testing.process_group import free_rendezvous
 from aeroloop.service.vehicle_address import load_vehicle_address
 from tests.support.certificates import DAY, Authority
-from tests.support.zenoh_network import eventually, free_port
+from tests.support.zenoh_network import PATIENCE_S, eventually, free_port
 
-NO_KEYS, KEYS = SecuritySettings(), SecuritySettings(directory="/keys")
 PLANT, CONTROLLER = Identity(("plant",), "aero"), Identity(("controller",), "aero")
 HERE = ("tcp/127.0.0.1:1", "tcp/[::1]:1", "tcp/localhost:1", "udp/127.1.2.3:1", "unixsock-stream//run/a.sock")
 BEYOND = ("tcp/10.0.0.1:1", "tcp/[fe80::1]:1?iface=eth0", "tcp/0.0.0.0:1", "tcp/[::]:1", "tcp/lab-2:1")
 
 
-def opened(endpoint: str, security: SecuritySettings, **flags: bool) -> str:
-    return secured(endpoint, security, **{"insecure": False, "loopback_secured": False, **flags})
-
-
-@pytest.mark.parametrize("endpoint", BEYOND)
-def test_beyond_loopback_tcp_becomes_tls_or_is_refused_unless_that_is_written_down(endpoint: str) -> None:
-    assert opened(endpoint, KEYS) == opened(endpoint, KEYS, insecure=True) == "tls" + endpoint.removeprefix("tcp")
-    with pytest.raises(SecurityError, match=r"network\.insecure"):
-        opened(endpoint, NO_KEYS)
-    assert opened(endpoint, NO_KEYS, insecure=True) == endpoint
-
-
-@pytest.mark.parametrize("endpoint", HERE)
-def test_loopback_stays_as_it_is_unless_it_is_secured(endpoint: str) -> None:
-    assert opened(endpoint, KEYS) == opened(endpoint, NO_KEYS) == endpoint
-    if endpoint.startswith("tcp"):
-        assert opened(endpoint, KEYS, loopback_secured=True) == "tls" + endpoint.removeprefix("tcp")
-        with pytest.raises(SecurityError, match="needs certificates"):
-            opened(endpoint, NO_KEYS, loopback_secured=True, insecure=True)
-
-
-@pytest.mark.parametrize("endpoint", ["udp/10.0.0.1:1", "ws/10.0.0.1:1"])
-def test_other_plain_text_is_refused_beside_certificates(endpoint: str) -> None:
-    with pytest.raises(SecurityError, match="plain text"):
-        opened(endpoint, KEYS)
-    with pytest.raises(SecurityError, match="needs certificates"):
-        opened("tls/127.0.0.1:1", NO_KEYS, insecure=True)
+@pytest.mark.parametrize("endpoint", [*HERE, *BEYOND, "udp/10.0.0.1:1", "ws/10.0.0.1:1", "tls/127.0.0.1:1"])
+def test_plain_text_leaves_this_host_only_where_that_is_written_down(endpoint: str) -> None:
+    """By settings of certificates, `insecure` and `loopback_secured`; None: refused."""
+    here, tls = endpoint in HERE, endpoint.startswith("tls")
+    as_tls = "tls" + endpoint.removeprefix("tcp") if endpoint.startswith("tcp") else None
+    local = endpoint if endpoint.startswith("unixsock") or tls else as_tls
+    for security in (SecuritySettings(), SecuritySettings(directory="/keys")):
+        for insecure, loopback_secured in product((False, True), repeat=2):
+            network = NetworkSettings(security=security, insecure=insecure, loopback_secured=loopback_secured)
+            expected: str | None
+            if security.directory:
+                expected = local if loopback_secured or not here else endpoint
+            elif tls or (loopback_secured and local != endpoint):
+                expected = None
+            else:
+                expected = endpoint if here or insecure else None
+            if expected is not None:
+                assert opened(endpoint, network) == expected
+            else:
+                with pytest.raises(NetworkError, match=r"network\.security\.directory|name a tcp or tls endpoint"):
+                    opened(endpoint, network)
 
 
 def test_plain_text_beyond_loopback_is_said_at_each_start(caplog: pytest.LogCaptureFixture) -> None:
     network = NetworkSettings(rendezvous=[], connect=["tcp/192.0.2.1:1"])  # an address that nobody has
-    with pytest.raises(SecurityError):
+    with pytest.raises(NetworkError):
         join(network)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
@@ -95,7 +91,7 @@ class Secured:
             security=SecuritySettings(directory=str(self.authority.folder), vehicles=["aero"]),
             loopback_secured=True,
         )
-        self.place = protected(self.settings, PLANT).settings.places[0]
+        self.place = protected(self.settings, PLANT).settings.rendezvous_endpoints[0]
 
 
 @pytest.fixture
@@ -121,7 +117,7 @@ SPOILED = ("expired", "not yet valid", "foreign")
 @contextmanager
 def bare(certificate: Path | None, **tree: Any) -> Iterator[zenoh.Session]:
     """A session of Zenoh's alone, which checks nothing of its own certificate."""
-    tls = {"transport": {"link": {"tls": tls_tree(read_certificate(certificate))}}} if certificate else {}
+    tls = {"transport": {"link": {"tls": tls_config(read_certificate(certificate))}}} if certificate else {}
     config = {"scouting": {"multicast": {"enabled": False}}, **tls, **tree}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
         yield session
@@ -135,9 +131,9 @@ def links(session: zenoh.Session) -> set[str | None]:
 def test_peers_link_by_their_certificates_and_a_command_visits_them(network: Secured) -> None:
     with join(network.settings, PLANT) as plant, join(network.settings, CONTROLLER) as controller:
         eventually("a link", lambda: links(plant) == {"controller/aero"} and links(controller) == {"plant/aero"})
-        with visit(network.settings) as here:
-            here.settle()
-            assert here.silent() == []
+        with command_session(network.settings) as here:
+            here.wait_for_links()
+            assert here.unanswered() == []
             assert links(here.session) == {"plant/aero", "controller/aero"}
 
 
@@ -152,6 +148,25 @@ def test_a_peer_without_a_good_certificate_does_not_link(network: Secured, kind:
         bare(certificate, mode="client", connect=connect),
     ):
         pytest.fail(f"it links: {links(plant)}")
+
+
+@pytest.mark.parametrize("kind", ["good", *SPOILED])
+def test_no_byte_of_ours_passes_the_handshake_with_a_listening_stranger(network: Secured, kind: str) -> None:
+    certificate = network.authority.issue("recorder") if kind == "good" else spoiled(network, kind)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, certificate.with_suffix(".key"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE_S)
+        place = f"tls/127.0.0.1:{server.getsockname()[1]}"
+        with join(network.settings.model_copy(update={"rendezvous": [], "connect": [place]}), PLANT):
+            caller, _ = server.accept()
+            caller.settimeout(PATIENCE_S)
+            with (
+                caller,
+                nullcontext() if kind == "good" else pytest.raises(ssl.SSLError, match=r"(?i)alert"),
+                context.wrap_socket(caller, server_side=True) as link,
+            ):
+                assert link.recv(1)
 
 
 def test_a_link_closes_when_its_certificate_expires(network: Secured) -> None:
@@ -185,7 +200,9 @@ def test_a_peer_without_tls_is_told_from_one_that_is_halted(network: Secured) ->
     mine = read_certificate(network.authority.folder / "operator.pem")
     plain = NetworkSettings(rendezvous=[free_rendezvous()])
     with join(plain):
-        assert "does not speak TLS" in (refusal(plain.places[0].replace("tcp", "tls"), mine, PLAIN_S) or "")
+        assert "does not speak TLS" in (
+            refusal(plain.rendezvous_endpoints[0].replace("tcp", "tls"), mine, PLAIN_S) or ""
+        )
     with socket.create_server(("127.0.0.1", 0)) as halted:
         assert refusal(f"tls/127.0.0.1:{halted.getsockname()[1]}", mine) is None
     assert refusal(f"tls/127.0.0.1:{free_port()}", mine) is None
@@ -204,7 +221,7 @@ def test_a_command_says_why_a_place_does_not_answer(network: Secured) -> None:
 
 def test_a_network_with_certificates_names_the_vehicles_whose_peers_have_rights(network: Secured) -> None:
     nobody = network.settings.model_copy(update={"security": SecuritySettings(directory=str(network.authority.folder))})
-    with pytest.raises(SecurityError, match="name them in"):
+    with pytest.raises(NetworkError, match="name them in"):
         protected(nobody, READER)
     keys = f"network.security.directory={network.authority.folder}"
     of_one = load_vehicle_address(None, ["vehicle=falcon", keys])

@@ -10,7 +10,7 @@ import pytest
 
 from aeroloop.protocol.runtime import role
 from aeroloop.protocol.transport import lingering
-from aeroloop.protocol.transport.session_tree import THREADS
+from aeroloop.protocol.transport.zenoh_config import THREADS
 from aeroloop.service.cli.common import DaemonOptions, run_role
 from aeroloop.service.config import load
 

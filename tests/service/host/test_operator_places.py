@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import cast
 
 from aeroloop.protocol.runtime.processes import name_process
-from aeroloop.protocol.transport.network import Visit
+from aeroloop.protocol.transport.network import CommandSession
 from aeroloop.service.host.operator import _unanswered
 
 
@@ -17,8 +17,8 @@ def test_a_process_of_this_host_is_not_taken_for_one_at_the_same_port_of_another
     try:
         with socket.create_server(("127.0.0.1", 0)) as here:
             places = [f"{protocol}/{host}:{here.getsockname()[1]}" for protocol, host in PLACES]
-            visit = cast(Visit, SimpleNamespace(silent=lambda: places, certificate=None))
-            (line,) = _unanswered(visit, but=("controller",))
+            session = cast(CommandSession, SimpleNamespace(unanswered=lambda: places, certificate=None))
+            (line,) = _unanswered(session, but=("controller",))
     finally:
         name_process("pytest")
     assert line == f"the process at {places[1]} does not answer"

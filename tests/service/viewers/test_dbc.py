@@ -1,0 +1,239 @@
+"""DBC file, read back by cantools: decodes every code of every frame as `protocol` does.
+
+Frames are packed by frames.py and padded to the CAN payload's length here; cantools reads only the DBC text.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from math import isclose, isnan, nan
+from typing import Any, Final
+
+import cantools
+import pytest
+from cantools.database.can import Database, Message, Signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.transport.can_format import CanError, Heartbeat
+from aeroloop.protocol.wire.frames import FrameFormat
+from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
+from aeroloop.service.viewers.dbc import dbc
+from tests.protocol.test_spec_document import FRAME_ROWS, Row, as_bits
+from tests.protocol.wire.test_frames import codes_of
+from tests.support.wires import specs
+
+NODE: Final = 5
+PERIOD_NS: Final = 2_000_000
+ROUNDING: Final = 2.0**-51
+"""Relative. The quantizer computes l + (i − 1)·l, which rounds twice, and a reader of the DBC i·l, which rounds once;
+each rounding is at most 2^−53 of the level."""
+UNITS: Final = {"eps": None, "omega": "rad/s", "u": "V"}
+FD_LENGTHS: Final = (12, 16, 20, 24, 32, 48, 64)
+
+WIRES: Final = {
+    "8/6": WireSpec(),
+    "10/10, eight bytes": WireSpec(counter_bits=4).with_bits(10, 10),
+    "16/16, FD": WireSpec().with_bits(16, 16),
+    "three actuators": WireSpec(actuators=3),
+    "cont/cont": WireSpec(counter_bits=10).with_bits(None, None),
+    "dead zones": WireSpec(
+        attitude=SignalSpec(bits=10, limit=1.0, deadzone=0.01),
+        rate=SignalSpec(bits=12, limit=1e-9),
+        voltage=SignalSpec(bits=7, limit=24.0, deadzone=2.5),
+    ),
+    "other kinds": WireSpec(
+        attitude=SignalSpec(bits=8, limit=1.0, kind="hysteresis-uniform"),
+        rate=SignalSpec(bits=10, limit=7.3, kind="logarithmic-uniform"),
+        voltage=SignalSpec(bits=7, limit=24.0, kind="logarithmic-uniform", deadzone=0.01, threshold=2.0),
+    ),
+}
+every_wire = pytest.mark.parametrize("spec", WIRES.values(), ids=WIRES.keys())
+quantizer_of = lru_cache(SignalSpec.quantizer)  # one that makes a table of its levels is slow
+
+
+@lru_cache
+def read(spec: WireSpec, node: int = NODE, period_ns: int = PERIOD_NS) -> Database:
+    """The DBC's text, through cantools, in its strict mode: no overlap, nothing beyond a message's end."""
+    text = dbc(spec, node, period_ns)
+    assert text.isascii()
+    database = cantools.database.load_string(text, "dbc", strict=True)
+    assert isinstance(database, Database)
+    return database
+
+
+def frames(spec: WireSpec) -> list[tuple[Message, FrameFormat, list[SignalSpec]]]:
+    """Each message that carries a frame, the frame's format, and the spec of each code in it."""
+    measurement, command = (read(spec).get_message_by_name(name) for name in ("Measurement", "Command"))
+    return [
+        (measurement, spec.measurement, [spec.attitude] * 3 + [spec.rate] * 3),
+        (command, spec.command, [spec.voltage] * spec.actuators),
+    ]
+
+
+def level_by_comment(comment: str, code: int) -> float:
+    """The level of a bare code by nothing but the formula in its signal's comment."""
+    constants = {name: float(value) for name, value in re.findall(r"(y0|yt|m|l) = (\S+?)[,.]?(?= |$)", comment)}
+    y0, step = constants["y0"], constants["l"]
+    if "e(k) = y0 * (yt / y0) ** (k / m) for k < m, else yt + (k - m) * l;" in comment:
+        yt, m = constants["yt"], constants["m"]
+        assert "else sgn(i) * (e(|i| - 1) + e(|i|)) / 2 " in comment
+        near, far = (y0 * (yt / y0) ** (k / m) if k < m else yt + (k - m) * step for k in (abs(code) - 1, abs(code)))
+        magnitude = (near + far) / 2
+    else:
+        assert "else sgn(i) * (y0 + l/2 + (|i| - 1) * l) " in comment
+        magnitude = y0 + step / 2 + (abs(code) - 1) * step
+    return magnitude * ((code > 0) - (code < 0))
+
+
+def bare(spec: SignalSpec) -> bool:
+    """Whether the level of code i is not i times a step, so that the DBC has the bare code."""
+    half_step = spec.bits is not None and spec.limit / (2**spec.bits - 1)
+    uniform = spec.deadzone is None or isclose(spec.deadzone, half_step, rel_tol=1e-12)
+    return spec.bits is not None and (spec.kind == "logarithmic-uniform" or not uniform)
+
+
+def assert_means(signal: Signal, spec: SignalSpec, code: float, decoded: Any) -> None:
+    """What cantools decoded is what this code is to the quantizer."""
+    value = quantizer_of(spec).decode(code)
+    if spec.bits is None:
+        assert signal.is_float
+        assert repr(decoded) == repr(value)  # repr: NaN equals itself, and −0 is not 0
+    elif code == -(2 ** (spec.bits - 1)):
+        assert isnan(value)
+        assert decoded == "no_valid_value"
+    elif bare(spec):
+        assert decoded == code
+        assert level_by_comment(signal.comment or "", int(code)) == pytest.approx(value, rel=ROUNDING, abs=0)
+    else:
+        assert abs(decoded - value) <= ROUNDING * abs(value)
+
+
+def assert_decodes(message: Message, layout: FrameFormat, of: list[SignalSpec], counter: int, codes: Any) -> None:
+    """A frame of these codes is, to cantools, its counter and these codes and what they mean, and nothing else."""
+    payload = layout.pack(counter, codes).ljust(message.length, b"\0")
+    assert len(payload) == message.length
+    raw, decoded = message.decode(payload, scaling=False, decode_choices=False), message.decode(payload)
+    assert isinstance(raw, dict)
+    assert isinstance(decoded, dict)
+    assert list(raw) == [signal.name for signal in message.signals]
+    assert [repr(value) for value in raw.values()] == [repr(value) for value in (counter, *codes)]
+    assert next(iter(decoded.values())) == counter
+    for signal, spec, code in zip(message.signals[1:], of, codes, strict=True):
+        assert_means(signal, spec, code, decoded[signal.name])
+
+
+@every_wire
+def test_every_code_of_every_signal_decodes_and_leaves_the_others_alone(spec: WireSpec) -> None:
+    """Of more than ten bits every 37th and the ends."""
+    for message, layout, of in frames(spec):
+        tops: list[float] = [each.limit if each.bits is None else 2 ** (each.bits - 1) - 1 for each in of]
+        around = [[top, -top, -0.5 * top if of[i].bits is None else -1][i % 3] for i, top in enumerate(tops)]
+        for i, each in enumerate(of):
+            half = 2 ** ((each.bits or 1) - 1)
+            tried = {*range(-half, half, 37 if half > 512 else 1), -half, 1 - half, -1, 0, 1, half - 1}
+            for n, code in enumerate(tried if each.bits else (0.0, -0.0, each.limit, 1 / 3, 5e-324, nan)):
+                assert_decodes(message, layout, of, n % layout.counters, [*around[:i], code, *around[i + 1 :]])
+        values: Any = dict(zip([signal.name for signal in message.signals], [9, *around], strict=True))
+        assert message.encode(values, scaling=False) == layout.pack(9, around).ljust(message.length, b"\0")
+
+
+@settings(max_examples=60)
+@given(spec=specs, data=st.data())
+def test_any_codes_of_any_wire_decode(spec: WireSpec, data: st.DataObject) -> None:
+    if spec.command.size > 64:  # eight voltages of 64 bits
+        with pytest.raises(CanError, match=r"a frame of 6\d bytes does not fit into CAN FD's 64"):
+            frames(spec)
+        return
+    for message, layout, of in frames(spec):
+        counter = data.draw(st.integers(0, 2**spec.counter_bits - 1))
+        assert_decodes(message, layout, of, counter, data.draw(codes_of(layout.widths)))
+
+
+@pytest.mark.parametrize("row", FRAME_ROWS, ids=" ".join)
+def test_the_golden_frames_of_the_spec_decode_to_their_codes(row: Row) -> None:
+    frame, counter_bits, bits, actuators, counter, codes, text = row
+    widths = [as_bits(cell.strip()) for cell in bits.split(",")]
+    changed: dict[str, object] = {"counter_bits": int(counter_bits)}
+    if frame == "measurement":
+        changed |= {"attitude": {"bits": widths[0], "limit": 1.0}, "rate": {"bits": widths[1], "limit": 1.0}}
+    else:
+        changed |= {"voltage": {"bits": widths[0], "limit": 24.0}, "actuators": int(actuators)}
+    message = read(WireSpec.model_validate(changed)).get_message_by_name(frame.capitalize())
+    payload = bytes.fromhex(text).ljust(message.length, b"\0")
+    raw = message.decode(payload, scaling=False, decode_choices=False)
+    assert isinstance(raw, dict)
+    assert [str(value).lower() for value in raw.values()] == [counter, *codes.lower().split()]
+
+
+@every_wire
+def test_messages_and_signals_are_described_and_bounded(spec: WireSpec) -> None:
+    database = read(spec)
+    found = {each.name: (each.frame_id, *each.senders, *each.receivers) for each in database.messages}
+    assert found == {
+        "Measurement": (0x100 + NODE, "Plant", "Controller"),
+        "Command": (0x200 + NODE, "Controller", "Plant"),
+        "PlantHeartbeat": (0x300 + NODE, "Plant", "Controller"),
+        "ControllerHeartbeat": (0x380 + NODE, "Controller", "Plant"),
+    }
+    assert database.dbc is not None
+    fast = any(message.is_fd for message in database.messages)
+    assert database.dbc.attributes["BusType"].value == ("CAN FD" if fast else "CAN")
+    names = [signal.name for message, *_ in frames(spec) for signal in message.signals]
+    rotors = ["u1", "u2", "u3"] if spec.actuators == 3 else ["u2", "u3"]
+    assert names == ["counter", "eps1", "eps2", "eps3", "omega1", "omega2", "omega3", "echo", *rotors]
+    for message, layout, of in frames(spec):
+        assert message.is_fd == (layout.size > 8)
+        assert message.length == next(size for size in (*range(9), *FD_LENGTHS) if size >= layout.size)
+        first, *others = message.signals
+        assert (first.length, first.is_signed, first.maximum) == (spec.counter_bits, False, 2**spec.counter_bits - 1)
+        assert message.comment
+        assert f"every {PERIOD_NS} ns" in message.comment
+        for signal, one in zip(others, of, strict=True):
+            assert signal.comment
+            assert (signal.is_signed, signal.offset) == (True, 0)
+            assert signal.unit == (None if bare(one) else UNITS[signal.name.rstrip("123")])
+            top = 2 ** ((one.bits or 1) - 1) - 1 if bare(one) else quantizer_of(one).outermost
+            assert (-(signal.minimum or 0), signal.maximum) == (pytest.approx(top, rel=ROUNDING),) * 2
+
+
+@pytest.mark.parametrize("off", [1.0, 1 + 2.0**-50, 1 + 1e-9])
+def test_a_dead_zone_gives_the_step_only_if_it_is_half_of_it_by_its_number(off: float) -> None:
+    spec = WireSpec(voltage=SignalSpec(bits=6, limit=24.0, deadzone=24.0 / 63 * off))
+    u2 = read(spec).get_message_by_name("Command").get_signal_by_name("u2")
+    assert u2.scale == (pytest.approx(48.0 / 63, rel=1e-13) if off < 1 + 1e-12 else 1)
+
+
+@pytest.mark.parametrize(("period_ns", "cycle_ms"), [(2_000_000, 2), (1, 1), (2_000_001, 3), (1_000_000_000, 1000)])
+def test_cycle_times_are_whole_milliseconds(period_ns: int, cycle_ms: int) -> None:
+    found = {message.name: message.cycle_time for message in read(WireSpec(), NODE, period_ns).messages}
+    beats = dict.fromkeys(("PlantHeartbeat", "ControllerHeartbeat"), 100)
+    assert found == {"Measurement": cycle_ms, "Command": cycle_ms, **beats}
+
+
+@pytest.mark.parametrize("state", PlantState)
+def test_heartbeats_carry_state_fingerprint_and_cause_or_session(state: PlantState) -> None:
+    mark = bytes.fromhex("fedcba98765432")
+    both = {"state": state.value, "fingerprint": 0xFEDCBA98765432}
+    for number in range(16):
+        packed = Heartbeat(state, number, mark).pack()
+        assert read(WireSpec()).decode_message(0x380 + NODE, packed) == {**both, "session": number}
+        if number <= len(TripCause):
+            cause = ["none", *map(str, TripCause)][number]
+            assert read(WireSpec()).decode_message(0x300 + NODE, packed) == {**both, "cause": cause}
+
+
+@pytest.mark.parametrize(
+    ("node", "period_ns", "says"),
+    [
+        (0, PERIOD_NS, "1 to 127, not 0"),
+        (128, PERIOD_NS, "1 to 127, not 128"),
+        (NODE, 0, "period of 0 ns"),
+        (NODE, 65_535_000_001, "period of 65535000001 ns"),
+    ],
+)
+def test_what_is_out_of_bounds_is_refused(node: int, period_ns: int, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        dbc(WireSpec(), node, period_ns)
