@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field
 
-from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.model.emulated import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError

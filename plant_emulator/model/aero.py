@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
+from aeroloop.plant_emulator.model.emulated import Inertia, Mechanism
 from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.rotations import R, S, from_euler
 

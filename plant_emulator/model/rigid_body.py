@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
-from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
+from aeroloop.plant_emulator.model.emulated import Inertia, Mechanism
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
 from aeroloop.protocol.wire.rotations import R, S, T
 

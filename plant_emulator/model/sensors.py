@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import cos, exp, isfinite, nan, pi, sin, sqrt
 from typing import Any, Literal, TypeVar
 
@@ -99,7 +99,7 @@ class Sensors:
         self.function = sensor_function(settings, period)
         self._random = np.random.default_rng(settings.seed)
         self.zeros: list[float] = self._random.random(len(settings.counts)).tolist()
-        self._noise: list[Vector] = []
+        self._errors = self._draw()
         self._compiled = Compiled(self.function)
         self._evaluate, given = self._compiled.evaluate, self._compiled.inputs
         self.given = {name: given[name] for name in ("attitude", "rate", "angles")}
@@ -135,10 +135,13 @@ class Sensors:
 
     def error(self) -> Vector:
         """Draw a gyro's next error, noise and bias [rad/s]."""
-        if not self._noise:
-            drawn = self._random.standard_normal((_BLOCK, 3)) * self._settings.gyro_noise + self._settings.gyro_bias
-            self._noise = [tuple(row) for row in drawn.tolist()]
-        return self._noise.pop()
+        return next(self._errors)
+
+    def _draw(self) -> Iterator[Vector]:
+        noise, bias = self._settings.gyro_noise, self._settings.gyro_bias
+        while True:
+            drawn = self._random.standard_normal((_BLOCK, 3)) * noise + bias
+            yield from map(tuple, drawn[::-1].tolist())  # the last first, as in every log so far
 
 
 def sensor_function(settings: SensorSettings, period: float) -> ca.Function:

@@ -18,9 +18,8 @@ import pytest
 
 from aeroloop.plant_emulator.engines.mujoco import SHIPPED, MujocoPlant, MujocoSettings, lagged
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.emulated import FrictionSettings, RotorSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
-from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 from aeroloop.protocol.messages.operator import Sinusoid

@@ -9,9 +9,8 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant, RotorSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
-from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.plant_emulator.plant import Measurement, State

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.model.friction import FrictionSettings, friction_torque
+from aeroloop.plant_emulator.model.emulated import FrictionSettings, friction_torque
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
 from aeroloop.plant_emulator.settings import IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 from tests.support.numpy_twin import Array

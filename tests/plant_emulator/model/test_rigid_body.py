@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
-from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
 from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings

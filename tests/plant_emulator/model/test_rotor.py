@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
-from aeroloop.plant_emulator.model.emulated import step_function
-from aeroloop.plant_emulator.model.rotor import RotorSettings, rotor_derivative, thrust_voltage
+from aeroloop.plant_emulator.model.emulated import RotorSettings, rotor_derivative, step_function, thrust_voltage
 from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 
 PERIOD = 0.002
