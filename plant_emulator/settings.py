@@ -173,9 +173,8 @@ class PlantSettings(BaseModel, extra="forbid"):
         """These settings with `ideal` replaced by the parts that it stands for."""
         if not self.ideal:
             return self
-        rotor, friction = IDEAL_ROTOR, IDEAL_FRICTION
-        parts = {"aero": IDEAL_AERO, "rotor": rotor, "friction": friction, "wind": WindSettings()}
-        return self.model_copy(update={**parts, "sensors": IDEAL_SENSORS, "ideal": False})
+        parts = {"aero": IDEAL_AERO, "rotor": IDEAL_ROTOR, "friction": IDEAL_FRICTION, "sensors": IDEAL_SENSORS}
+        return self.model_copy(update={**parts, "wind": WindSettings(), "ideal": False})
 
     @property
     def emulated(self) -> bool:
@@ -221,7 +220,7 @@ class PlantSettings(BaseModel, extra="forbid"):
         )
 
     def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
-        """Wrap a plant in the configured faults. Raises ValueError if a fault names a motor the plant does not have."""
+        """Wrap a plant in the configured faults. Raises FaultError if one names a motor that the plant does not have."""
         faulty = FaultyPlant(plant, period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
         faulty.inject(self.parsed_faults, "configured")
         return faulty

@@ -17,7 +17,15 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from aeroloop.plant_emulator.faults.language import SIGNALS, ActingFault, Fault, FrameFault, ValueFault, Values
+from aeroloop.plant_emulator.faults.language import (
+    SIGNALS,
+    ActingFault,
+    Fault,
+    FaultError,
+    FrameFault,
+    ValueFault,
+    Values,
+)
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import FaultStatus
 
@@ -102,7 +110,7 @@ class FaultyPlant(Plant):
         self._last_frame: dict[str, bytes] = {}
         self._injected: Counter[str] = Counter()
         self._scheduled: list[ScheduledFault] = []
-        self._acting: dict[str, list[ActingFault]] = {signal.whole: [] for signal in SIGNALS.values()}
+        self._acting: dict[str, list[ActingFault]] = {signal.whole: [] for signal in language.SIGNALS.values()}
 
     @property
     def time(self) -> float:
@@ -126,15 +134,15 @@ class FaultyPlant(Plant):
             The ends of the faults removed.
 
         Raises:
-            ValueError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
+            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
         """
         for fault in faults:
             if fault.target.whole == "motors" and (fault.target.part or 0) >= self.actuators:
                 there = ", ".join(f"motor{i + 1}" for i in range(self.actuators))
-                raise ValueError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
+                raise FaultError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
         staying = 0 if clear else sum(not each.over for each in self._scheduled)
         if staying + len(faults) > MAX_FAULTS:
-            raise ValueError(f"a plant takes {MAX_FAULTS} faults at a time: `aeroloop op inject --clear` removes them")
+            raise FaultError(f"a plant takes {MAX_FAULTS} faults at a time: `aeroloop op inject --clear` removes them")
         ends = self._clear() if clear else []
         over = [each for each in self._scheduled if each.over]
         forgotten = over[: max(0, len(over) + len(faults) - MAX_FAULTS)]

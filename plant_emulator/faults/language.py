@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from math import cos, hypot, inf, nan, sin, ulp
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
+from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.spec import MAX_ACTUATORS
 
 if TYPE_CHECKING:
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 MAX_DELAY_S: Final = 10.0
 MAX_TIME_S: Final = 1e8
 """Latest begin and end [s]; three years."""
+
+
+class FaultError(AeroloopError, ValueError):
+    """A fault that is none, or cannot be injected; one line that says why."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,7 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Fault:
-        """Parse `signal:kind[=value][@start[..end]]`. Raises ValueError: one line with the text and the error."""
+        """Parse `signal:kind[=value][@start[..end]]`. Raises FaultError, with the text and the error."""
         what, at, when = text.strip().partition("@")
         signal, colon, failure = what.partition(":")
         kind, equals, value = failure.partition("=")
@@ -96,15 +101,10 @@ class Fault:
         try:
             if not colon:
                 raise ValueError("it is written signal:kind[=value][@start[..end]], such as attitude:off@5")
-            return cls(
-                signal,
-                kind,
-                _number(value) if equals else None,
-                _number(start) if at else 0.0,
-                _number(end) if dots else None,
-            )
+            size = _number(value) if equals else None
+            return cls(signal, kind, size, _number(start) if at else 0.0, _number(end) if dots else None)
         except ValueError as error:
-            raise ValueError(f"fault {text!r}: {error}") from None
+            raise FaultError(f"fault {text!r}: {error}") from None
 
     def __str__(self) -> str:
         value = "" if self.value is None else f"={_text(self.value)}"

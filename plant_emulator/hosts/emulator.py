@@ -16,7 +16,6 @@ from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject
 from aeroloop.protocol.runtime.role import Role
@@ -24,10 +23,6 @@ from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
-
-
-class FaultError(AeroloopError):
-    """A fault that cannot be injected; one line that says why."""
 
 
 class Emulator(Driver):
@@ -55,7 +50,7 @@ class Emulator(Driver):
             What was done, a line each; they are events, too.
 
         Raises:
-            ValueError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
+            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
         """
         self._publish(self._faulty.inject(faults, "injected", clear=clear))
         names = [*([None] if clear else []), *map(str, faults)]
@@ -159,16 +154,8 @@ class EmulatorOnZenoh(Emulator):
     # ── queries `inject` and `advance`, for tests ──
 
     def _inject(self, request: Inject) -> Callable[[], Answer]:
-        try:
-            faults = [Fault.parse(text) for text in request.faults]
-        except ValueError as error:
-            raise FaultError(str(error)) from None
-
         def inject() -> Answer:
-            try:
-                done = self.inject(faults, clear=request.clear)
-            except ValueError as error:
-                raise FaultError(str(error)) from None
+            done = self.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
             return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
         return inject

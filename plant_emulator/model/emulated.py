@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from math import hypot, inf
 from typing import Annotated
 
 import casadi as ca
@@ -17,19 +18,10 @@ from aeroloop.plant_emulator.model.sensors import Sensors
 from aeroloop.plant_emulator.model.wind import Wind
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
+from aeroloop.protocol.wire.rotations import R, S
 from aeroloop.protocol.wire.symbolic import Compiled
 
 # ── mechanism ──
-
-
-def _positive(values: Vector) -> Vector:
-    if not all(0 < value < float("inf") for value in values):
-        raise ValueError("every moment of inertia must be positive and finite")
-    return values
-
-
-Inertia = Annotated[Vector, AfterValidator(_positive)]
-"""The diagonal of J [kg·m²]."""
 
 
 class Mechanism(ABC):
@@ -71,6 +63,42 @@ class Mechanism(ABC):
     def settle(self, x: ca.SX) -> ca.SX:
         """Correct the drift of a state after an integration step."""
         return x
+
+
+def _positive(values: Vector) -> Vector:
+    if not all(0 < value < inf for value in values):
+        raise ValueError("every moment of inertia must be positive and finite")
+    return values
+
+
+def _with_a_direction(attitude: Quaternion) -> Quaternion:
+    if not 0 < hypot(*attitude) < inf:
+        raise ValueError("a quaternion of any finite length but zero")
+    return attitude
+
+
+Direction = Annotated[Quaternion, AfterValidator(_with_a_direction)]
+"""An attitude q to be scaled to unit length [1]."""
+
+
+class BodySettings(BaseModel, extra="forbid"):
+    """A body about a fixed point. Defaults: the inertia and mass of Table C.1."""
+
+    inertia: Annotated[Vector, AfterValidator(_positive)] = Field(
+        default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]"
+    )
+    mass: float = Field(default=1.075, gt=0, description="m [kg]")
+    gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
+    centre_of_mass: Vector = Field(default=(0.0, 0.0, 0.0), description="r_g, origin to centre of mass, body frame [m]")
+
+
+def torque_of_motion(body: BodySettings, damping: Vector, q: ca.SX, omega: ca.SX) -> ca.SX:
+    """Ψ(q, ω) + Φ(ω) θ of (C.2): gyroscopic torque, weight and damping θ, in the body frame [N·m]. Shape (3,)."""
+    J, weight = ca.diag(ca.SX(body.inertia)), ca.vertcat(0, 0, -body.mass * body.gravity)
+    g = -S(ca.SX(body.centre_of_mass)) @ R(q).T @ weight  # (C.6)
+    Psi = -S(omega) @ (J @ omega) - g  # (C.4)
+    Phi = ca.diag(-omega)  # (C.5)
+    return Psi + Phi @ ca.SX(damping)
 
 
 # ── rotors and friction ──

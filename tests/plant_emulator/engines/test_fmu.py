@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import subprocess
 import sys
@@ -267,14 +266,6 @@ def test_a_library_that_cannot_be_loaded_is_one_line(fmus: dict[str, Path], tmp_
     with pytest.raises(FmuError, match=r"broken.fmu: it does not start: Failed to load shared library") as refused:
         FmuPlant(settings_of(broken), PERIOD)
     assert "\n" not in str(refused.value)
-
-
-def test_a_plant_that_is_dropped_without_close_is_freed(fmus: dict[str, Path], unpacked: Path) -> None:
-    plant = FmuPlant(settings_of(fmus["fmi2"]), PERIOD)
-    assert list(unpacked.iterdir())
-    del plant
-    gc.collect()
-    assert not list(unpacked.iterdir())
 
 
 def test_a_step_of_another_length_than_it_prefers_says_which(fmus: dict[str, Path]) -> None:
