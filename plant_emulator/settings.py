@@ -220,7 +220,7 @@ class PlantSettings(BaseModel, extra="forbid"):
         )
 
     def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
-        """Wrap a plant in the configured faults. Raises FaultError if one names a motor that the plant does not have."""
+        """Wrap a plant in the configured faults. Raises FaultError for one of a motor that is not there."""
         faulty = FaultyPlant(plant, period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
         faulty.inject(self.parsed_faults, "configured")
         return faulty

@@ -110,7 +110,7 @@ class FaultyPlant(Plant):
         self._last_frame: dict[str, bytes] = {}
         self._injected: Counter[str] = Counter()
         self._scheduled: list[ScheduledFault] = []
-        self._acting: dict[str, list[ActingFault]] = {signal.whole: [] for signal in language.SIGNALS.values()}
+        self._acting: dict[str, list[ActingFault]] = {signal.whole: [] for signal in SIGNALS.values()}
 
     @property
     def time(self) -> float:
