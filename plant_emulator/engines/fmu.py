@@ -255,8 +255,9 @@ class FmuPlant(Plant):
 
     def _known(self, name: str, fitting: Iterable[str]) -> Any:
         if name not in self._variables:
-            alike = get_close_matches(name, fitting, 1)
-            hint = f": did you mean {alike[0]}?" if alike else f"; it has {_listed(fitting)}"
+            names = {each.lower(): each for each in fitting}
+            alike = get_close_matches(name.lower(), names, 1)
+            hint = f": did you mean {names[alike[0]]}?" if alike else f"; it has {_listed(fitting)}"
             raise FmuError(f"{self._name} has no variable {name}{hint}")
         return self._variables[name]
 
