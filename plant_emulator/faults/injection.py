@@ -17,15 +17,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from aeroloop.plant_emulator.faults.language import (
-    SIGNALS,
-    ActingFault,
-    Fault,
-    FaultError,
-    FrameFault,
-    ValueFault,
-    Values,
-)
+from aeroloop.plant_emulator.faults.language import SIGNALS, ActingFault, Fault, FaultError, FrameFault, ValueFault
 from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.models import FaultStatus
 
@@ -103,7 +95,7 @@ class FaultyPlant(Plant):
         self.actuators, self.paces = plant.actuators, plant.paces
         self.ticks = -1
         self._period, self._limit, self._seed = period, voltage_limit, seed
-        self._commanded: Values = (0.0,) * plant.actuators
+        self._commanded: tuple[float, ...] = (0.0,) * plant.actuators
         self._applied = self._commanded
         self._actuated = False  # since the last period
         self._seen: Measurement | None = None
@@ -164,7 +156,7 @@ class FaultyPlant(Plant):
             return FrameFault(fault, random, self.time, self._last_frame.get(whole))
         if whole == "motors":
             return ValueFault(fault, random, self.time, self._applied, self._limit)
-        last: Values | None = seen and (seen.attitude if whole == "attitude" else seen.rate)
+        last = seen and (seen.attitude if whole == "attitude" else seen.rate)
         return ValueFault(fault, random, self.time, last, GARBLED_RATE)
 
     def _clear(self) -> list[FaultTransition]:

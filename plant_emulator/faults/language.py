@@ -36,24 +36,13 @@ class FaultError(AeroloopError, ValueError):
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of failure of one signal for a span of time.
+    """One kind of failure of one signal for a span of time. Raises ValueError: what is wrong, and what is right."""
 
-    Raises:
-        ValueError: What is wrong and what would be right, in one line.
-
-    Attributes:
-        signal: Sensor, motor or stream that fails, a key of SIGNALS.
-        kind: Kind of failure, a key of KINDS.
-        value: Size [the signal's unit, s or 1]; None for a kind without one.
-        start_s: Start, in the plant's time [s].
-        end_s: End [s]; None for none.
-    """
-
-    signal: str
-    kind: str
-    value: float | None = None
+    signal: str  # a key of SIGNALS
+    kind: str  # a key of KINDS
+    value: float | None = None  # size [the signal's unit, s or 1]; None for a kind without one
     start_s: float = 0.0
-    end_s: float | None = None
+    end_s: float | None = None  # None for none
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
@@ -200,25 +189,20 @@ class ValueFault(ActingFault):
         self.size = len(last) if self.whole == "motors" and last is not None else 3  # components of an error
         self.bound = bound
         self._parts = range(self.size) if part is None else (part,)
-        self._earlier: deque[tuple[float, Values]] = deque() if last is None else deque([(-inf, last)])
+        self.earlier: deque[tuple[float, Values]] = deque() if last is None else deque([(-inf, last)])
 
     def apply(self, given: Values, t: float) -> Values:
         """The values of time t [s]. Call it at every sample: before the fault starts, it keeps history."""
         if self.kind.takes == "delay":
-            self._earlier.append((t, given))
-            while len(self._earlier) > 1 and self._earlier[1][0] <= round(t - self.value, 9):
-                self._earlier.popleft()
+            self.earlier.append((t, given))
+            while len(self.earlier) > 1 and self.earlier[1][0] <= round(t - self.value, 9):
+                self.earlier.popleft()
         if not self.active(t):
             self.last = given
         elif self.acts(t):
             assert self.kind.of_values is not None
             return self.kind.of_values(self, given)
         return given
-
-    @property
-    def delayed(self) -> Values:
-        """The values of `value` seconds ago."""
-        return self._earlier[0][1]
 
     def replaced(self, values: Values, by: Values) -> Values:
         """The values with the fault's parts replaced by others; an attitude is replaced as a whole."""
@@ -257,7 +241,7 @@ def _noisy(fault: ValueFault, values: Values) -> Values:
 
 
 def _late(fault: ValueFault, values: Values) -> Values:
-    return fault.replaced(values, fault.delayed)
+    return fault.replaced(values, fault.earlier[0][1])  # those of `value` seconds ago
 
 
 def _garbled(fault: ValueFault, values: Values) -> Values:
@@ -372,21 +356,13 @@ KINDS: Final = {
 
 
 class Signal(NamedTuple):
-    """A signal that a fault can act on.
+    """A signal that a fault can act on."""
 
-    Attributes:
-        whole: Sensor, motors or stream that it is, or is a part of.
-        part: Axis 0…2, or motor from 0; None for all of it.
-        kinds: Kinds of faults that it takes.
-        counted: What a fault changes of it.
-        largest: Largest bias and noise, in `unit`.
-    """
-
-    whole: str
-    part: int | None
+    whole: str  # sensor, motors or stream that it is, or is a part of
+    part: int | None  # axis 0…2, or motor from 0; None for all of it
     kinds: tuple[str, ...]
-    counted: str
-    largest: float = 0.0
+    counted: str  # what a fault changes of it
+    largest: float = 0.0  # bias and noise, in `unit`
     unit: str = ""
 
 

@@ -256,7 +256,6 @@ class EmulatedPlant(Plant):
         true = sensors.given if angles else {name: sensors.given[name] for name in ("attitude", "rate")}
         self._step = Compiled(step_function(mechanism, rotor, friction, period, substeps), true)
         self._x, self._u, self._load = (self._step.inputs[name] for name in ("x", "u", "wind"))
-        self._evaluate, self._after = self._step.evaluate, self._step.outputs["after"]
         for i, value in enumerate(mechanism.initial):
             self._x[i] = value
         self._measurement = sensors.read(attitude, rate, angles)
@@ -265,15 +264,15 @@ class EmulatedPlant(Plant):
         """Hold voltages [V], clipped to the supply's limits. Shape (actuators,)."""
         limit = self._limit
         for i, voltage in enumerate(voltages):
-            self._u[i] = voltage if -limit <= voltage <= limit else max(-limit, min(limit, voltage))
+            self._u[i] = max(-limit, min(limit, voltage))
 
     def advance(self) -> None:
         """Integrate one period and sample the sensors."""
         if not self._wind.calm:
             for i, torque in enumerate(self._wind.sample()):
                 self._load[i] = torque
-        self._evaluate()
-        self._x[:] = self._after
+        self._step.evaluate()
+        self._x[:] = self._step.outputs["after"]
         self._measurement = self._sensors.sample()
 
     def measure(self) -> Measurement:
