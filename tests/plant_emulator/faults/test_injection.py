@@ -99,6 +99,17 @@ def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
     assert [m.attitude for m in seen] == [sample(k).attitude for k in range(1, 9)]
 
 
+def test_an_injected_fault_begins_at_the_tick_that_its_decimals_mean() -> None:
+    """In floats, 0.1 + 0.2 > 0.3."""
+    plant, _ = faulty()
+    plant.advance()
+    inject(plant, "rate:off@0.2")
+    plant.advance()
+    assert not missing(plant.measure().rate)
+    plant.advance()
+    assert missing(plant.measure().rate)
+
+
 def test_motors_fail_and_recover_under_a_held_voltage_and_one_stuck_at_once_keeps_what_it_had() -> None:
     plant, stand = faulty("motor1:off@0.3..0.6", "motor2:stuck", started=False)
     plant.actuate((5.0, 4.0))
@@ -205,9 +216,11 @@ def test_the_same_seed_fails_the_same_way_and_another_otherwise() -> None:
     assert all(one != other for one, other in zip(all_of(3), all_of(4), strict=True))
 
 
-def test_one_more_fault_leaves_the_random_numbers_of_the_others_and_streams_lose_other_ticks() -> None:
+def test_one_more_fault_leaves_the_random_numbers_of_the_others_and_has_its_own() -> None:
     alone = [m.rate for m in sensed("rate:noise=0.1")]
     assert [m.rate for m in sensed("rate:noise=0.1", "attitude:garble=0.5")] == alone
+    twice = [m.rate[0] - k for k, m in enumerate(sensed("rate:noise=0.1", "rate:noise=0.1"))]
+    assert twice != pytest.approx([2 * (rate[0] - k) for k, rate in enumerate(alone)])
     plant, _ = faulty("command:drop=0.5", "measurement:drop=0.5")
     passes = [(plant.passes("command", b"a"), plant.passes("measurement", b"a")) for _ in range(100)]
     assert any(command != measurement for command, measurement in passes)

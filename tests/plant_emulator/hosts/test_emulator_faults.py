@@ -168,6 +168,20 @@ def test_a_fault_goes_on_without_a_session_and_its_end_names_none() -> None:
     assert [(notice.session, notice.tick) for notice in run.events] == [("s1", 48), (None, None)]
 
 
+def test_frames_held_back_for_a_session_are_lost_with_it() -> None:
+    """0.1 s are 50 ticks, before which the next session has none to pass."""
+    sent: dict[int, int] = {}
+
+    def operator(run: Run) -> None:
+        sent[run.endpoint.ticked] = len(run.sent)
+        if run.endpoint.ticked == 100:
+            run.endpoint.release("s1")
+            run.claim()
+
+    Run("measurement:delay=0.1", between=operator).run(200)
+    assert 0 < sent[100] == sent[145] < sent[199]
+
+
 def test_of_faults_one_of_which_is_refused_none_is_injected() -> None:
     emulator = Run().emulator
     with pytest.raises(ValueError, match="the plant has no motor3"):
