@@ -2,33 +2,7 @@
 
 The emulated plant, the USB board and a user's own class implement it; `plant.kind = "package.module:Class"` names the
 latter. The endpoint calls actuate → advance → measure once a tick. Frames, claims, watchdog, limits and faults are the
-endpoint's and the same for every plant. A plant of one's own:
-
-    class Settings(BaseModel, extra="forbid"):
-        inertia: float = Field(default=0.02, gt=0, description="about z [kg·m²]")
-
-    class Turntable(Plant):
-        Settings = Settings
-        actuators = 1
-        repeatable = True
-
-        def __init__(self, settings: Settings, period: float) -> None:
-            self._inertia, self._period = settings.inertia, period
-            self._angle = self._rate = self._volts = 0.0
-
-        def actuate(self, voltages: Sequence[float]) -> None:
-            (self._volts,) = voltages
-
-        def advance(self) -> None:
-            self._rate += 0.01 * self._volts / self._inertia * self._period
-            self._angle += self._rate * self._period
-
-        def measure(self) -> Measurement:
-            half = self._angle / 2
-            return Measurement((cos(half), 0.0, 0.0, sin(half)), (0.0, 0.0, self._rate))
-
-        def close(self) -> None:
-            self._volts = 0.0
+endpoint's and the same for every plant. `aeroloop show examples own_plant.py` prints a plant to begin with.
 """
 
 from __future__ import annotations
@@ -68,11 +42,9 @@ class PlantError(AeroloopError):
 
 
 class Measurement(NamedTuple):
-    """Sensor values, unquantized. A failed sensor yields NaN, never its last value.
+    """Sensor values, unquantized: q, body relative to inertial [1]; ω in the body frame [rad/s].
 
-    Attributes:
-        attitude: q, body relative to inertial [1].
-        rate: ω in the body frame [rad/s].
+    A failed sensor yields NaN, never its last value.
     """
 
     attitude: Quaternion
@@ -80,13 +52,7 @@ class Measurement(NamedTuple):
 
 
 class State(NamedTuple):
-    """True state of an emulated plant, free of sensor errors.
-
-    Attributes:
-        attitude: q, body relative to inertial [1].
-        rate: ω in the body frame [rad/s].
-        voltages: Voltages at the motors, after their limits [V].
-    """
+    """True state of a plant, free of sensor errors: q [1], ω in the body frame [rad/s], voltages at the motors [V]."""
 
     attitude: Quaternion
     rate: Vector
@@ -153,13 +119,7 @@ def class_of(kind: str) -> type[Plant]:
 
 
 def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: float) -> OwnPlant:
-    """Make the plant that `plant.kind` names.
-
-    Args:
-        kind: As configured.
-        own: `[plant.own]`.
-        period: Time of one `advance` [s].
-        voltage_limit: Largest voltage that reaches it [V].
+    """Make the plant that `plant.kind` names, with the settings `own`; at most `voltage_limit` [V] reaches it.
 
     Raises:
         PluginError: There is no such class.
@@ -213,9 +173,8 @@ class OwnPlant(Plant):
         try:
             (w, x, y, z), (a, b, c) = (map(float, part) for part in measured)
         except (TypeError, ValueError):
-            raise self._failure(
-                f"measured {_shown(measured)}: measure() must return Measurement((w, x, y, z), (x, y, z))"
-            ) from None
+            form = "measure() must return Measurement((w, x, y, z), (x, y, z))"
+            raise self._failure(f"measured {_shown(measured)}: {form}") from None
         length = hypot(w, x, y, z)
         if isfinite(length) and abs(length - 1) > _UNIT:
             raise self._failure(f"measured an attitude of length {length:.3g}, not a unit quaternion (w, x, y, z)")
@@ -229,9 +188,8 @@ class OwnPlant(Plant):
         try:
             (w, x, y, z), (a, b, c), (*voltages,) = (map(float, part) for part in true)
         except (TypeError, ValueError):
-            raise self._failure(
-                f"gave {_shown(true)}: truth() must return State((w, x, y, z), (x, y, z), voltages) or None"
-            ) from None
+            form = "truth() must return State((w, x, y, z), (x, y, z), voltages) or None"
+            raise self._failure(f"gave {_shown(true)}: {form}") from None
         if len(voltages) != self.actuators:
             raise self._failure(f"gave a true state of {len(voltages)} voltages, and has {self.actuators} actuators")
         known = isfinite(sum((w, x, y, z, a, b, c, *voltages)))
@@ -239,14 +197,15 @@ class OwnPlant(Plant):
 
     def close(self) -> None:
         """Set 0 V, and release its resources; after a failure as far as that is possible."""
-        if not self._closed:
-            self._closed = True
-            failed = self._failed
-            try:
-                self._call(self._plant.close)
-            except PlantError:
-                if not failed:  # otherwise the first failure is the one to show
-                    raise
+        if self._closed:
+            return
+        self._closed = True
+        failed = self._failed
+        try:
+            self._call(self._plant.close)
+        except PlantError:
+            if not failed:  # otherwise the first failure is the one to show
+                raise
 
     def _call(self, method: Callable[..., T], *values: object) -> T:
         try:

@@ -12,15 +12,11 @@ from typing import Any, Final, Literal, TypeAlias
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from aeroloop.plant_emulator.endpoint.endpoint import LimitMonitor, LimitSettings
-from aeroloop.plant_emulator.faults.injection import FaultyPlant
+from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, FaultyPlant
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.schedule import MAX_FAULTS
 from aeroloop.plant_emulator.model.aero import Aero, AeroSettings
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
-from aeroloop.plant_emulator.model.friction import FrictionSettings
-from aeroloop.plant_emulator.model.mechanism import Mechanism
+from aeroloop.plant_emulator.model.emulated import EmulatedPlant, FrictionSettings, Mechanism, RotorSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
-from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.model.wind import Wind, WindSettings
 from aeroloop.plant_emulator.plant import EMULATED, Plant, PlantError, own_plant
@@ -177,9 +173,8 @@ class PlantSettings(BaseModel, extra="forbid"):
         """These settings with `ideal` replaced by the parts that it stands for."""
         if not self.ideal:
             return self
-        rotor, friction = IDEAL_ROTOR, IDEAL_FRICTION
-        parts = {"aero": IDEAL_AERO, "rotor": rotor, "friction": friction, "wind": WindSettings()}
-        return self.model_copy(update={**parts, "sensors": IDEAL_SENSORS, "ideal": False})
+        parts = {"aero": IDEAL_AERO, "rotor": IDEAL_ROTOR, "friction": IDEAL_FRICTION, "sensors": IDEAL_SENSORS}
+        return self.model_copy(update={**parts, "wind": WindSettings(), "ideal": False})
 
     @property
     def emulated(self) -> bool:
@@ -225,9 +220,10 @@ class PlantSettings(BaseModel, extra="forbid"):
         )
 
     def with_faults(self, plant: Plant, period: float) -> FaultyPlant:
-        """Wrap a plant in the configured faults. Raises ValueError if a fault names a motor the plant does not have."""
-        limit = self.voltage_limit
-        return FaultyPlant(plant, self.parsed_faults, period, voltage_limit=limit, seed=self.fault_seed)
+        """Wrap a plant in the configured faults. Raises FaultError for one of a motor that is not there."""
+        faulty = FaultyPlant(plant, period, voltage_limit=self.voltage_limit, seed=self.fault_seed)
+        faulty.inject(self.parsed_faults, "configured")
+        return faulty
 
     def limit_monitor(self, period_ns: int, commanded_limit: float) -> LimitMonitor:
         """Build the check of the limits; `commanded_limit` is the outermost level of the quantizer [V]."""

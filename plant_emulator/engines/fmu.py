@@ -1,9 +1,8 @@
 """FMU as a plant: a model that Simulink, OpenModelica, Dymola or another tool exported for co-simulation, FMI 2 or 3.
 
 FMPy loads it. Once a period the voltages are set, the FMU advances by the period in equal communication steps, and the
-outputs that the settings name are read. What they give is both the true state and what the sensors measure. What can be
-wrong is one line each: the file, what it was exported for, its binary, a variable's name, causality, type or unit, a
-start value, its own fixed step, and what it fails with, in its own words.
+outputs that the settings name are read. What they give is both the true state and what the sensors measure. Whatever is
+wrong with a file, a variable or a start value is one line, and a failure of the FMU one line in its own words.
 """
 
 from __future__ import annotations
@@ -11,12 +10,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import chdir, suppress
+from difflib import get_close_matches
 from math import cos, isclose, prod, radians, sin
 from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
-from weakref import finalize
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, ClassVar, Final, Literal
 from zipfile import ZipFile
 
 from pydantic import BaseModel, Field, model_validator
@@ -24,7 +22,6 @@ from pydantic import BaseModel, Field, model_validator
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
-from aeroloop.protocol.wording import closest, either
 
 Name = Annotated[str, Field(min_length=1, max_length=500)]
 Names3 = tuple[str, str, str]
@@ -89,11 +86,7 @@ class FmuSettings(BaseModel, extra="forbid", frozen=True):
 
 
 class FmuPlant(Plant):
-    """A co-simulation FMU as a plant.
-
-    Args:
-        settings: Which FMU, and its variables.
-        period: The loop's period [s].
+    """A co-simulation FMU as a plant, stepped `period` by `period` [s].
 
     Raises:
         FmuError: FMPy is not installed, or the FMU cannot be used with these settings; from `advance`: it failed.
@@ -107,6 +100,7 @@ class FmuPlant(Plant):
         self.actuators = len(settings.voltages)
         self._steps = 0
         self._description = description = _description(settings.file)
+        self._fmi2 = description.fmiMajorVersion == 2
         self._variables: Mapping[str, Any] = {each.name: each for each in description.modelVariables}
         fixed = float(description.coSimulation.fixedInternalStepSize or 0)  # of FMI 3
         if fixed and not (round(self._step / fixed) and isclose(self._step / fixed, round(self._step / fixed))):
@@ -114,32 +108,37 @@ class FmuPlant(Plant):
                 f"{self._name} has steps of {fixed:g} s, of which {self._step:g} s, the loop's period or its part by "
                 "plant.own.substeps, is no multiple: set loop.rate_hz, or export the FMU with another step"
             )
-        self._inputs = _Numbers.of([self._element(name, ("input",), "V") for name in settings.voltages])
-        outputs = settings.outputs.items()
-        self._outputs = _Numbers.of([self._element(name, ("output", "local"), unit) for name, unit in outputs])
-        self._loaded = _Loaded()
-        self._release = finalize(self, self._loaded.free)
+        inputs = [self._element(name, ("input",), "V") for name in settings.voltages]
+        self._outputs = {
+            name: self._element(name, ("output", "local"), unit) for name, unit in settings.outputs.items()
+        }
+        self._logged = (-1, "")  # status and text of the gravest message; of those the last
+        self._fmu: Any = None
+        self._fatal = False
+        self._folder = TemporaryDirectory(prefix="aeroloop-fmu-")
         try:
             self._load()
         except BaseException:
             self.close()
             raise
-        self._set_values = self._get(self._inputs)
+        self._given = {variable.name: self._read(variable) for variable, _ in inputs}
+        self._voltages = [(self._given[variable.name], index) for variable, index in inputs]
         self.actuate((0.0,) * self.actuators)
         self._sample()
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Hold voltages [V] from the next period on. Shape (actuators,)."""
-        for at, voltage in zip(self._inputs.at, voltages, strict=True):
-            self._set_values[at] = voltage
+        for (values, index), voltage in zip(self._voltages, voltages, strict=True):
+            values[index] = voltage
 
     def advance(self) -> None:
         """Advance the FMU by one period."""
         try:
-            set_values = self._loaded.fmu.setReal if self._fmi2 else self._loaded.fmu.setFloat64
-            set_values(self._inputs.references, self._set_values)
+            for name, values in self._given.items():
+                write = self._fmu.setReal if self._fmi2 else self._fmu.setFloat64
+                write([self._variables[name].valueReference], values)
             for _ in range(self._settings.substeps):
-                ended = self._loaded.fmu.doStep(self._steps * self._step, self._step)
+                ended = self._fmu.doStep(self._steps * self._step, self._step)
                 self._steps += 1
                 if ended is not None and (ended[1] or ended[2]):  # FMI 3: it terminates, or returned early
                     raise FmuError(f"{self._name}: it ended by itself at {ended[3]:g} s{self._own_words()}")
@@ -153,27 +152,28 @@ class FmuPlant(Plant):
 
     def truth(self) -> State:
         """The same, with the voltages."""
-        return State(*self._measurement, tuple(self._set_values[at] for at in self._inputs.at))
+        return State(*self._measurement, tuple(values[index] for values, index in self._voltages))
 
     def close(self) -> None:
         """End and free the FMU, and remove its unpacked files. A second call does nothing."""
-        self._release()
+        if self._fmu is not None and not self._fatal:
+            with suppress(Exception):  # one that failed may refuse to be ended, and is freed nonetheless
+                self._fmu.terminate()
+            self._fmu.freeInstance()
+        self._fmu = None
+        self._folder.cleanup()
 
-    @property
-    def _fmi2(self) -> bool:
-        return bool(self._description.fmiMajorVersion == 2)
-
-    def _get(self, numbers: _Numbers) -> list[float]:
+    def _read(self, variable: Any) -> list[float]:
+        """All elements of a variable."""
+        reference = [variable.valueReference]
         values: list[float] = (
-            self._loaded.fmu.getReal(numbers.references)
-            if self._fmi2
-            else self._loaded.fmu.getFloat64(numbers.references, numbers.total)
+            self._fmu.getReal(reference) if self._fmi2 else self._fmu.getFloat64(reference, prod(variable.shape))
         )
         return values
 
     def _sample(self) -> None:
-        settings, values = self._settings, self._get(self._outputs)
-        of = dict(zip(settings.outputs, (values[at] for at in self._outputs.at), strict=True)) | {"": 0.0}
+        settings = self._settings
+        of = {name: self._read(variable)[index] for name, (variable, index) in self._outputs.items()} | {"": 0.0}
         angles = _in_radians([of[name] for name in settings.angles or ()], settings.angle_unit)
         a, b, c = _in_radians([of[name] for name in settings.rate or settings.angle_rates or ()], settings.rate_unit)
         if settings.quaternion:
@@ -187,7 +187,7 @@ class FmuPlant(Plant):
     # ── checks and start ──
 
     def _element(self, name: str, causalities: Sequence[str], unit: str) -> tuple[Any, int]:
-        """Variable and offset that a name stands for; `q[2]` may be an element of an array, counted from 1.
+        """Variable and index that a name stands for; `q[2]` may be an element of an array, counted from 1.
 
         It must have one of these causalities, the first being the usual one, and not be declared in another unit, if
         that is one of an angle or its rate.
@@ -221,23 +221,23 @@ class FmuPlant(Plant):
         for name in self._settings.start:
             self._known(name, self._variables)
         try:
-            fmpy.extract(self._settings.file, self._loaded.folder)
+            fmpy.extract(self._settings.file, self._folder.name)
             with chdir("."):  # FMPy changes the folder to load the library, and does not return where that fails
-                self._loaded.fmu = fmpy.instantiate_fmu(
-                    self._loaded.folder,
+                self._fmu = fmpy.instantiate_fmu(
+                    self._folder.name,
                     self._description,
                     "CoSimulation",
                     debug_logging=self._settings.log,
-                    logger=self._loaded.log,
+                    logger=self._log,
                 )
             if self._fmi2:
-                self._loaded.fmu.setupExperiment(startTime=0.0)
+                self._fmu.setupExperiment(startTime=0.0)
             left = self._apply(self._settings.start, fmpy.simulation.settable_in_instantiated)
-            self._loaded.fmu.enterInitializationMode()
+            self._fmu.enterInitializationMode()
             for name in self._apply(left, fmpy.simulation.settable_in_initialization_mode):
                 kind = _kind(self._variables[name])
                 raise FmuError(f"{self._name}: plant.own.start.{name} cannot be set: it is {kind}")
-            self._loaded.fmu.exitInitializationMode()
+            self._fmu.exitInitializationMode()
         except Exception as error:
             raise self._failure("it does not start", error) from None
 
@@ -248,86 +248,40 @@ class FmuPlant(Plant):
         left: dict[str, object] = {}
         for name, value in start.items():
             try:
-                left |= apply_start_values(self._loaded.fmu, self._description, {name: value}, when)
+                left |= apply_start_values(self._fmu, self._description, {name: value}, when)
             except (TypeError, ValueError) as error:
                 raise FmuError(f"{self._name}: plant.own.start.{name}: {error}") from None
         return left
 
     def _known(self, name: str, fitting: Iterable[str]) -> Any:
         if name not in self._variables:
-            alike = closest(name, fitting)
-            hint = f": did you mean {alike}?" if alike else f"; it has {_listed(fitting)}"
+            names = {each.lower(): each for each in fitting}
+            alike = get_close_matches(name.lower(), names, 1)
+            hint = f": did you mean {names[alike[0]]}?" if alike else f"; it has {_listed(fitting)}"
             raise FmuError(f"{self._name} has no variable {name}{hint}")
         return self._variables[name]
 
+    # ── failures ──
+
+    def _log(self, *message: Any) -> None:
+        """Keep a message of the FMU. FMI 2 gives the FMU's name, too, before these three."""
+        status, _, text = message[-3:]
+        if status >= self._logged[0]:
+            self._logged = (status, " ".join((text or b"").decode(errors="replace").split()))
+
     def _own_words(self) -> str:
-        return (
-            f": {self._loaded.logged[1]}"
-            if self._loaded.logged[1]
-            else "; it logged nothing: plant.own.log = true may say more"
-        )
+        return f": {self._logged[1]}" if self._logged[1] else "; it logged nothing: plant.own.log = true may say more"
 
     def _failure(self, what: str, error: Exception) -> FmuError:
         if isinstance(error, FmuError):
             return error
-        self._loaded.fatal |= getattr(error, "status", None) == _FATAL
+        self._fatal |= getattr(error, "status", None) == _FATAL
         text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         preferred = float(getattr(self._description.defaultExperiment, "stepSize", None) or self._step)
-        hint = (
-            ""
-            if isclose(preferred, self._step)
-            else f" (steps are of {self._step:g} s, and it prefers {preferred:g} s: see plant.own.substeps)"
-        )
+        hint = ""
+        if not isclose(preferred, self._step):
+            hint = f" (steps are of {self._step:g} s, and it prefers {preferred:g} s: see plant.own.substeps)"
         return FmuError(f"{self._name}: {what}: {text}{self._own_words()}{hint}")
-
-
-class _Loaded:
-    """An FMU in this process: the library's object, the folder of its files, and what it logged. Outlives no plant."""
-
-    def __init__(self) -> None:
-        self.folder = mkdtemp(prefix="aeroloop-fmu-")
-        self.fmu: Any = None
-        self.fatal = False
-        self.logged = (-1, "")  # status and text of the gravest message; of those the last
-
-    def log(self, *message: Any) -> None:
-        """Keep a message. FMI 2 gives the FMU's name, too, before these three."""
-        status, _, text = message[-3:]
-        if status >= self.logged[0]:
-            self.logged = (status, " ".join((text or b"").decode(errors="replace").split()))
-
-    def free(self) -> None:
-        """End and free it, and remove its files."""
-        if self.fmu is not None and not self.fatal:
-            with suppress(Exception):  # one that failed may refuse to be ended, and is freed nonetheless
-                self.fmu.terminate()
-            self.fmu.freeInstance()
-        rmtree(self.folder, ignore_errors=True)
-
-
-class _Numbers(NamedTuple):
-    """Some numbers that an FMU holds, scalars or elements of arrays, which are set and read as wholes.
-
-    Attributes:
-        references: Of the variables that they belong to.
-        at: Where each is among all elements of these variables.
-        total: Number of these elements.
-    """
-
-    references: list[int]
-    at: list[int]
-    total: int
-
-    @classmethod
-    def of(cls, elements: Sequence[tuple[Any, int]]) -> _Numbers:
-        """The numbers of these variables and offsets."""
-        first: dict[int, int] = {}
-        total = 0
-        for variable, _ in elements:
-            if variable.valueReference not in first:
-                first[variable.valueReference] = total
-                total += prod(variable.shape)
-        return cls(list(first), [first[variable.valueReference] + offset for variable, offset in elements], total)
 
 
 def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
@@ -384,7 +338,7 @@ def _description(file: Path) -> Any:
         others = sorted({name.split("/")[1] for name in files if re.match("binaries/[^/]+/.", name)})
         sources = any(re.match(r"sources/.+\.c$", name) for name in files)
         remedy = f"`fmpy compile {file}` builds one from its sources" if sources else "export it on this platform"
-        raise FmuError(f"{file.name} has no binary for {platform}, only for {either(others or ['none'])}: {remedy}")
+        raise FmuError(f"{file.name} has no binary for {platform}, only for {', '.join(others) or 'none'}: {remedy}")
     return description
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from math import ceil, copysign, exp, hypot, inf, log
+from math import ceil, copysign, exp, log
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import BaseModel, Field
 
-from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.model.emulated import Direction, RotorSettings
 from aeroloop.plant_emulator.model.sensors import Sensors, SensorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError
@@ -24,12 +24,6 @@ from aeroloop.protocol.wire.attitude import Quaternion, Vector
 
 SHIPPED: Final = {path.stem: path for path in sorted((Path(__file__).parent / "models").glob("*.xml"))}
 """Our models, by name."""
-
-
-def _has_a_direction(attitude: Quaternion) -> Quaternion:
-    if not 0 < hypot(*attitude) < inf:
-        raise ValueError("a quaternion of any finite length but zero")
-    return attitude
 
 
 class MujocoSettings(BaseModel, extra="forbid"):
@@ -42,7 +36,7 @@ class MujocoSettings(BaseModel, extra="forbid"):
     keyframe: str | None = Field(
         default=None, description="the model's keyframe to start from; its controls are those at 0 V, else 0"
     )
-    attitude: Annotated[Quaternion, AfterValidator(_has_a_direction)] | None = Field(
+    attitude: Direction | None = Field(
         default=None, description="q of the body at the start [1]; for a body on a free or ball joint"
     )
     allocation: list[list[float]] | None = Field(
@@ -93,9 +87,8 @@ class MujocoPlant(Plant):
 
         self._data = data = self._mujoco.MjData(model)
         if settings.keyframe is not None:
-            key = self._named("keyframe", "key", settings.keyframe)
-            self._mujoco.mj_resetDataKeyframe(model, data, key)
-        self._body = self._named("body", "body", settings.body)
+            self._mujoco.mj_resetDataKeyframe(model, data, self._found("key", settings.keyframe).id)
+        self._body = int(self._found("body", settings.body).id)
         if settings.attitude is not None:
             self._turn(settings.attitude)
         self._at_rest = data.ctrl.copy()
@@ -106,9 +99,7 @@ class MujocoPlant(Plant):
         self._commanded = self._at_rotors = [0.0] * self.actuators
         self._sensors = Sensors(settings.sensors, period)
         encoders = settings.sensors.attitude == "encoders" or settings.sensors.rate == "derivative"
-        self._joints = [
-            model.jnt_qposadr[self._named("joint", "joint", name)] for name in (settings.joints if encoders else ())
-        ]
+        self._joints = [self._found("joint", name).qposadr[0] for name in (settings.joints if encoders else ())]
         self._ctrl, self._qpos, self._xquat = data.ctrl, data.qpos, data.xquat[self._body]  # views
         self._velocity = np.empty(6)
         self._sense()
@@ -158,16 +149,13 @@ class MujocoPlant(Plant):
             said = " ".join(str(error).split())
             raise PluginError(f"MuJoCo refuses the MJCF {'given' if '<' in model else model}: {said}") from None
 
-    def _named(self, what: str, kind: str, name: str) -> int:
-        """The index of what the model calls `name`; `kind` is MuJoCo's word for what it is."""
-        m = self._mujoco
-        type_ = getattr(m.mjtObj, f"mjOBJ_{kind.upper()}")
-        if (found := m.mj_name2id(self._model, type_, name)) < 0:
-            count = {"body": self._model.nbody, "joint": self._model.njnt, "key": self._model.nkey}[kind]
-            names = [m.mj_id2name(self._model, type_, i) for i in range(count)]
-            known = ", ".join(each for each in names if each and each != "world")
-            raise PluginError(f"the MJCF has no {what} {name!r}; it has {known or 'none with a name'}")
-        return int(found)
+    def _found(self, kind: str, name: str) -> Any:
+        """The key, body or joint that the model calls `name`."""
+        try:
+            return getattr(self._model, kind)(name)
+        except KeyError as error:  # "Invalid name 'rotor'. Valid names: ['body', 'world']"
+            what = "keyframe" if kind == "key" else kind
+            raise PluginError(f"the MJCF has no such {what}: {error.args[0]}") from None
 
     def _allocated(self, allocation: list[list[float]] | None) -> Any:
         """Controls per volt. Shape (controls, voltages)."""
@@ -185,7 +173,7 @@ class MujocoPlant(Plant):
         """Set the quaternion of the body's joint such that the body has this attitude."""
         m, model, data = self._mujoco, self._model, self._data
         joint = model.body_jntadr[self._body]
-        kind = m.mjtJoint(model.jnt_type[joint]) if joint >= 0 else None
+        kind = m.mjtJoint(model.jnt_type[joint]) if joint >= 0 else None  # −1: the body is fixed
         if kind not in (m.mjtJoint.mjJNT_FREE, m.mjtJoint.mjJNT_BALL):
             raise PluginError("attitude sets that of a body on a free or ball joint; start others from a keyframe")
         start = model.jnt_qposadr[joint] + (3 if kind == m.mjtJoint.mjJNT_FREE else 0)

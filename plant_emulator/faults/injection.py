@@ -1,415 +1,244 @@
 """Faults at work on a plant's sensors, motors and frames, repeatable from a seed.
 
 A FaultyPlant wraps any plant: motor faults change the voltages at the start of a period, sensor faults the sample at
-its end. A FaultyStream passes the frames of one direction. Faults on one signal act one after another, in the order of
-injection. Each has its own random numbers, so that another fault leaves its noise unchanged. What each kind does is in
-two tables, VALUE_FAULTS and FRAME_FAULTS.
+its end, and `passes` takes the frames of either direction. Faults on one signal act one after another, in the order of
+injection. Each has its own random numbers, so that another fault leaves its noise unchanged.
 
-Times are the plant's, rounded to the nanosecond: a fault starts at exactly the tick of its start time.
+Times are the plant's, whole numbers of periods rounded to the nanosecond: a fault starts at exactly the tick of its
+start time. So the ticks of its begin and end follow from the fault and the tick of its injection alone.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Sequence
-from math import cos, hypot, inf, nan, sin
-from typing import Final, Literal, TypeAlias
+from collections import Counter
+from collections.abc import Sequence
+from math import ceil, inf
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from aeroloop.plant_emulator.faults.language import Fault, Kind
+from aeroloop.plant_emulator.faults.language import SIGNALS, ActingFault, Fault, FaultError, FrameFault, ValueFault
 from aeroloop.plant_emulator.plant import Measurement, Plant
+from aeroloop.protocol.messages.models import FaultStatus
 
-Values: TypeAlias = tuple[float, ...]
+MAX_FAULTS: Final = 64
+"""Faults that may act or be to come at the same time; as many that are over are remembered."""
 
 GARBLED_RATE: Final = 10.0
 """Bound of a garbled angular velocity about each axis, ± [rad/s]."""
 
-
-class ActingFault:
-    """A fault in the plant's time: what is left to do, and what it has done.
-
-    Attributes:
-        fault: The fault as it was written.
-        start: Start [s].
-        end: End [s]; infinity for none.
-        changed: Samples, voltages of a period, or frames that it has changed.
-    """
-
-    def __init__(self, fault: Fault, random: np.random.Generator, now: float) -> None:
-        self.fault, self.random = fault, random
-        self.start = round(fault.start_s + now, 9)
-        self.end = inf if fault.end_s is None else round(fault.end_s + now, 9)
-        self.value = fault.value or 0.0
-        self.changed = 0
-
-    def active(self, t: float) -> bool:
-        """Whether it acts at time t [s]: start ≤ t < end."""
-        return self.start <= t < self.end
+Source: TypeAlias = Literal["configured", "injected"]
 
 
-# ── sensors and motors ──
+class FaultTransition(NamedTuple):
+    """A fault's begin, end or injection: when, in ticks of the plant's time, and one line that says what."""
+
+    tick: int
+    text: str
 
 
-class ValueFault(ActingFault):
-    """A fault of attitude, rate or voltages, sampled once a period.
+class ScheduledFault:
+    """A fault with the ticks at which it begins and ends, in periods since the plant's time began; None for no end."""
 
-    `last` are the values just before, if there are any; `bound` is the largest size of a garbled value.
-    """
+    def __init__(self, acting: ActingFault, source: Source, period: float) -> None:
+        self.acting, self.source = acting, source
+        self.begin = first_tick(acting.start, period)
+        self.end = None if acting.end == inf else first_tick(acting.end, period)
+        self.begun = False
+        self.over = self.begin == self.end  # it lies between two ticks
 
-    def __init__(
-        self, fault: Fault, random: np.random.Generator, now: float, last: Values | None, bound: float = GARBLED_RATE
-    ) -> None:
-        super().__init__(fault, random, now)
-        whole, part, _ = fault.target
-        self.is_attitude, self.is_motor = whole == "attitude", whole == "motors"
-        self.size = len(last) if self.is_motor and last is not None else 3  # components of an error
-        self.parts = range(self.size) if part is None else range(part, part + 1)
-        self.last, self.bound = last, bound
-        self.history: deque[tuple[float, Values]] = deque() if last is None else deque([(-inf, last)])
+    def transitions(self, now: int) -> list[FaultTransition]:
+        """Its begin and end up to tick `now`, unless returned before."""
+        found, fault = [], f"({self.source}): {self.acting.fault}"
+        if not (self.begun or self.over) and self.begin <= now:
+            self.begun = True
+            found.append(FaultTransition(self.begin, f"fault begins {fault}"))
+        if self.begun and not self.over and self.end is not None and self.end <= now:
+            self.over = True
+            text = f"fault ends {fault}, {self.acting.changed} {self.acting.fault.effect}"
+            found.append(FaultTransition(self.end, text))
+        return found
 
-    def apply(self, values: Values, t: float) -> Values:
-        """Apply the fault to the values of time t [s]. Call it at every sample: before it starts, it keeps history."""
-        kind, history = self.fault.kind, self.history
-        if kind == "delay":
-            history.append((t, values))
-            while len(history) > 1 and history[1][0] <= round(t - self.value, 9):
-                history.popleft()
-        if not self.active(t):
-            self.last = values
-            return values
-        if kind in ("drop", "garble") and self.random.random() >= self.value:
-            return values
-        self.changed += 1
-        return VALUE_FAULTS[kind](self, values)
-
-    def missing(self, values: Values) -> Values:
-        """0 V; else no valid value, on all axes: a rate with one axis missing is invalid."""
-        return self.replaced(values, (0.0,) * self.size) if self.is_motor else (nan,) * len(values)
-
-    def stuck(self, values: Values) -> Values:
-        """The last values before the fault."""
-        self.last = values if self.last is None else self.last
-        return self.replaced(values, self.last)
-
-    def garbled(self, values: Values) -> Values:
-        """A uniformly distributed attitude, or values uniformly distributed within ±`bound`."""
-        if not self.is_attitude:
-            return self.replaced(values, tuple(self.random.uniform(-self.bound, self.bound, self.size).tolist()))
-        w, x, y, z = self.random.standard_normal(4).tolist()
-        length = hypot(w, x, y, z)
-        return w / length, x / length, y / length, z / length
-
-    def shifted(self, values: Values, error: Sequence[float]) -> Values:
-        """The values with the fault's parts of an error added: of an attitude, a rotation about the body's axes."""
-        error = [part if i in self.parts else 0.0 for i, part in enumerate(error)]
-        if self.is_attitude:
-            return _rotated(values, error)
-        return tuple(value + part for value, part in zip(values, error, strict=True))
-
-    def replaced(self, values: Values, by: Values) -> Values:
-        """The values with the fault's parts replaced by others; an attitude is replaced as a whole."""
-        if self.is_attitude:
-            return by
-        return tuple(by[i] if i in self.parts else value for i, value in enumerate(values))
+    def status(self, first: int | None) -> FaultStatus:
+        """Its status; `first` is the plant's tick at which its time began, None if it has not."""
+        return FaultStatus(
+            fault=str(self.acting.fault),
+            source=self.source,
+            begin_tick=None if first is None else first + self.begin,
+            end_tick=None if first is None or self.end is None else first + self.end,
+            changed=self.acting.changed,
+            effect=self.acting.fault.effect,
+        )
 
 
-def _rotated(q: Values, error: Sequence[float]) -> Values:
-    """`q ⊗ exp(error / 2)`; the error is a rotation vector in the body frame [rad]."""
-    angle = hypot(*error)
-    if angle == 0.0:
-        return q
-    scale = sin(angle / 2) / angle
-    (w, x, y, z), (a, b, c), d = q, (scale * part for part in error), cos(angle / 2)
-    return (
-        w * d - x * a - y * b - z * c,
-        w * a + x * d + y * c - z * b,
-        w * b - x * c + y * d + z * a,
-        w * c + x * b - y * a + z * d,
-    )
-
-
-VALUE_FAULTS: Final[dict[Kind, Callable[[ValueFault, Values], Values]]] = {
-    "off": ValueFault.missing,
-    "drop": ValueFault.missing,
-    "stuck": ValueFault.stuck,
-    "garble": ValueFault.garbled,
-    "bias": lambda fault, values: fault.shifted(values, [fault.value] * fault.size),
-    "noise": lambda fault, values: fault.shifted(
-        values, (fault.value * fault.random.standard_normal(fault.size)).tolist()
-    ),
-    "delay": lambda fault, values: fault.replaced(values, fault.history[0][1]),
-}
-"""What each kind does to values while it acts, and where it has a probability, when chance has it act."""
+def first_tick(time_s: float, period: float) -> int:
+    """The first tick at or after a time [s]. Tick n is at n·period, rounded to the nanosecond."""
+    tick = max(0, ceil(time_s / period) - 1)
+    while round(tick * period, 9) < time_s:
+        tick += 1
+    return tick
 
 
 class FaultyPlant(Plant):
-    """A plant with faults of its sensors and motors. Before `start` its time is 0 and no fault acts.
+    """A plant with faults of its sensors, motors and frames. Before `start` no fault acts.
 
-    Faults of streams are ignored here. `period` is the time of one `advance` [s], `voltage_limit` the largest voltage
-    of a garbled command [V]; `seed` is 0 or more.
-
-    Raises:
-        ValueError: A fault of a motor that the plant does not have.
+    `period` is the time of one `advance` [s], `voltage_limit` the largest voltage of a garbled command [V]; `seed` is 0
+    or more.
 
     Attributes:
         plant: The plant without its faults.
-        elapsed: Plant time since `start` [s]; 0 before.
+        ticks: Periods since `start`; −1 before.
     """
 
-    def __init__(
-        self, plant: Plant, faults: Sequence[Fault], period: float, *, voltage_limit: float, seed: int = 0
-    ) -> None:
+    def __init__(self, plant: Plant, period: float, *, voltage_limit: float, seed: int = 0) -> None:
         self.plant = plant
         self.actuators, self.paces = plant.actuators, plant.paces
+        self.ticks = -1
         self._period, self._limit, self._seed = period, voltage_limit, seed
-        self._started = False
-        self._ticks = self._attached = 0
-        self.elapsed = 0.0
-        self._commanded: Values = (0.0,) * plant.actuators
+        self._commanded: tuple[float, ...] = (0.0,) * plant.actuators
         self._applied = self._commanded
         self._actuated = False  # since the last period
         self._seen: Measurement | None = None
-        self._motors: list[ValueFault] = []
-        self._sensors: list[ValueFault] = []
-        for fault in faults:
-            self.inject(fault)
+        self._last_frame: dict[str, bytes] = {}
+        self._injected: Counter[str] = Counter()
+        self._scheduled: list[ScheduledFault] = []
+        self._acting: dict[str, list[ActingFault]] = {signal.whole: [] for signal in SIGNALS.values()}
 
     @property
     def time(self) -> float:
-        """`elapsed`, rounded to the nanosecond."""
-        return round(self.elapsed, 9)
-
-    @property
-    def ticks(self) -> int:
-        """Periods since `start`; −1 before."""
-        return self._ticks if self._started else -1
+        """Time since `start`, rounded to the nanosecond [s]; 0 before."""
+        return round(max(0, self.ticks) * self._period, 9)
 
     def start(self) -> None:
         """Start the time at 0. A second call does nothing."""
-        if not self._started:
-            self._started = True
+        if self.ticks < 0:
+            self.ticks = 0
             self._seen = None
 
-    def check(self, fault: Fault) -> None:
-        """Raise ValueError if it is a fault of a motor that the plant does not have."""
-        if fault.target.whole == "motors" and (fault.target.part or 0) >= self.actuators:
-            there = ", ".join(f"motor{i + 1}" for i in range(self.actuators))
-            raise ValueError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
+    # ── injection ──
 
-    def inject(self, fault: Fault) -> ValueFault | None:
-        """Add a fault with start and end counted from now. The current sample stays unchanged.
+    def inject(self, faults: Sequence[Fault], source: Source, *, clear: bool = False) -> list[FaultTransition]:
+        """Add faults with start and end counted from now; if `clear`, remove all others first.
+
+        The current sample stays unchanged; frames that a removed fault holds back are lost.
 
         Returns:
-            The fault at work; None for one of a stream.
+            The ends of the faults removed.
 
         Raises:
-            ValueError: A fault of a motor that the plant does not have.
+            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
         """
-        self.check(fault)
-        whole, seen = fault.target.whole, self._seen
-        random = _generator(self._seed, self._attached, fault)
-        self._attached += 1
-        if whole == "motors":
-            self._motors.append(added := ValueFault(fault, random, self.time, self._applied, self._limit))
-        elif whole == "attitude" or whole == "rate":
-            last: Values | None = seen and (seen.attitude if whole == "attitude" else seen.rate)
-            self._sensors.append(added := ValueFault(fault, random, self.time, last))
-        else:
-            return None
-        return added
+        for fault in faults:
+            if fault.target.whole == "motors" and (fault.target.part or 0) >= self.actuators:
+                there = ", ".join(f"motor{i + 1}" for i in range(self.actuators))
+                raise FaultError(f"fault '{fault}': the plant has no {fault.signal}, but {there}")
+        staying = 0 if clear else sum(not each.over for each in self._scheduled)
+        if staying + len(faults) > MAX_FAULTS:
+            raise FaultError(f"a plant takes {MAX_FAULTS} faults at a time: `aeroloop op inject --clear` removes them")
+        ends = self._clear() if clear else []
+        over = [each for each in self._scheduled if each.over]
+        forgotten = over[: max(0, len(over) + len(faults) - MAX_FAULTS)]
+        self._scheduled = [each for each in self._scheduled if each not in forgotten]
+        for fault in faults:
+            acting = self._at_work(fault)
+            self._acting[fault.target.whole].append(acting)
+            self._scheduled.append(ScheduledFault(acting, source, self._period))
+        return ends
 
-    def clear(self) -> None:
-        """Remove all faults and put the commanded voltages on the motors."""
-        self._sensors = []
-        if self._motors:
-            self._motors = []
+    def _at_work(self, fault: Fault) -> ActingFault:
+        whole, seen = fault.target.whole, self._seen
+        of_frames = whole in ("measurement", "command")
+        number = self._injected[whole] if of_frames else self._injected.total()
+        self._injected[whole] += 1
+        # The signal's name is part of the seed, so that the two streams do not lose the same ticks.
+        random = np.random.default_rng([self._seed, number, *fault.signal.encode()])
+        if of_frames:
+            return FrameFault(fault, random, self.time, self._last_frame.get(whole))
+        if whole == "motors":
+            return ValueFault(fault, random, self.time, self._applied, self._limit)
+        last = seen and (seen.attitude if whole == "attitude" else seen.rate)
+        return ValueFault(fault, random, self.time, last, GARBLED_RATE)
+
+    def _clear(self) -> list[FaultTransition]:
+        self._scheduled = [each for each in self._scheduled if each.begun]
+        for each in self._scheduled:
+            if not each.over:
+                each.end = self.ticks
+        self._stop_acting()
+        if self._applied != self._commanded:
             self.plant.actuate(self._commanded)
             self._applied = self._commanded
+        return self.transitions()
+
+    def _stop_acting(self) -> None:
+        for faults in self._acting.values():
+            faults.clear()
+
+    def transitions(self) -> list[FaultTransition]:
+        """Begins and ends up to now that were not returned before, in order of time."""
+        found = [transition for each in self._scheduled for transition in each.transitions(self.ticks)]
+        return sorted(found, key=lambda transition: transition.tick)
+
+    def statuses(self, first: int | None) -> list[FaultStatus]:
+        """Status of every fault in order; `first` is the plant's tick at `start`, None if there was none."""
+        return [each.status(first) for each in self._scheduled]
+
+    # ── sensors and motors ──
 
     def actuate(self, voltages: Sequence[float]) -> None:
         """Put voltages [V] through the motor faults on the motors. Shape (actuators,)."""
-        self._commanded = self._applied = tuple(voltages)
+        self._commanded = tuple(voltages)
         self._actuated = True
-        if self._motors:
-            t = self.time if self._started else -inf
-            for fault in self._motors:
-                self._applied = fault.apply(self._applied, t)
-            self._motors = [fault for fault in self._motors if t < fault.end]
+        self._applied = self._through("motors", self._commanded)
         self.plant.actuate(self._applied)
 
     def advance(self) -> None:
         """Let one period pass."""
-        if self._motors and not self._actuated:
+        if self._acting["motors"] and not self._actuated:
             self.actuate(self._commanded)  # a motor also fails and recovers while a voltage is held
         self._actuated = False
         self.plant.advance()
         self.passed = self.plant.passed
-        if self._started:
-            self._ticks += 1
-            self.elapsed = self._ticks * self._period
+        if self.ticks >= 0:
+            self.ticks += 1
         self._seen = None
-        if self._sensors:
+        if self._acting["attitude"] or self._acting["rate"]:
             self.measure()  # faults that hold or delay values need every sample
 
     def measure(self) -> Measurement:
         """Sensor values with their faults; the same until the next `advance`."""
         if self._seen is None:
-            self._seen = self.plant.measure()
-            if self._sensors:
-                self._seen = self._sensed(self._seen)
+            attitude, rate = self.plant.measure()
+            w, x, y, z = self._through("attitude", attitude)
+            a, b, c = self._through("rate", rate)
+            self._seen = Measurement((w, x, y, z), (a, b, c))
         return self._seen
 
     def close(self) -> None:
         """Remove all faults and set 0 V."""
-        self._motors, self._sensors = [], []
+        self._stop_acting()
         self._commanded = self._applied = (0.0,) * self.actuators
         self.plant.close()
 
-    def _sensed(self, seen: Measurement) -> Measurement:
-        attitude: Values = seen.attitude
-        rate: Values = seen.rate
-        t = self.time if self._started else -inf
-        for fault in self._sensors:
-            if fault.is_attitude:
-                attitude = fault.apply(attitude, t)
-            else:
-                rate = fault.apply(rate, t)
-        self._sensors = [fault for fault in self._sensors if t < fault.end]
-        w, x, y, z = attitude
-        a, b, c = rate
-        return Measurement((w, x, y, z), (a, b, c))
+    # ── frames ──
 
-
-# ── frames ──
-
-
-class FrameFault(ActingFault):
-    """A fault of frames; `last` is the frame that passed last, if there was one."""
-
-    def __init__(self, fault: Fault, random: np.random.Generator, now: float, last: bytes | None) -> None:
-        super().__init__(fault, random, now)
-        self.last = last
-        self.held: deque[tuple[float, bytes]] = deque()  # due time [s] and frame
-
-    def acts(self, t: float) -> bool:
-        """Whether it acts on a frame, which is counted, whatever it is."""
-        acts = self.active(t)
-        self.changed += acts
-        return acts
-
-    def happens(self, t: float) -> bool:
-        """Whether chance has it act on a frame, which is counted."""
-        happens = self.active(t) and bool(self.random.random() < self.value)
-        self.changed += happens
-        return happens
-
-    def delayed(self, frames: list[bytes], t: float) -> list[bytes]:
-        """When the fault ends, all held frames pass at once, ahead of the newer ones."""
-        active = self.active(t)
-        self.changed += active * len(frames)
-        self.held.extend((round(t + self.value, 9), frame) for frame in frames)
-        passed = []
-        while self.held and (not active or self.held[0][0] <= t):
-            passed.append(self.held.popleft()[1])
-        return passed
-
-    def duplicated(self, frames: list[bytes], t: float) -> list[bytes]:
-        """A frame passes again a tick later."""
-        again = [frame for _, frame in self.held]
-        self.held = deque((t, frame) for frame in frames if self.happens(t))
-        return again + frames
-
-    def reordered(self, frames: list[bytes], t: float) -> list[bytes]:
-        """A frame passes after the next one."""
-        passed = []
-        for frame in frames:
-            if self.held:
-                passed += [frame, self.held.popleft()[1]]
-            elif self.happens(t):
-                self.held.append((t, frame))
-            else:
-                passed.append(frame)
-        return passed
-
-    def stuck(self, frames: list[bytes], t: float) -> list[bytes]:
-        """The last frame before the fault, for each new one."""
-        if frames and not self.active(t):
-            self.last = frames[-1]
-        elif frames:
-            self.changed += len(frames)
-            self.last = frames[0] if self.last is None else self.last
-            return [self.last] * len(frames)
-        return frames
-
-    def garbled(self, frame: bytes) -> bytes:
-        """The frame with one random bit flipped."""
-        bit = int(self.random.integers(8 * len(frame)))
-        flipped = bytearray(frame)
-        flipped[bit // 8] ^= 0x80 >> bit % 8
-        return bytes(flipped)
-
-
-FRAME_FAULTS: Final[dict[Kind, Callable[[FrameFault, list[bytes], float], list[bytes]]]] = {
-    "off": lambda fault, frames, t: [frame for frame in frames if not fault.acts(t)],
-    "drop": lambda fault, frames, t: [frame for frame in frames if not fault.happens(t)],
-    "garble": lambda fault, frames, t: [
-        fault.garbled(frame) if frame and fault.happens(t) else frame for frame in frames
-    ],
-    "stuck": FrameFault.stuck,
-    "delay": FrameFault.delayed,
-    "duplicate": FrameFault.duplicated,
-    "reorder": FrameFault.reordered,
-}
-"""The frames that pass at time t [s], of those of this tick and those held back."""
-
-
-class FaultyStream:
-    """Frames of one direction, with faults; those of other signals are ignored here. `seed` is 0 or more."""
-
-    def __init__(self, signal: Literal["measurement", "command"], faults: Sequence[Fault], seed: int = 0) -> None:
-        self._signal, self._seed = signal, seed
-        self._attached = 0
-        self._last: bytes | None = None
-        self._faults: list[FrameFault] = []
-        for fault in faults:
-            self.inject(fault, 0.0)
-
-    def passes(self, frame: bytes | None, t: float) -> list[bytes]:
-        """Pass the frame of a tick, if any, through the faults at time t [s], which rises. It is rounded here.
-
-        Returns:
-            The frames that pass at this tick, in order.
-        """
-        frames = [] if frame is None else [frame]
-        if self._faults:
-            t = round(t, 9)
-            for fault in self._faults:
-                frames = FRAME_FAULTS[fault.fault.kind](fault, frames, t)
-            self._faults = [fault for fault in self._faults if t < fault.end or fault.held]
+    def passes(self, stream: Literal["measurement", "command"], frame: bytes | None) -> list[bytes]:
+        """Pass the frame of a tick, if any, through the stream's faults. Returns the frames that pass now, in order."""
+        frames: list[bytes] = self._through(stream, [] if frame is None else [frame])
         if frames:
-            self._last = frames[-1]
+            self._last_frame[stream] = frames[-1]
         return frames
 
-    def inject(self, fault: Fault, now: float) -> FrameFault | None:
-        """Add a fault with start and end counted from `now` [s]; None if it is not of this signal."""
-        if fault.signal != self._signal:
-            return None
-        random = _generator(self._seed, self._attached, fault)
-        self._faults.append(added := FrameFault(fault, random, now, self._last))
-        self._attached += 1
-        return added
-
-    def forget(self) -> None:
+    def forget_frames(self) -> None:
         """Drop the frames held back: they belong to the last session's keys."""
-        for fault in self._faults:
+        for fault in (*self._acting["measurement"], *self._acting["command"]):
             fault.held.clear()
 
-    def clear(self) -> None:
-        """Remove all faults; frames held back are lost."""
-        self._faults = []
-
-
-def _generator(seed: int, number: int, fault: Fault) -> np.random.Generator:
-    """Random numbers of one fault; they differ by signal, so that the two streams do not lose the same ticks."""
-    return np.random.default_rng([seed, number, *fault.signal.encode()])
+    def _through(self, whole: str, given: Any) -> Any:
+        """Values or frames after the faults of a signal, one after another."""
+        if faults := self._acting[whole]:
+            t = self.time if self.ticks >= 0 else -inf
+            for fault in faults:
+                given = fault.apply(given, t)
+            faults[:] = [fault for fault in faults if t < fault.end or fault.held]
+        return given

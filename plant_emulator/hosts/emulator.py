@@ -11,13 +11,11 @@ import threading
 from collections.abc import Callable, Sequence
 
 from aeroloop.plant_emulator.endpoint.vehicle_claim import Notice
-from aeroloop.plant_emulator.faults.injection import FaultyPlant, FaultyStream
+from aeroloop.plant_emulator.faults.injection import FaultTransition
 from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.plant_emulator.faults.schedule import FaultTransition, Schedule, Source
 from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject
 from aeroloop.protocol.runtime.role import Role
@@ -25,10 +23,6 @@ from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
-
-
-class FaultError(AeroloopError):
-    """A fault that cannot be injected; one line that says why."""
 
 
 class Emulator(Driver):
@@ -40,17 +34,13 @@ class Emulator(Driver):
     """
 
     def __init__(self, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event) -> None:
-        limit, seed = settings.voltage_limit, settings.fault_seed
-        self._faulty = FaultyPlant(settings.make(loop.period), (), loop.period, voltage_limit=limit, seed=seed)
-        self._measurements = FaultyStream("measurement", (), seed)
-        self._commands = FaultyStream("command", (), seed)
-        self._schedule = Schedule(loop.period)
         self._session: str | None = None
+        plant = settings.make(loop.period)
         try:
+            self._faulty = settings.with_faults(plant, loop.period)
             super().__init__(self._faulty, loop, wire, settings, stop)
-            self._add(settings.parsed_faults, "configured")
         except ValueError:
-            self._faulty.close()  # it may be a machine
+            plant.close()  # it may be a machine
             raise
 
     def inject(self, faults: Sequence[Fault], *, clear: bool = False) -> list[str]:
@@ -60,30 +50,20 @@ class Emulator(Driver):
             What was done, a line each; they are events, too.
 
         Raises:
-            ValueError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
+            FaultError: A fault of a motor that the plant does not have, or too many faults. Then nothing has changed.
         """
-        for fault in faults:
-            self._faulty.check(fault)
-        if not clear:
-            self._schedule.make_room(len(faults))
-        else:
-            self._faulty.clear()
-            self._measurements.clear()
-            self._commands.clear()
-            self._publish(self._schedule.clear(self._faulty.ticks))
-            self.endpoint.record_change("inject", name=None)
-        self._add(faults, "injected")
-        done = ["no faults any more"] if clear else []
-        for fault in faults:
-            self.endpoint.record_change("inject", name=str(fault))
-            done.append(f"fault injected: {fault}")
+        self._publish(self._faulty.inject(faults, "injected", clear=clear))
+        names = [*([None] if clear else []), *map(str, faults)]
+        for name in names:
+            self.endpoint.record_change("inject", name=name)
+        done = ["no faults any more" if name is None else f"fault injected: {name}" for name in names]
         self._publish([FaultTransition(self._faulty.ticks, text) for text in done])
         return done
 
     def fault_statuses(self) -> list[FaultStatus]:
         """Status of every fault."""
         ticks = self._faulty.ticks
-        return self._schedule.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
+        return self._faulty.statuses(None if ticks < 0 else self.endpoint.ticked - ticks)
 
     def truth(self) -> Truth | None:
         """The present true state, with the tick of the measurement taken of it; None where the plant knows none."""
@@ -98,21 +78,10 @@ class Emulator(Driver):
         )
 
     def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Tick the plant end, and note the faults that began or ended."""
+        """Tick the plant end, and publish the faults that began or ended."""
         measurement = super().tick(frame, k)
-        if self._faulty.ticks >= self._schedule.due:
-            self._publish(self._schedule.transitions(self._faulty.ticks))
+        self._publish(self._faulty.transitions())
         return measurement
-
-    def _add(self, faults: Sequence[Fault], source: Source) -> None:
-        now = self._faulty.time
-        self._schedule.make_room(len(faults))
-        for fault in faults:
-            acting = (
-                self._faulty.inject(fault) or self._measurements.inject(fault, now) or self._commands.inject(fault, now)
-            )
-            assert acting is not None
-            self._schedule.add(acting, source)
 
     def _publish(self, transitions: Sequence[FaultTransition]) -> None:
         """Queue events of faults, with the session's tick if there was one then."""
@@ -127,17 +96,16 @@ class Emulator(Driver):
         session = self.endpoint.session
         if session != self._session:
             self._session = session
-            self._measurements.forget()
-            self._commands.forget()
+            self._faulty.forget_frames()
             if session is not None:
                 self._faulty.start()
-        passed = self._commands.passes(frame, self._faulty.elapsed)
+        passed = self._faulty.passes("command", frame)
         return passed[-1] if passed else None
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
         if frame == SILENCE and not self._loop.lockstep:  # not a frame, so no fault acts on it
-            return self._measurements.passes(None, self._faulty.elapsed) or [SILENCE]
-        return self._measurements.passes(frame, self._faulty.elapsed)
+            return self._faulty.passes("measurement", None) or [SILENCE]
+        return self._faulty.passes("measurement", frame)
 
 
 class EmulatorOnZenoh(Emulator):
@@ -186,16 +154,8 @@ class EmulatorOnZenoh(Emulator):
     # ── queries `inject` and `advance`, for tests ──
 
     def _inject(self, request: Inject) -> Callable[[], Answer]:
-        try:
-            faults = [Fault.parse(text) for text in request.faults]
-        except ValueError as error:
-            raise FaultError(str(error)) from None
-
         def inject() -> Answer:
-            try:
-                done = self.inject(faults, clear=request.clear)
-            except ValueError as error:
-                raise FaultError(str(error)) from None
+            done = self.inject([Fault.parse(text) for text in request.faults], clear=request.clear)
             return Answer(done=bool(done), text="; ".join(done) or "no fault was given")
 
         return inject

@@ -17,19 +17,16 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
+from aeroloop.plant_emulator.model.emulated import BodySettings, Mechanism, torque_of_motion
 from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.protocol.wire.rotations import R, S, from_euler
+from aeroloop.protocol.wire.rotations import from_euler
 
 
-class AeroSettings(BaseModel, extra="forbid"):
+class AeroSettings(BodySettings):
     """The Aero's body. Defaults: Table C.1 of the paper, except the centre of mass, fitted by `lab calibrate`."""
 
-    inertia: Inertia = Field(default=(0.0218, 0.0217, 0.0218), description="J, diagonal [kg·m²]")
-    mass: float = Field(default=1.075, gt=0, description="m [kg]")
-    gravity: float = Field(default=9.81, ge=0, description="g [m/s²]")
     centre_of_mass: Vector = Field(
         default=(0.0, 0.0, -0.003951),
         description="r_g, pivot to centre of mass, body frame [m]; height by `lab calibrate`, Table C.1: -0.0038",
@@ -53,20 +50,11 @@ def aero_dynamics(settings: AeroSettings) -> ca.Function:
     x, u, load = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("load", 2)
     pitch, yaw, nu = x[0], x[1], x[2:4]
     J = ca.diag(ca.SX(settings.inertia))
-    r_g = ca.SX(settings.centre_of_mass)
-    theta = ca.SX(settings.damping)
     B = ca.vertcat(ca.SX.zeros(1, 2), ca.SX(np.array(settings.thrust)))
-
     A = free_motions(pitch)
     A_dot = ca.jacobian(ca.vec(A), pitch).reshape((3, 2)) * nu[0]
-    q = from_euler(ca.vertcat(0, pitch, yaw))
-    omega = A @ nu
-
-    weight = ca.vertcat(0, 0, -settings.mass * settings.gravity)
-    g = -S(r_g) @ R(q).T @ weight  # (C.6)
-    Psi = -S(omega) @ (J @ omega) - g  # (C.4)
-    Phi = ca.diag(-omega)  # (C.5)
-    torque = A.T @ (Psi + Phi @ theta + B @ u - J @ A_dot @ nu) + load
+    q, omega = from_euler(ca.vertcat(0, pitch, yaw)), A @ nu
+    torque = A.T @ (torque_of_motion(settings, settings.damping, q, omega) + B @ u - J @ A_dot @ nu) + load
     nu_dot = ca.solve(A.T @ J @ A, torque)
     return ca.Function("aero", [x, u, load], [ca.vertcat(nu, nu_dot)], ["x", "u", "load"], ["x_dot"])
 

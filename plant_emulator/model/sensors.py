@@ -1,16 +1,13 @@
 """Sensors of the emulated plant.
 
 Attitude: encoders that count steps of the joints, with a random zero within a step, or perfect. Angular velocity: the
-filtered derivative of the encoders' angles, a gyro with noise and bias, or perfect.
-
-A sample is one CasADi function, which a loop that is compiled as a whole contains as well; random numbers are inputs.
+filtered derivative of the encoders' angles, a gyro with noise and bias, or perfect. A sample is one CasADi function.
 """
 
 from __future__ import annotations
 
 import math
-from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import cos, exp, isfinite, nan, pi, sin, sqrt
 from typing import Any, Literal, TypeVar
 
@@ -84,10 +81,6 @@ class Sensors:
     """Sensors of one plant, sampled once a `period` [s].
 
     Attributes:
-        function: A sample as CasADi function. Inputs: true attitude q [1], rate ω [rad/s], joint angles [rad]; held
-            (filtered angle [rad] and rate [rad/s] of pitch, then of yaw; a NaN angle starts the filter), zeros (of
-            the encoders, within a step [1]), error (of the gyro [rad/s]). Outputs: seen (q and ω as measured), after
-            (`held` of the next sample).
         zeros: Of pitch and yaw encoders, within a step [1].
         given: Memory of attitude, rate and joint angles, by name: what `sample` samples.
     """
@@ -96,17 +89,16 @@ class Sensors:
         self._settings = settings
         self._gyro = settings.rate == "gyro"
         self._encoders = settings.attitude == "encoders" or settings.rate == "derivative"
-        self.function = sensor_function(settings, period)
         self._random = np.random.default_rng(settings.seed)
         self.zeros: list[float] = self._random.random(len(settings.counts)).tolist()
-        self._noise: list[Vector] = []
-        self._compiled = Compiled(self.function)
-        self._evaluate, given = self._compiled.evaluate, self._compiled.inputs
+        self._errors = self._draw()
+        self._compiled = Compiled(sensor_function(settings, period))
+        given = self._compiled.inputs
         self.given = {name: given[name] for name in ("attitude", "rate", "angles")}
         self._angles, self._held, self._error = given["angles"], given["held"], given["error"]
-        self._seen, self._after = self._compiled.outputs["seen"], self._compiled.outputs["after"]
-        given["zeros"][:] = memoryview(array("d", self.zeros))
-        self._held[:] = memoryview(array("d", [nan, 0.0, nan, 0.0]))
+        for i in (0, 1):
+            given["zeros"][i] = self.zeros[i]
+            self._held[2 * i] = nan
 
     def read(self, attitude: Quaternion, rate: Vector, angles: Sequence[float]) -> Measurement:
         """Sample a true attitude q [1], rate ω [rad/s] and joint angles [rad]. Call it once a period."""
@@ -123,26 +115,34 @@ class Sensors:
             return NO_MEASUREMENT
         if self._gyro:
             self._error[0], self._error[1], self._error[2] = self.error()
-        self._evaluate()
-        self._held[:] = self._after
-        w, x, y, z, a, b, c = self._seen.tolist()
+        self._compiled.evaluate()
+        self._held[:] = self._compiled.outputs["after"]
+        w, x, y, z, a, b, c = self._compiled.outputs["seen"].tolist()
         return Measurement((w, x, y, z), (a, b, c))
 
     @property
     def held(self) -> list[float]:
-        """Memory of the filters; see `function`."""
+        """Memory of the filters; see `sensor_function`."""
         return self._held.tolist()  # type: ignore[return-value]  # doubles
 
     def error(self) -> Vector:
         """Draw a gyro's next error, noise and bias [rad/s]."""
-        if not self._noise:
-            drawn = self._random.standard_normal((_BLOCK, 3)) * self._settings.gyro_noise + self._settings.gyro_bias
-            self._noise = [tuple(row) for row in drawn.tolist()]
-        return self._noise.pop()
+        return next(self._errors)
+
+    def _draw(self) -> Iterator[Vector]:
+        noise, bias = self._settings.gyro_noise, self._settings.gyro_bias
+        while True:
+            drawn = self._random.standard_normal((_BLOCK, 3)) * noise + bias
+            yield from map(tuple, drawn[::-1].tolist())  # the last first, as in every log so far
 
 
 def sensor_function(settings: SensorSettings, period: float) -> ca.Function:
-    """A sample; see `Sensors.function`."""
+    """A sample as CasADi function.
+
+    Inputs: true attitude q [1], rate ω [rad/s], joint angles [rad]; held (filtered angle [rad] and rate [rad/s] of
+    pitch, then of yaw; a NaN angle starts the filter), zeros (of the encoders, within a step [1]), error (of the gyro
+    [rad/s]). Outputs: seen (q and ω as measured), after (`held` of the next sample).
+    """
     sizes = {"attitude": 4, "rate": 3, "angles": 2, "held": 4, "zeros": 2, "error": 3}
     given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     attitude, rate, angles, held, zeros, error = given.values()

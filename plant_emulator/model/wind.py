@@ -7,13 +7,13 @@ stepped exactly, so that its statistics do not depend on the period.
 
 from __future__ import annotations
 
-from itertools import accumulate
+from collections.abc import Iterator
 from math import exp, hypot, sqrt
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-_BLOCK = 4096  # random numbers are drawn this many periods at a time: one draw costs more than a plant's step
+_BLOCK = 4096  # periods whose random numbers are drawn at once: one draw costs more than a plant's step
 
 
 class WindSettings(BaseModel, extra="forbid"):
@@ -36,39 +36,25 @@ class WindSettings(BaseModel, extra="forbid"):
 
 
 class Wind:
-    """Torque about each axis, `period` by `period` [s].
-
-    Attributes:
-        calm: Whether the torque is always 0.
-    """
+    """Torque about each axis, `period` by `period` [s]; `calm` if it is always 0."""
 
     def __init__(self, settings: WindSettings, axes: int, period: float) -> None:
-        self._steady = np.array((*settings.torque, 0.0, 0.0, 0.0)[:axes]) * settings.blowing
-        self.calm = not self._steady.any()
-        deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
+        self._steady = [torque * settings.blowing for torque in (*settings.torque, 0.0, 0.0, 0.0)[:axes]]
+        self.calm = not any(self._steady)
+        self._deviation = settings.gust * hypot(*self._steady) / sqrt(axes)
         self._keep = exp(-period / settings.gust_time_s)
-        self._kick = deviation * sqrt(1 - self._keep**2)
         self._random = np.random.default_rng(settings.seed)
-        self._gust: list[float] = (deviation * self._random.standard_normal(axes)).tolist()
-        self._block: list[list[float]] = []
+        self._torques = self._blow()
 
     def sample(self) -> list[float]:
         """Torque about each axis for the next period [N·m]. Shape (axes,)."""
-        if not self._block:
-            self._block = self._draw()[::-1]
-        return self._block.pop()
+        return next(self._torques)
 
-    def _draw(self) -> list[list[float]]:
-        torques = np.tile(self._steady, (_BLOCK, 1))
-        if self._kick:
-            kicks = (self._random.standard_normal(torques.shape) * self._kick).T.tolist()
-            gusts = [
-                list(accumulate(each, self._next, initial=gust)) for each, gust in zip(kicks, self._gust, strict=True)
-            ]
-            self._gust = [each[-1] for each in gusts]
-            torques += np.array(gusts).T[1:]
-        block: list[list[float]] = torques.tolist()
-        return block
-
-    def _next(self, gust: float, kick: float) -> float:
-        return self._keep * gust + kick
+    def _blow(self) -> Iterator[list[float]]:
+        axes, keep = len(self._steady), self._keep
+        gust = (self._deviation * self._random.standard_normal(axes)).tolist()
+        kick = self._deviation * sqrt(1 - keep**2)
+        while True:
+            for kicks in (self._random.standard_normal((_BLOCK, axes)) * kick).tolist():
+                gust = [keep * old + new for old, new in zip(gust, kicks, strict=True)]
+                yield [steady + part for steady, part in zip(self._steady, gust, strict=True)]

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from aeroloop.plant_emulator.model.aero import AeroSettings
-from aeroloop.plant_emulator.model.rotor import RotorSettings
+from aeroloop.plant_emulator.model.emulated import RotorSettings
 from aeroloop.plant_emulator.model.sensors import SensorSettings
 from aeroloop.plant_emulator.settings import IDEAL_AERO, PlantSettings
 from aeroloop.protocol.wire.attitude import Vector

@@ -27,11 +27,8 @@ def settings_of(kind: str, **own: Any) -> PlantSettings:
 
 
 def table(**own: Any) -> tuple[OwnPlant, Turntable]:
-    made = settings_of(TABLE, **own).make(PERIOD)
-    assert isinstance(made, OwnPlant)
-    inner = made._plant
-    assert isinstance(inner, Turntable)
-    return made, inner
+    inner = Turntable(TurntableSettings(**own), PERIOD)
+    return OwnPlant(inner, 24.0), inner
 
 
 @pytest.mark.parametrize("kind", ["aero", "rigid_body"])
@@ -40,8 +37,11 @@ def test_our_bodies_are_no_plants_of_ones_own(kind: str) -> None:
 
 
 def test_a_class_is_made_with_its_own_settings_and_the_period() -> None:
-    _, inner = table(inertia=0.5)
-    assert (inner._own.inertia, inner._period) == (0.5, PERIOD)
+    made, (alike, _), (other, _) = settings_of(TABLE, inertia=0.5).make(PERIOD), table(inertia=0.5), table()
+    for plant in (made, alike, other):
+        plant.actuate((5.0,))
+        plant.advance()
+    assert made.measure() == alike.measure() != other.measure()
 
 
 @pytest.mark.parametrize(
@@ -75,8 +75,10 @@ def test_its_own_exception_is_one_line_with_class_file_and_line(method: str) -> 
 
 
 def test_after_a_failure_it_is_closed_once_and_the_first_failure_stays_the_one_shown() -> None:
-    plant, inner = table(fails_in="close", fails_after=0)
-    plant._failed = True
+    plant, inner = table(fails_in="close", fails_after=0, gives="few")
+    plant.advance()
+    with pytest.raises(PlantError):
+        plant.measure()
     plant.close()
     plant.close()
     assert inner.closed == 1

@@ -1,4 +1,4 @@
-"""A plant that counts its periods as its sensors' truth, behind faults of signals."""
+"""A plant that counts its periods as its sensors' truth, behind faults of its sensors, motors and frames."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ class Stand(Plant):
 
 
 def faulty(
-    *faults: str | Fault, seed: int = 0, actuators: int = 2, started: bool = True, period: float = PERIOD
+    *faults: str, seed: int = 0, actuators: int = 2, started: bool = True, period: float = PERIOD
 ) -> tuple[FaultyPlant, Stand]:
     """A plant with these faults, and what is behind them."""
     stand = Stand(actuators)
-    parsed = [Fault.parse(fault) if isinstance(fault, str) else fault for fault in faults]
-    plant = FaultyPlant(stand, parsed, period, voltage_limit=LIMIT, seed=seed)
+    plant = FaultyPlant(stand, period, voltage_limit=LIMIT, seed=seed)
+    plant.inject([Fault.parse(fault) for fault in faults], "configured")
     if started:
         plant.start()
     return plant, stand
@@ -70,6 +70,21 @@ def driven(*faults: str, ticks: int = 8, seed: int = 0) -> list[tuple[float, ...
         plant.actuate((float(k), float(-k)))
         plant.advance()
     return stand.periods
+
+
+def passed(*faults: str, frames: Sequence[bytes | None], seed: int = 0, period: float = PERIOD) -> list[list[bytes]]:
+    """The commands that pass at 0 s, 0.1 s, 0.2 s and so on."""
+    plant, _ = faulty(*faults, seed=seed, period=period)
+    ticks = []
+    for frame in frames:
+        ticks.append(plant.passes("command", frame))
+        plant.advance()
+    return ticks
+
+
+def numbered(count: int) -> list[bytes]:
+    """Frames that are their own index."""
+    return [k.to_bytes(4, "big") for k in range(count)]
 
 
 def missing(values: Sequence[float]) -> bool:

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from aeroloop.plant_emulator.engines.mujoco import SHIPPED, MujocoPlant, MujocoSettings, lagged
 from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.plant_emulator.model.friction import FrictionSettings
+from aeroloop.plant_emulator.model.emulated import FrictionSettings, RotorSettings
 from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
-from aeroloop.plant_emulator.model.rotor import RotorSettings
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.plant_emulator.settings import IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 from aeroloop.protocol.messages.operator import Sinusoid
@@ -28,7 +28,6 @@ from aeroloop.protocol.plugins import PluginError
 from aeroloop.service.cli.show import EXAMPLES
 from aeroloop.service.config import Settings, load
 from aeroloop.service.lab.experiment import run_experiment
-from tests.support.numpy_twin import Array
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'aeroloop[mujoco]'")
 
@@ -89,6 +88,15 @@ class Recorded(Plant):
 
     def close(self) -> None:
         self.plant.close()
+
+
+def _driven(plant: Plant, voltages: Sequence[Sequence[float]]) -> list[Measurement]:
+    seen = []
+    for each in voltages:
+        plant.actuate(each)
+        plant.advance()
+        seen.append(plant.measure())
+    return seen
 
 
 def _apart(some: Sequence[State], others: Sequence[State]) -> float:
@@ -220,23 +228,14 @@ def test_a_free_body_flies_through_full_turns() -> None:
 
 @pytest.mark.parametrize("twin", [MujocoSettings(rotor=RotorSettings()), QUADROTOR], ids=["aero", "quadrotor"])
 def test_two_runs_are_the_same_to_the_last_bit(twin: MujocoSettings) -> None:
-    def course() -> list[Measurement]:
-        plant = MujocoPlant(twin, PERIOD)
-        voltages = np.random.default_rng(3).uniform(-10, 10, (300, plant.actuators))
-        seen = []
-        for each in voltages:
-            plant.actuate(each.tolist())
-            plant.advance()
-            seen.append(plant.measure())
-        return seen
-
-    assert course() == course()
+    one, other = (MujocoPlant(twin, PERIOD) for _ in range(2))
+    voltages = np.random.default_rng(3).uniform(-10, 10, (300, one.actuators)).tolist()
+    assert _driven(one, voltages) == _driven(other, voltages)
 
 
 def test_lag_is_that_of_our_rotors() -> None:
     rotor = RotorSettings(lag_up_s=0.1, lag_down_s=0.2)
-    rng = np.random.default_rng(4)
-    for voltage, command in rng.normal(size=(20, 2)):
+    for voltage, command in np.random.default_rng(4).normal(size=(20, 2)):
         fine, steps = voltage, 20_000
         for _ in range(steps):
             rising = (command - fine) * fine >= 0
@@ -268,11 +267,8 @@ def test_the_rate_is_that_of_the_instant_of_the_attitude() -> None:
       <actuator><motor joint="z" gear="3"/></actuator>
     </mujoco>
     """
-    plant = MujocoPlant(MujocoSettings(model=wheel), PERIOD)
-    plant.actuate((4.0,))
-    for _ in range(10):
-        plant.advance()
-    assert plant.measure().rate == pytest.approx((0.0, 0.0, 4.0 * 3 / 2 * 10 * PERIOD), abs=1e-12)
+    (*_, last) = _driven(MujocoPlant(MujocoSettings(model=wheel), PERIOD), [(4.0,)] * 10)
+    assert last.rate == pytest.approx((0.0, 0.0, 4.0 * 3 / 2 * 10 * PERIOD), abs=1e-12)
 
 
 def test_controls_at_0_v_are_the_keyframes_and_close_goes_there() -> None:
@@ -288,10 +284,20 @@ def test_a_simulation_that_diverges_measures_nothing(tmp_path: Path, monkeypatch
     """MuJoCo would begin anew at the start, as if nothing had happened."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     plant = MujocoPlant(MujocoSettings(model=SMOOTH.replace('damping="0.0220"', 'damping="-1e4"')), PERIOD)
-    plant.actuate((1.0, 1.0))
-    for _ in range(20):
-        plant.advance()
-    assert np.isnan(plant.measure().attitude).all()
+    (*_, last) = _driven(plant, [(1.0, 1.0)] * 20)
+    assert np.isnan(last.attitude).all()
+
+
+def test_a_file_and_a_smaller_step_may_be_given(tmp_path: Path) -> None:
+    """Whatever the period, steps are equal and no longer than the model's: 2.5 ms are three steps of 1 ms at most."""
+    path = tmp_path / "mine.xml"
+    path.write_text(AERO)
+    ends = [
+        _driven(MujocoPlant(MujocoSettings(model=str(path), substeps=substeps), 0.0025), [(5.0, 8.0)] * 400)[-1].rate
+        for substeps in (None, 3, 12)
+    ]
+    assert ends[0] == ends[1] != ends[2]
+    assert ends[2] == pytest.approx(ends[1], abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -300,47 +306,30 @@ def test_a_simulation_that_diverges_measures_nothing(tmp_path: Path, monkeypatch
         ({"model": "no.xml"}, "there is no MJCF file no.xml; ours are aero, quadrotor"),
         ({"model": "<mujoco><worl/></mujoco>"}, "MuJoCo refuses the MJCF given: .* 'worl', line 1"),
         ({"model": "<mujoco/>", "body": "world"}, "the MJCF has no actuators"),
-        ({"body": "rotor"}, "the MJCF has no body 'rotor'; it has body"),
-        ({"keyframe": "start"}, "the MJCF has no keyframe 'start'; it has none with a name"),
-        ({"sensors": {"rate": "derivative"}, "joints": ["p", "yaw"]}, "no joint 'p'; it has yaw, pitch"),
+        ({"body": "rotor"}, "the MJCF has no such body: Invalid name 'rotor'. Valid names: .'body'"),
+        ({"keyframe": "start"}, "the MJCF has no such keyframe: Invalid name 'start'"),
+        (
+            {"sensors": {"rate": "derivative"}, "joints": ["p", "yaw"]},
+            "no such joint: Invalid name 'p'. Valid names: .'pitch', 'yaw'",
+        ),
         ({"allocation": [[1.0]]}, "allocation needs 2 rows of one length"),
         ({"allocation": [[], []]}, "allocation needs 2 rows of one length"),
         ({"allocation": [[1.0], [1.0, 2.0]]}, "allocation needs 2 rows of one length"),
         ({"attitude": (1.0, 0.0, 0.0, 0.0)}, "attitude sets that of a body on a free or ball joint"),
+        ({"attitude": (0.0, 0.0, 0.0, 0.0)}, "any finite length but zero"),
+        ({"attitude": (inf, 0.0, 0.0, 0.0)}, "any finite length but zero"),
     ],
 )
 def test_what_does_not_fit_is_one_line(changed: dict[str, object], text: str) -> None:
-    with pytest.raises(PluginError, match=text) as refused:
+    with pytest.raises((PluginError, ValidationError), match=text) as refused:
         MujocoPlant(MujocoSettings.model_validate(changed), PERIOD)
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0, 0.0), (inf, 0.0, 0.0, 0.0)])
-def test_an_attitude_has_a_direction(attitude: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="any finite length but zero"):
-        MujocoSettings.model_validate({"attitude": attitude})
+    assert isinstance(refused.value, ValidationError) or "\n" not in str(refused.value)
 
 
 def test_without_mujoco_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(PluginError, match=r"not installed: pip install 'aeroloop\[mujoco\]'"):
         MujocoPlant(MujocoSettings(), PERIOD)
-
-
-def test_a_file_and_a_smaller_step_may_be_given(tmp_path: Path) -> None:
-    """Whatever the period, steps are equal and no longer than the model's."""
-    path = tmp_path / "mine.xml"
-    path.write_text(AERO)
-    courses: list[Array] = []
-    for substeps in (None, 3, 12):
-        plant = MujocoPlant(MujocoSettings(model=str(path), substeps=substeps), 0.0025)
-        plant.actuate((5.0, 8.0))
-        for _ in range(400):
-            plant.advance()
-        courses.append(np.array(plant.measure().rate))
-    assert (courses[0] == courses[1]).all()  # 2.5 ms are three steps of less than 1 ms
-    assert courses[2] == pytest.approx(courses[1], abs=1e-4)
-    assert (courses[2] != courses[1]).any()
 
 
 @pytest.mark.processes

@@ -2,128 +2,185 @@
 
 from __future__ import annotations
 
-from functools import partial
-from weakref import ref
-
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.endpoint.endpoint import Endpoint, LimitMonitor, LimitSettings
-from aeroloop.plant_emulator.faults.language import Fault
-from aeroloop.protocol.messages.models import Claim, Grant
-from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.wire.spec import WireSpec
-from tests.support.faulty_plant import LIMIT, driven, faulty, missing, sample, sensed
-from tests.support.faulty_streams import numbered, passed
+from aeroloop.plant_emulator.faults.injection import MAX_FAULTS, FaultyPlant
+from aeroloop.plant_emulator.faults.language import Fault, FaultError
+from tests.support.faulty_plant import driven, faulty, missing, numbered, passed, sample, sensed
 
 
-def test_a_fault_begins_and_ends_at_the_tick_that_its_decimals_mean() -> None:
-    """In floats, 53 of the first 100 multiples of 0.009 fall short of their decimals: 3 · 0.009 < 0.027."""
-    for k in range(1, 100):
-        when = f"off@{9 * k}e-3..{9 * k + 9}e-3"
-        plant, _ = faulty(f"rate:{when}", period=0.009)
-        seen = []
-        for _ in range(k + 2):
-            seen.append(missing(plant.measure().rate))
-            plant.advance()
-        assert seen == [False] * k + [True, False]
-        ticks = passed(f"command:{when}", frames=[b"a"] * (k + 2), period=0.009)
-        assert [not tick for tick in ticks] == [False] * k + [True, False]
+def inject(plant: FaultyPlant, *faults: str, clear: bool = False) -> list[tuple[int, str]]:
+    ends = plant.inject([Fault.parse(fault) for fault in faults], "injected", clear=clear)
+    return [(end.tick, end.text) for end in ends]
+
+
+# ── begin and end ──
+
+
+@given(
+    period=st.sampled_from((0.002, 0.009, 1 / 300, 0.1)),
+    start=st.integers(0, 300),
+    length=st.none() | st.integers(1, 300),
+)
+def test_a_fault_acts_at_the_ticks_of_its_status_and_events_and_at_no_other(
+    period: float, start: int, length: int | None
+) -> None:
+    """Starts and ends are whole milliseconds, most of them between two ticks; 3 · 0.009 < 0.027 in floats."""
+    end = "" if length is None else f"..{(start + length) / 1000}"
+    plant, _ = faulty(f"rate:off@{start / 1000}{end}", f"command:off@{start / 1000}{end}", period=period)
+    acted, events = [], []
+    for k in range(round(0.7 / period)):
+        acted.append(missing(plant.measure().rate))
+        assert (plant.passes("command", b"a") == []) == acted[-1]
+        events += [transition.tick for transition in plant.transitions()]
+        assert acted[-1] == (start / 1000 <= round(k * period, 9) < (start + (length or 1000)) / 1000)
+        plant.advance()
+    for status in plant.statuses(0):
+        assert status.begin_tick is not None
+        ticks = range(status.begin_tick, len(acted) if status.end_tick is None else status.end_tick)
+        assert acted == [k in ticks for k in range(len(acted))]
+        edges = [] if not ticks else [ticks.start] if length is None else [ticks.start, ticks.stop]
+        assert events == sorted(2 * edges)
+
+
+def test_begins_and_ends_are_returned_once_and_in_order_however_many_ticks_are_skipped() -> None:
+    plant, _ = faulty("command:off@0.5..0.7", "rate:off@0.2", "rate:bias=1@0.61..0.69", started=False)
+    plant.advance()
+    assert plant.transitions() == []
+    plant.start()
+    for _ in range(9):
+        plant.advance()
+    found = plant.transitions()
+    assert [transition.tick for transition in found] == [2, 5, 7]  # the last fault lies between two ticks
+    assert found[0].text == "fault begins (configured): rate:off@0.2"
+    assert found[2].text == "fault ends (configured): command:off@0.5..0.7, 0 commands dropped"
+    assert plant.transitions() == []
 
 
 def test_nothing_fails_and_no_time_passes_before_the_start() -> None:
-    plant, stand = faulty("rate:off", "motors:off", started=False)
-    for _ in range(5):
+    plant, stand = faulty("rate:off", "motors:off", "command:off", "motor1:noise=1", started=False)
+    at_once, other = faulty("rate:off", "motors:off", "command:off", "motor1:noise=1")
+    at_once.actuate((3.0, 3.0))
+    for k in range(5):
         plant.actuate((3.0, 3.0))
         plant.advance()
-    assert (plant.time, stand.voltages, plant.measure()) == (0.0, (3.0, 3.0), sample(5))
+        assert (plant.time, stand.voltages, plant.measure()) == (0.0, (3.0, 3.0), sample(k + 1))
+        assert plant.passes("command", b"a") == [b"a"]
     plant.start()
     plant.actuate((3.0, 3.0))
-    assert stand.voltages == (0.0, 0.0)
+    assert stand.voltages == other.voltages != (0.0, 0.0)  # nor does the wait use up random numbers
+    assert stand.voltages[1] == 0.0
     assert missing(plant.measure().rate)
     plant.advance()
-    plant.start()
+    plant.start()  # a second call does nothing
     plant.advance()
     assert plant.time == 0.2
 
 
-def test_the_time_waited_for_a_start_changes_no_random_number() -> None:
-    def run(waited: int) -> list[float]:
-        plant, stand = faulty("rate:noise=1", started=False)
-        for _ in range(waited):
-            plant.advance()
-        plant.start()
-        stand.k = 0
-        seen = []
-        for _ in range(5):
-            plant.advance()
-            seen.append(plant.measure().rate[0])
-        return seen
-
-    assert run(0) == run(7)
+# ── injection ──
 
 
-def test_an_injected_fault_counts_from_now() -> None:
+def test_what_is_injected_counts_from_now_and_holds_what_it_has_now() -> None:
+    plant, stand = faulty()
+    seen = []
+    for k in range(1, 9):
+        if k == 4:
+            inject(plant, "motor1:delay=0.2", "motor2:stuck", "rate.x:delay=0.2", "rate.y:stuck", "rate.z:off@0.2..0.3")
+        plant.actuate((1.0 * k, -1.0 * k))
+        plant.advance()
+        seen.append(plant.measure())
+    assert stand.periods == [(1, -1), (2, -2), (3, -3), (3, -3), (3, -3), (4, -3), (5, -3), (6, -3)]
+    known = [m.rate for m in seen if not missing(m.rate)]
+    assert [rate[0] for rate in known] == [1, 2, 3, 3, 4, 5, 6]
+    assert [rate[1] for rate in known] == [10, 20, 30, 30, 30, 30, 30]
+    assert [k for k, m in enumerate(seen, 1) if missing(m.rate)] == [5]
+    assert [m.attitude for m in seen] == [sample(k).attitude for k in range(1, 9)]
+
+
+def test_an_injected_fault_begins_at_the_tick_that_its_decimals_mean() -> None:
+    """In floats, 0.1 + 0.2 > 0.3."""
     plant, _ = faulty()
-    seen = []
-    for k in range(10):
-        if k == 4:
-            plant.inject(Fault.parse("rate:off@0.2..0.4"))
+    plant.advance()
+    inject(plant, "rate:off@0.2")
+    plant.advance()
+    assert not missing(plant.measure().rate)
+    plant.advance()
+    assert missing(plant.measure().rate)
+
+
+def test_motors_fail_and_recover_under_a_held_voltage_and_one_stuck_at_once_keeps_what_it_had() -> None:
+    plant, stand = faulty("motor1:off@0.3..0.6", "motor2:stuck", started=False)
+    plant.actuate((5.0, 4.0))
+    plant.start()
+    plant.actuate((5.0, 9.0))
+    for _ in range(8):
         plant.advance()
-        seen.append(missing(plant.measure().rate))
-    assert seen == [t in (6, 7) for t in range(1, 11)]
+    assert stand.periods == [(5, 4)] * 3 + [(0, 4)] * 3 + [(5, 4)] * 2
 
 
-def test_what_gets_stuck_now_holds_what_it_has_now() -> None:
-    plant, stand = faulty()
-    for k in range(1, 4):
-        plant.actuate((1.0 * k, 2.0 * k))
+def test_a_sample_is_taken_once_a_period_and_history_is_kept_however_often_it_is_read() -> None:
+    plant, _ = faulty("rate:delay=0.2", "attitude:noise=1")
+    for _ in range(5):
         plant.advance()
-        plant.measure()
-    for text in ("motor1:stuck", "rate:stuck", "attitude:stuck"):
-        plant.inject(Fault.parse(text))
-    plant.actuate((9.0, 9.0))
+    once = plant.measure()
+    assert once.rate == sample(3).rate
+    assert plant.measure() is once
     plant.advance()
-    assert stand.voltages == (3.0, 9.0)
-    assert plant.measure() == sample(3)
+    assert plant.measure() != once
 
 
-def test_what_is_late_from_now_on_is_what_it_is_now_until_the_delay_is_over() -> None:
-    plant, stand = faulty()
-    seen = []
-    for k in range(1, 8):
-        if k == 4:
-            plant.inject(Fault.parse("motor1:delay=0.2"))
-            plant.inject(Fault.parse("rate.x:delay=0.2"))
-        plant.actuate((1.0 * k, 0.0))
-        plant.advance()
-        seen.append(plant.measure().rate[0])
-    assert [u[0] for u in stand.periods] == [1, 2, 3, 3, 3, 4, 5]
-    assert seen == [1, 2, 3, 3, 3, 4, 5]
+def test_of_faults_that_cannot_be_none_is_injected() -> None:
+    plant, _ = faulty("rate:off")
+    with pytest.raises(FaultError, match=r"^fault 'motor3:off@2': the plant has no motor3, but motor1, motor2$"):
+        inject(plant, "rate:off", "motor3:off@2", clear=True)
+    with pytest.raises(FaultError, match="op inject --clear"):
+        inject(plant, *["rate:off"] * MAX_FAULTS)
+    assert len(plant.statuses(0)) == 1
+    three, stand = faulty("motor3:off", actuators=3)
+    three.actuate((1.0, 2.0, 3.0))
+    assert stand.voltages == (1.0, 2.0, 0.0)
 
 
-@pytest.mark.parametrize("text", ["motor1:bias=1@0..0.2", "rate:bias=1@0..0.2", "attitude:bias=1@0..0.2"])
-def test_a_fault_that_is_over_is_forgotten(text: str) -> None:
-    """A plant that receives faults for days must not look through all of them at every tick."""
-    fault = Fault.parse(text)
-    plant, _ = faulty(fault)
-    kept = ref(fault)
-    del fault
+def test_faults_that_are_over_make_room() -> None:
+    """A plant that receives faults for days keeps a bounded number of them."""
+    plant, _ = faulty(*["command:off@0..0.1"] * MAX_FAULTS)
+    plant.transitions()
     plant.advance()
-    assert kept() is not None
-    plant.advance()
-    plant.advance()
-    assert kept() is None
+    plant.transitions()
+    inject(plant, *["rate:off"] * (MAX_FAULTS - 1))
+    assert [status.source for status in plant.statuses(0)] == ["configured"] + ["injected"] * (MAX_FAULTS - 1)
 
 
-def test_once_cleared_sensors_and_motors_act_as_without_faults() -> None:
-    plant, stand = faulty("rate:off", "attitude:off", "motors:off")
+def test_once_cleared_the_plant_is_as_without_faults_and_what_was_to_come_never_begins() -> None:
+    plant, stand = faulty("rate:off", "attitude:off", "motors:off", "command:delay=0.1", "rate:off@9")
+    plant.transitions()
     plant.actuate((5.0, 5.0))
     plant.advance()
-    assert stand.voltages == (0.0, 0.0)
-    plant.clear()
+    assert plant.passes("command", b"a") == []
+    ends = inject(plant, clear=True)
+    assert [tick for tick, _ in ends] == [1] * 4
+    assert ends[3][1] == "fault ends (configured): command:delay=0.1, 1 commands delayed"
     assert stand.voltages == (5.0, 5.0)
     plant.advance()
     assert plant.measure() == sample(2)
+    assert plant.passes("command", b"b") == [b"b"]
+    assert [(status.begin_tick, status.end_tick) for status in plant.statuses(10)] == [(10, 11)] * 4
+
+
+def test_frames_are_of_one_direction_and_those_held_back_are_lost_with_their_session() -> None:
+    plant, _ = faulty("command:delay=0.1", "measurement:off@0.2")
+    assert plant.passes("command", b"a") == []
+    plant.forget_frames()
+    plant.advance()
+    assert plant.passes("command", b"b") == []
+    assert plant.passes("measurement", b"m") == [b"m"]
+    plant.advance()
+    assert plant.passes("command", None) == [b"b"]
+    assert plant.passes("measurement", b"m") == []
+    inject(plant, "command:stuck", clear=True)
+    assert plant.passes("command", b"c") == [b"b"]  # the frame that passed last
 
 
 @pytest.mark.parametrize("fault", ["motors:bias=3", "motors:stuck@0.1", "motors:garble=1", "motors:delay=1"])
@@ -133,49 +190,37 @@ def test_it_is_closed_at_no_voltage_whatever_its_faults_even_one_that_comes_too_
         plant.actuate((5.0, 5.0))
         plant.advance()
     assert stand.voltages != (0.0, 0.0) or "delay" in fault
-    too_late = Fault.parse("motor1:off")
-    for step in (plant.close, plant.close, plant.clear, partial(plant.inject, too_late), plant.advance):
-        step()
+    plant.close()
+    plant.close()
+    assert stand.voltages == (0.0, 0.0)
+    for clear in (True, False):
+        inject(plant, "motor1:off", clear=clear)
+        plant.advance()
         assert stand.voltages == (0.0, 0.0)
 
 
-def test_an_endpoint_trips_when_its_sensors_fail() -> None:
-    """0.1 s are 50 ticks of 2 ms."""
-    wire, period_ns = WireSpec(), 2_000_000
-    plant, still = faulty("rate:off@0.2", started=False, period=0.002)
-    guard = LimitMonitor(LimitSettings(max_rate=1e9, max_invalid_s=0.1), period_ns, LIMIT)
-    endpoint = Endpoint(plant, wire, period_ns, limits=guard, armed=True)
-    claim = Claim(controller="a", session="a", period_ns=period_ns, lockstep=False, auto_arm=False, wire=wire)
-    assert isinstance(endpoint.claim(claim), Grant)
-    plant.start()
-    endpoint.tick(None, 0)
-    k = 0
-    while endpoint.state in (PlantState.GRANTED, PlantState.DRIVEN):
-        endpoint.tick(wire.command.pack(endpoint.counter, [1, 1]), k := k + 1)
-        assert k < 1000
-    assert endpoint.cause is not None
-    assert "no valid value" in endpoint.cause
-    assert k == 100 + 50
-    assert still.voltages == (0.0, 0.0)
-
-
-RANDOM = ("attitude:noise=0.1", "attitude:garble=0.3", "rate:noise=0.1", "rate.x:garble=0.3", "rate:drop=0.3")
+# ── random numbers ──
 
 
 def test_the_same_seed_fails_the_same_way_and_another_otherwise() -> None:
+    sensors = ("attitude:noise=0.1", "attitude:garble=0.3", "rate:noise=0.1", "rate.x:garble=0.3", "rate:drop=0.3")
+
     def all_of(seed: int) -> list[str]:
-        seen = sensed(*RANDOM, ticks=50, seed=seed)
+        seen = sensed(*sensors, ticks=50, seed=seed)
         motors = driven("motors:noise=1", "motor1:garble=0.3", "motors:drop=0.3", ticks=50, seed=seed)
-        stream = [
-            passed(f"command:{kind}=0.5", frames=numbered(50), seed=seed)
-            for kind in ("drop", "garble", "duplicate", "reorder")
-        ]
-        return [repr(part) for part in (seen, motors, *stream)]
+        kinds = ("drop", "garble", "duplicate", "reorder")
+        streams = [passed(f"command:{kind}=0.5", frames=numbered(50), seed=seed) for kind in kinds]
+        return [repr(part) for part in (seen, motors, *streams)]
 
     assert all_of(3) == all_of(3)
     assert all(one != other for one, other in zip(all_of(3), all_of(4), strict=True))
 
 
-def test_one_more_fault_leaves_the_random_numbers_of_the_others() -> None:
+def test_one_more_fault_leaves_the_random_numbers_of_the_others_and_has_its_own() -> None:
     alone = [m.rate for m in sensed("rate:noise=0.1")]
     assert [m.rate for m in sensed("rate:noise=0.1", "attitude:garble=0.5")] == alone
+    twice = [m.rate[0] - k for k, m in enumerate(sensed("rate:noise=0.1", "rate:noise=0.1"))]
+    assert twice != pytest.approx([2 * (rate[0] - k) for k, rate in enumerate(alone)])
+    plant, _ = faulty("command:drop=0.5", "measurement:drop=0.5")
+    passes = [(plant.passes("command", b"a"), plant.passes("measurement", b"a")) for _ in range(100)]
+    assert any(command != measurement for command, measurement in passes)

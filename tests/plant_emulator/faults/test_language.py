@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeroloop.plant_emulator.faults.language import MAX_ANGLE, MAX_RATE, MAX_TIME_S, MAX_VOLTS, SIGNALS, Fault
+from aeroloop.plant_emulator.faults.language import KINDS, MAX_DELAY_S, MAX_TIME_S, SIGNALS, Fault, FaultError
 
 
 @pytest.mark.parametrize(
@@ -17,8 +17,6 @@ from aeroloop.plant_emulator.faults.language import MAX_ANGLE, MAX_RATE, MAX_TIM
     [
         ("attitude:off@5", Fault(signal="attitude", kind="off", start_s=5.0)),
         ("rate.y:bias=0.1@2..4", Fault(signal="rate.y", kind="bias", value=0.1, start_s=2.0, end_s=4.0)),
-        ("motor2:stuck@3", Fault(signal="motor2", kind="stuck", start_s=3.0)),
-        ("command:drop=0.05@1", Fault(signal="command", kind="drop", value=0.05, start_s=1.0)),
         ("command:delay=0.02@0..10", Fault(signal="command", kind="delay", value=0.02, end_s=10.0)),
         ("measurement:garble=0.1", Fault(signal="measurement", kind="garble", value=0.1)),
         (" motors:bias=-1e-3@1.5..2 ", Fault(signal="motors", kind="bias", value=-0.001, start_s=1.5, end_s=2.0)),
@@ -33,25 +31,19 @@ def test_a_fault_is_read_as_it_is_written(text: str, fault: Fault) -> None:
     ("text", "wrong", "right"),
     [
         ("attitude", "it is written", "signal:kind[=value][@start[..end]]"),
-        ("", "it is written", "attitude:off@5"),
         ("altitude:off", "no signal 'altitude'", "attitude, attitude.x"),
         ("attitude:of", "takes no 'of'", "off, stuck, bias, noise, delay, drop and garble"),
         ("attitude.x:stuck", "attitude.x takes no 'stuck'", "off, bias, noise and drop; attitude as a whole does"),
         ("command:bias=1", "command takes no 'bias'", "off, stuck, delay, drop, garble, duplicate and reorder"),
-        ("rate:duplicate=1", "rate takes no 'duplicate'", "drop and garble"),
         ("attitude:off=1", "off takes no value, but was given 1", "write off alone"),
         ("rate:bias", "bias takes -35 to 35 rad/s", "bias=0.1"),
-        ("rate:bias=nan", "not nan", "-35 to 35 rad/s"),
         ("attitude.x:bias=-3.2", "not -3.2", "-3.1416 to 3.1416 rad"),
         ("motors:bias=1e308", "not 1e+308", "-48 to 48 V"),
-        ("rate:noise=inf", "not inf", "0 to 35 rad/s"),
         ("rate:noise=-1", "not -1", "0 to 35 rad/s"),
         ("rate:delay=10.5", "not 10.5", "0 to 10 s"),
         ("rate:drop=0", "not 0", "a probability above 0 and up to 1"),
-        ("rate:garble=1.01", "not 1.01", "a probability above 0 and up to 1"),
         ("rate:bias=much", "'much' is not a number", ""),
         ("rate:off@soon", "'soon' is not a number", ""),
-        ("rate:off@-1", "not at -1 s", "within 0 to 1e+08 s"),
         ("rate:off@nan", "not at nan s", "within 0 to 1e+08 s"),
         ("rate:off@4..2", "not at 2 s", "after it begins at 4 s"),
         ("rate:off@4..1e9", "not at 1000000000 s", "by 1e+08 s"),
@@ -61,31 +53,20 @@ def test_a_fault_is_read_as_it_is_written(text: str, fault: Fault) -> None:
 def test_what_is_no_fault_is_refused_in_a_line_that_names_it_and_what_would_be_one(
     text: str, wrong: str, right: str
 ) -> None:
-    with pytest.raises(ValueError, match="fault") as refused:
+    with pytest.raises(FaultError) as refused:
         Fault.parse(text)
     line = str(refused.value)
-    assert type(refused.value) is ValueError
     assert line.startswith(f"fault {text!r}: ")
     assert "\n" not in line
     assert wrong in line
     assert right in line
 
 
-def test_fields_are_held_to_the_same_rules_as_texts() -> None:
-    with pytest.raises(ValueError, match="rate takes no 'reorder'"):
-        Fault(signal="rate", kind="reorder", value=0.5)
-    with pytest.raises(ValueError, match="bias takes -35 to 35 rad/s"):
-        Fault(signal="rate", kind="bias")
-
-
 def range_of(signal: str, kind: str) -> tuple[float, float] | None:
     """Least and largest value; None for a kind without one."""
-    if kind in ("off", "stuck"):
-        return None
-    if kind in ("bias", "noise"):
-        size = {"attitude": MAX_ANGLE, "rate": MAX_RATE, "motors": MAX_VOLTS}[SIGNALS[signal].whole]
-        return -size if kind == "bias" else 0.0, size
-    return (0.0, 10.0) if kind == "delay" else (ulp(0.0), 1.0)
+    largest = SIGNALS[signal].largest
+    ranges = {"bias": (-largest, largest), "deviation": (0.0, largest), "delay": (0.0, MAX_DELAY_S), "nothing": None}
+    return ranges.get(KINDS[kind].takes, (ulp(0.0), 1.0))
 
 
 @st.composite
@@ -100,12 +81,8 @@ def any_fault(draw: st.DrawFn) -> Fault:
 
 
 @given(fault=any_fault())
-def test_what_is_written_reads_back_the_same(fault: Fault) -> None:
+def test_a_fault_reads_back_the_same_and_just_beyond_its_ranges_is_none(fault: Fault) -> None:
     assert Fault.parse(str(fault)) == fault
-
-
-@given(fault=any_fault())
-def test_a_value_or_a_time_just_beyond_its_range_is_refused(fault: Fault) -> None:
     within, start = range_of(fault.signal, fault.kind), fault.start_s
     values = [0.0, 1.0] if within is None else [None, nan, nextafter(within[0], -inf), nextafter(within[1], inf)]
     wrong: list[tuple[str, float | None]] = [("value", value) for value in values]
@@ -121,7 +98,7 @@ def test_any_text_is_a_fault_or_one_line_that_states_why_not(text: str) -> None:
     reason = ""
     try:
         fault = Fault.parse(text)
-    except ValueError as error:
+    except FaultError as error:
         reason = str(error)
     if reason:
         assert reason.startswith(f"fault {text!r}: ")

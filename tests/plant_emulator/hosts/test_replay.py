@@ -219,33 +219,22 @@ def test_batches_that_come_again_are_passed_over() -> None:
     assert replayed(loop, wire, plant, again) == replayed(loop, wire, plant, batches)
 
 
-def test_it_stops_where_rows_are_missing_and_reports_where() -> None:
+def test_it_stops_with_the_reason_where_it_cannot_follow() -> None:
     loop, wire, batches = undisturbed()
     with_rows = [i for i, batch in enumerate(batches) if batch.header.rows]
-    del batches[with_rows[1]]
-    result = replayed(loop, wire, PLANT, batches)
-    assert (result.ticks, result.differ) == (256, 0)
-    assert result.stopped == "256 rows are missing after row 255 of the plant"
-
-
-def test_it_does_not_begin_without_the_first_row_or_the_claim() -> None:
-    loop, wire, batches = undisturbed()
-    with_rows = [i for i, batch in enumerate(batches) if batch.header.rows]
-    late = replayed(loop, wire, PLANT, batches[with_rows[1] :])
-    assert (late.ticks, late.stopped) == (0, "the log lacks the plant's first row, so the plant's state is not known")
-    unclaimed = replayed(loop, wire, PLANT, batches[with_rows[0] :])
-    assert (unclaimed.ticks, unclaimed.stopped) == (0, "tick 1 is in a session whose claim is missing")
-    assert replayed(loop, wire, PLANT, []).stopped == "the log has no trace of the plant"
-
-
-def test_another_process_and_another_wire_are_not_followed() -> None:
-    loop, wire, batches = undisturbed()
-    batches.append(batches[0]._replace(header=batches[0].header._replace(run=1)))
-    assert replayed(loop, wire, PLANT, batches).stopped == "the plant was started again"
+    second, other = with_rows[1], batches[0]._replace(header=batches[0].header._replace(run=1))
     wider = WireSpec().with_bits(10, 10)
-    assert (
-        replayed(loop, wider, PLANT, batches).stopped == "the rows are not of the wire that the description describes"
+    stops = (
+        (wire, batches[:second] + batches[second + 1 :], 256, "256 rows are missing after row 255 of the plant"),
+        (wire, batches[second:], 0, "the log lacks the plant's first row, so the plant's state is not known"),
+        (wire, batches[with_rows[0] :], 0, "tick 1 is in a session whose claim is missing"),
+        (wire, [], 0, "the log has no trace of the plant"),
+        (wire, [*batches, other], 600, "the plant was started again"),
+        (wider, batches, 0, "the rows are not of the wire that the description describes"),
     )
+    for its_wire, fed, ticks, reason in stops:
+        result = replayed(loop, its_wire, PLANT, fed)
+        assert (result.ticks, result.differ, result.stopped) == (ticks, 0, reason)
 
 
 @pytest.mark.parametrize("via", ["can", "quanser"])

@@ -1,19 +1,26 @@
-"""The emulated plant: the pieces together, each one on and off, and settings that no plant has."""
+"""The emulated plant: rotors, friction and wind against closed solutions, each on and off, and all together."""
 
 from __future__ import annotations
 
-from math import cos, sin
+from collections.abc import Callable
+from math import asinh, cos, exp, sin, sinh
 
+import casadi as ca
 import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from aeroloop.plant_emulator.model.aero import AeroSettings, aero_dynamics
-from aeroloop.plant_emulator.model.emulated import EmulatedPlant
-from aeroloop.plant_emulator.model.rigid_body import RigidBody, RigidBodySettings
-from aeroloop.plant_emulator.model.rotor import RotorSettings
-from aeroloop.plant_emulator.model.sensors import Sensors
-from aeroloop.plant_emulator.model.wind import Wind, WindSettings
+from aeroloop.plant_emulator.model.aero import Aero, AeroSettings, aero_dynamics
+from aeroloop.plant_emulator.model.emulated import (
+    FrictionSettings,
+    RotorSettings,
+    friction_torque,
+    rotor_derivative,
+    step_function,
+    thrust_voltage,
+)
+from aeroloop.plant_emulator.model.rigid_body import RigidBodySettings
+from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.plant import Measurement, State
 from aeroloop.plant_emulator.settings import IDEAL_AERO, IDEAL_FRICTION, IDEAL_ROTOR, IDEAL_SENSORS, PlantSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
@@ -26,8 +33,144 @@ BARE = PlantSettings(rotor=IDEAL_ROTOR, friction=IDEAL_FRICTION, sensors=IDEAL_S
 """The Aero with every piece off: no lag, no friction, calm, perfect sensors."""
 
 
-def _with(settings: PlantSettings = BARE, **sections: BaseModel) -> PlantSettings:
+def _with(settings: PlantSettings = BARE, **sections: object) -> PlantSettings:
     return settings.model_copy(update=sections)
+
+
+# ── rotors ──
+
+
+UP, DOWN = 0.1, 0.3
+ROTOR = RotorSettings(lag_up_s=UP, lag_down_s=DOWN)
+
+
+@pytest.mark.parametrize(
+    ("start", "command", "lag"),
+    [(0, 10, UP), (10, 20, UP), (0, -10, UP), (10, 0, DOWN), (20, 10, DOWN), (-10, 0, DOWN), (7, 7, UP)],
+)
+def test_a_rotor_follows_with_the_time_constant_of_the_direction(start: float, command: float, lag: float) -> None:
+    """Up is where |thrust| rises, whichever its sign: V(t) = V∞ + (V₀ − V∞) exp(−t/τ)."""
+    step = step_function(Aero(WEIGHTLESS), ROTOR, IDEAL_FRICTION, PERIOD, 2)
+    x = ca.DM([0.0, 0.0, 0.0, 0.0, 0.0, start])
+    for periods in range(1, 251):
+        x = step(x, [0.0, command], [0.0, 0.0])[0]
+        expected = command + (start - command) * exp(-periods * PERIOD / lag)
+        # fourth order, exact but for (h/τ)⁵/120 a step of h = 1 ms: 1e-12 of it, 500 times, of 10 V
+        assert float(x[5]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_rotor_that_reverses_falls_with_the_down_lag_before_it_rises_with_the_up_lag() -> None:
+    falling, rising, from_rest = (float(rotor_derivative(ROTOR, ca.SX(v), ca.SX(-10.0))) for v in (5.0, -1.0, 0.0))
+    assert [falling, rising, from_rest] == pytest.approx([-15 / DOWN, -9 / UP, -10 / UP], rel=1e-15)
+
+
+def test_thrust_lags_behind_the_voltage_and_begins_beyond_the_dead_zone() -> None:
+    """A weightless body's rate is the integral of the thrust: B V/J (t − τ (1 − exp(−t/τ))).
+
+    With a dead zone of 5 V, thrust begins τ ln(10/(10 − 5)) after a step to 10 V.
+    """
+    plant = _with(aero=WEIGHTLESS, rotor=ROTOR).build(PERIOD)
+    plant.actuate((20.0, 0.0))
+    for periods in range(1, 301):
+        plant.advance()
+        t = periods * PERIOD
+        expected = 0.001 * 20.0 / WEIGHTLESS.inertia[1] * (t - UP * (1 - exp(-t / UP)))
+        # as above, (h/τ)⁵/120 a step; the first period's rate is itself only (t/τ)/2 of what it would be at once
+        assert plant.truth().rate[1] == pytest.approx(expected, rel=1e-8)
+    assert plant.truth().voltages == (20.0, 0.0)  # the truth holds the voltage at the motor, not the thrust
+
+    plant = _with(aero=WEIGHTLESS, rotor=ROTOR.model_copy(update={"dead_zone_v": 5.0})).build(PERIOD)
+    plant.actuate((10.0, 0.0))
+    periods = 0
+    while plant.truth().rate[1] == 0.0 and periods < 1000:
+        plant.advance()
+        periods += 1
+    assert (periods - 1) * PERIOD <= UP * np.log(2) <= periods * PERIOD
+
+
+def test_a_dead_zone_takes_its_width_away_from_the_voltage() -> None:
+    v = ca.SX.sym("v")
+    zone, none = (ca.Function("f", [v], [thrust_voltage(RotorSettings(dead_zone_v=size), v)]) for size in (2.5, 0.0))
+    for voltage, left in ((0.0, 0.0), (2.5, 0.0), (-2.5, 0.0), (1.0, 0.0), (3.0, 0.5), (-3.0, -0.5), (24.0, 21.5)):
+        assert (float(zone(voltage)), float(none(voltage))) == (left, voltage)
+
+
+# ── friction ──
+
+
+FRICTION = FrictionSettings(viscous=(0.02, 0.03, 0.04), coulomb=(0.001, 0.002, 0.003), width=0.01)
+
+
+def _friction(settings: FrictionSettings, axes: int) -> Callable[[Array], Array]:
+    rates = ca.SX.sym("rates", axes)
+    function = ca.Function("friction", [rates], [friction_torque(settings, rates)])
+    return lambda values: np.array(function(values), dtype=np.float64).ravel()
+
+
+def test_viscous_friction_is_in_proportion_to_the_rate_and_coulomb_friction_constant_against_it() -> None:
+    torque = _friction(FRICTION.model_copy(update={"coulomb": ()}), 3)
+    for rates in (np.array([1.0, -2.0, 3.0]), np.array([1e-3, 0.0, -1e-5])):
+        assert torque(rates).tolist() == (-np.array(FRICTION.viscous) * rates).tolist()
+    torque = _friction(FRICTION.model_copy(update={"viscous": ()}), 3)
+    c = np.array(FRICTION.coulomb)
+    assert torque(np.array([0.2, 5.0, 100.0])).tolist() == (-c).tolist()  # 1 − tanh(20) is 8.5e-18: nothing in floats
+    assert torque(np.array([-0.2, -5.0, -100.0])).tolist() == c.tolist()
+    # tanh(½ ln 3) is ½; some operations of 1e-16
+    assert torque(np.full(3, FRICTION.width * np.log(3) / 2)) == pytest.approx(-c / 2, rel=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["viscous", "coulomb"])
+def test_missing_axes_have_no_friction(kind: str) -> None:
+    off = {"viscous": (), "coulomb": ()}
+    torque = _friction(FrictionSettings.model_validate(off | {kind: (0.1,)}), 3)(np.ones(3))
+    assert torque.tolist() == [-0.1, 0.0, 0.0]
+    two = _friction(FrictionSettings.model_validate(off | {kind: (0.1, 0.2, 0.3)}), 2)(np.ones(2))
+    assert two.tolist() == [-0.1, -0.2]  # nor does one too many do any harm
+
+
+@pytest.mark.parametrize("rate", [0.5, -0.5])
+def test_an_axis_slides_down_and_comes_to_rest(rate: float) -> None:
+    """ω̇ = −(c/J) tanh(ω/w) has the solution sinh(ω/w) = sinh(ω₀/w) exp(−c t/(J w))."""
+    c, width, inertia = 0.003, 0.01, 0.02
+    body = RigidBodySettings(inertia=(inertia,) * 3, damping=(0.0, 0.0, 0.0), rate=(0.0, 0.0, rate))
+    friction = FrictionSettings(viscous=(), coulomb=(0.0, 0.0, c), width=width)
+    plant = _with(kind="rigid_body", rigid_body=body, friction=friction).build(PERIOD)
+    stop = abs(rate) * inertia / c  # where a Coulomb torque that does not turn over would have brought it to rest
+    for periods in range(1, round(1.5 * stop / PERIOD)):
+        plant.advance()
+        expected = width * asinh(sinh(rate / width) * exp(-c / (inertia * width) * periods * PERIOD))
+        # (h c/(J w))⁵/120 = 6e-12 of the width a step while it turns over, some 100 steps; rounding of 1e-16·periods
+        assert plant.truth().rate[2] == pytest.approx(expected, abs=1e-11)
+    # By then sinh(ω/w) is ½ exp(ω₀/w − 1.5 ω₀/w): at rest but for 1e-11 of the width.
+    assert abs(plant.truth().rate[2]) < width * exp(-0.5 * abs(rate) / width)
+
+
+# ── supply, start and end ──
+
+
+@pytest.mark.parametrize(("commanded", "held"), [((30.0, -1e9), (24.0, -24.0)), ((-24.5, 23.5), (-24.0, 23.5))])
+def test_voltages_are_clipped_to_the_supply(commanded: tuple[float, float], held: tuple[float, float]) -> None:
+    plant, other = BARE.build(PERIOD), BARE.build(PERIOD)
+    plant.actuate(commanded)
+    other.actuate(held)
+    for _ in range(10):
+        plant.advance()
+        other.advance()
+    assert plant.truth().voltages == held
+    assert plant.truth() == other.truth()
+
+
+def test_it_starts_level_at_rest_and_stays_there_without_voltage_as_when_closed() -> None:
+    plant = _with(aero=IDEAL_AERO).build(PERIOD)
+    level = (IDENTITY, (0.0, 0.0, 0.0))
+    assert plant.measure() == level
+    plant.actuate((10.0, -10.0))
+    plant.close()
+    plant.close()  # twice does no harm
+    for _ in range(1000):
+        plant.advance()
+    assert plant.truth() == (*level, (0.0, 0.0))
+    assert plant.measure() == level
 
 
 @pytest.mark.parametrize(
@@ -48,9 +191,7 @@ def test_a_free_body_with_sensors_that_need_no_joints_is_built(rate: str) -> Non
     settings = PlantSettings.model_validate(
         {"kind": "rigid_body", "sensors": {"attitude": "perfect", "rate": rate}, "rigid_body": {"rate": (1, 2, 3)}}
     )
-    plant = settings.build(PERIOD)
-    assert plant.actuators == 3
-    assert plant.measure() == (IDENTITY, (1.0, 2.0, 3.0))
+    assert settings.build(PERIOD).measure() == (IDENTITY, (1.0, 2.0, 3.0))
 
 
 @pytest.mark.parametrize(
@@ -67,8 +208,11 @@ def test_a_body_that_cannot_be_is_refused(settings: dict[str, object], names: st
         PlantSettings.model_validate(settings)
 
 
-def _voltages(k: int) -> tuple[float, float]:
-    return 12 * sin(0.02 * k), 9 * cos(0.013 * k)
+# ── all together ──
+
+
+def _voltages(k: int) -> tuple[float, ...]:
+    return 12 * sin(0.02 * k), 9 * cos(0.013 * k), 5 * sin(0.05 * k)
 
 
 def _driven(settings: PlantSettings, periods: int = 300) -> list[tuple[State, Measurement]]:
@@ -76,7 +220,7 @@ def _driven(settings: PlantSettings, periods: int = 300) -> list[tuple[State, Me
     plant = settings.build(PERIOD)
     seen = []
     for k in range(periods):
-        plant.actuate(_voltages(k))
+        plant.actuate(_voltages(k)[: plant.actuators])
         plant.advance()
         seen.append((plant.truth(), plant.measure()))
     return seen
@@ -87,12 +231,12 @@ def test_with_every_piece_off_the_plant_is_the_bare_mechanism() -> None:
     p = AeroSettings(inertia=(0.02, 0.03, 0.04), damping=(0.01, 0.02, 0.03))
     dynamics = aero_dynamics(p)
 
-    def slope(x: Array, u: tuple[float, float]) -> Array:
+    def slope(x: Array, u: tuple[float, ...]) -> Array:
         return np.array(dynamics(x, u, np.zeros(2)), dtype=np.float64).ravel()
 
     x, h = np.zeros(4), PERIOD / BARE.substeps
     for k, (state, measured) in enumerate(_driven(_with(aero=p), 200)):
-        u = _voltages(k)
+        u = _voltages(k)[:2]
         for _ in range(BARE.substeps):
             a = slope(x, u)
             b = slope(x + h / 2 * a, u)
@@ -114,11 +258,14 @@ GUSTY = PlantSettings(wind=WindSettings(blowing=True, gust=0.5), rotor=RotorSett
 
 
 def test_two_plants_of_the_same_settings_move_alike_and_another_seed_changes_its_own_piece_only() -> None:
+    def other_seed(part: BaseModel) -> BaseModel:
+        return part.model_copy(update={"seed": 1})
+
     states, seen = zip(*_driven(GUSTY), strict=True)
     assert (states, seen) == tuple(zip(*_driven(GUSTY), strict=True))
-    blown, _ = zip(*_driven(_with(GUSTY, wind=GUSTY.wind.model_copy(update={"seed": 1}))), strict=True)
+    blown, _ = zip(*_driven(_with(GUSTY, wind=other_seed(GUSTY.wind))), strict=True)
     assert all(one.attitude != other.attitude for one, other in zip(states, blown, strict=True))
-    same, otherwise = zip(*_driven(_with(GUSTY, sensors=GUSTY.sensors.model_copy(update={"seed": 1}))), strict=True)
+    same, otherwise = zip(*_driven(_with(GUSTY, sensors=other_seed(GUSTY.sensors))), strict=True)
     assert same == states
     assert otherwise != seen
 
@@ -135,27 +282,7 @@ def test_wind_is_a_torque_about_the_axes() -> None:
     assert plant.truth().rate[2] == pytest.approx(0.01 * 0.2 / 0.05, rel=1e-12)
 
 
-def test_the_ideal_plant_has_no_piece_whatever_is_set() -> None:
-    ideal = GUSTY.model_copy(update={"ideal": True, "aero": WEIGHTLESS})
-    assert _driven(ideal) == _driven(_with(aero=IDEAL_AERO))
-
-
-def test_the_ideal_free_body_keeps_its_own_body() -> None:
-    body = RigidBodySettings(inertia=(0.01, 0.02, 0.03), rate=(1.0, 2.0, 3.0))
-    ideal = GUSTY.model_copy(update={"kind": "rigid_body", "rigid_body": body, "ideal": True}).build(PERIOD)
-    bare = EmulatedPlant(
-        RigidBody(body),
-        IDEAL_ROTOR,
-        IDEAL_FRICTION,
-        Wind(WindSettings(), 3, PERIOD),
-        Sensors(IDEAL_SENSORS, PERIOD),
-        period=PERIOD,
-        voltage_limit=24.0,
-        substeps=2,
-    )
-    for plant in (ideal, bare):
-        plant.actuate((1.0, -2.0, 3.0))
-        for _ in range(100):
-            plant.advance()
-    assert ideal.truth() == bare.truth()
-    assert ideal.measure() == (ideal.truth().attitude, ideal.truth().rate)
+def test_the_ideal_plant_has_no_piece_whatever_is_set_and_a_free_one_keeps_its_own_body() -> None:
+    assert _driven(_with(GUSTY, ideal=True, aero=WEIGHTLESS)) == _driven(_with(aero=IDEAL_AERO))
+    free = {"kind": "rigid_body", "rigid_body": RigidBodySettings(inertia=(0.01, 0.02, 0.03), rate=(1.0, 2.0, 3.0))}
+    assert _driven(_with(GUSTY, ideal=True, **free)) == _driven(_with(**free))

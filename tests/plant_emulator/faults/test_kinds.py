@@ -1,17 +1,19 @@
-"""Faults of sensors and motors: each acts as specified, when specified, in its own components only."""
+"""Kinds of faults: each acts on values and frames as specified, when specified, in its own components only."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import chain
 from math import cos, hypot, nan, sin, sqrt
 from statistics import fmean, pstdev
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from aeroloop.plant_emulator.faults.injection import GARBLED_RATE
-from aeroloop.plant_emulator.faults.language import Fault
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector
-from tests.support.faulty_plant import LIMIT, driven, faulty, missing, sample, sensed
+from tests.support.faulty_plant import LIMIT, driven, missing, numbered, passed, sample, sensed
 
 MANY = 10_000
 GONE = nan, nan, nan
@@ -148,38 +150,19 @@ def test_a_fifth_of_the_values_fails_when_configured_so_and_the_others_are_true(
     assert abs(sum(failed) - 2000) <= 200
 
 
-def test_garbled_attitudes_are_unit_quaternions_of_every_kind() -> None:
-    """Each component of a uniform one has mean 0 and deviation 1/2: 5 standard errors."""
+def test_garbled_values_are_anywhere_within_their_range_and_no_others() -> None:
+    """Each component of an evenly distributed unit quaternion has mean 0 and deviation 1/2: 5 standard errors."""
     garbled = [m.attitude for m in sensed("attitude:garble=1", ticks=MANY - 1)]
     assert all(hypot(*q) == pytest.approx(1.0, abs=1e-12) for q in garbled)
     for component in zip(*garbled, strict=True):
         assert fmean(component) == pytest.approx(0.0, abs=5 * 0.5 / sqrt(MANY))
         assert pstdev(component) == pytest.approx(0.5, abs=0.02)
-
-
-def test_garbled_rates_and_motors_are_anywhere_within_their_range_and_no_others() -> None:
     rates = list(zip(*(m.rate for m in sensed("rate:garble=1", ticks=999)), strict=True))
     motors = driven("motor1:garble=1", ticks=1000)
     for limit, values in [*((GARBLED_RATE, rate) for rate in rates), (LIMIT, [u[0] for u in motors])]:
         assert -limit <= min(values) < -0.98 * limit
         assert 0.98 * limit < max(values) <= limit
     assert all(u[1] == -k for k, u in enumerate(motors))
-
-
-def test_history_that_is_asked_for_rarely_is_kept_all_the_same() -> None:
-    plant, _ = faulty("rate:delay=0.2")
-    for _ in range(5):
-        plant.advance()
-    assert plant.measure().rate == sample(3).rate
-
-
-def test_a_sample_is_taken_once_a_period_however_often_it_is_asked_for() -> None:
-    plant, _ = faulty("rate:noise=1")
-    plant.advance()
-    once = plant.measure()
-    assert plant.measure() is once
-    plant.advance()
-    assert plant.measure() != once
 
 
 # ── motors ──
@@ -201,33 +184,77 @@ def test_a_motor_fails_as_written(faults: list[str], voltages: Callable[[int], t
     assert driven(*faults) == [voltages(k) for k in range(8)]
 
 
-def test_a_motor_that_is_stuck_at_once_keeps_what_it_had_before_the_start() -> None:
-    plant, stand = faulty("motor1:stuck", started=False)
-    plant.actuate((5.0, 5.0))
-    plant.start()
-    plant.actuate((7.0, 7.0))
-    assert stand.voltages == (5.0, 7.0)
-
-
 def test_all_motors_are_lost_at_the_same_times() -> None:
     periods = driven("motors:drop=0.5", ticks=200)[1:]
     assert {(a == 0, b == 0) for a, b in periods} == {(True, True), (False, False)}
 
 
-def test_a_motor_fails_and_recovers_under_a_voltage_that_is_held() -> None:
-    plant, stand = faulty("motor1:off@0.3..0.6")
-    plant.actuate((5.0, 5.0))
-    for _ in range(8):
-        plant.advance()
-    assert stand.periods == [(5, 5)] * 3 + [(0, 5)] * 3 + [(5, 5)] * 2
+# ── frames ──
 
 
-def test_a_motor_that_is_not_there_cannot_fail() -> None:
-    with pytest.raises(ValueError, match=r"^fault 'motor3:off@2': the plant has no motor3, but motor1, motor2$"):
-        faulty("motor3:off@2")
-    plant, _ = faulty()
-    with pytest.raises(ValueError, match="no motor3"):
-        plant.inject(Fault.parse("motor3:off"))
-    three, stand = faulty("motor3:off", actuators=3)
-    three.actuate((1.0, 2.0, 3.0))
-    assert (three.actuators, stand.voltages) == (3, (1.0, 2.0, 0.0))
+@pytest.mark.parametrize(
+    ("faults", "frames", "ticks"),
+    [
+        ([], ["a", "", "b"], ["a", "", "b"]),
+        (["off@0.2..0.4"], "abcdef", ["a", "b", "", "", "e", "f"]),
+        (["stuck@0.2..0.5"], ["a", "b", "c", "", "e", "f"], ["a", "b", "b", "", "b", "f"]),
+        (["stuck"], "abc", ["a", "a", "a"]),
+        (["delay=0.2"], "abcde", ["", "", "a", "b", "c"]),
+        (["delay=0.05"], "abc", ["", "a", "b"]),
+        (["delay=0.2@0.1..0.4"], "abcdef", ["a", "", "", "b", "cde", "f"]),  # what is on its way comes at once, first
+        (["duplicate=1@0.1..0.3"], [*"abcd", ""], ["a", "b", "bc", "cd", ""]),
+        (["duplicate=1"], ["a", "", ""], ["a", "a", ""]),
+        (["reorder=1"], "abcd", ["", "ba", "", "dc"]),
+        (["reorder=1@0.1..0.2"], ["a", "b", "", "d", "e"], ["a", "", "", "db", "e"]),
+        (["duplicate=1", "delay=0.1"], ["a", "", ""], ["", "a", "a"]),  # one after another, in this order
+        (["delay=0.1", "off@0.1"], "abc", ["", "", ""]),
+    ],
+)
+def test_frames_pass_as_written(faults: list[str], frames: Sequence[str], ticks: list[str]) -> None:
+    seen = passed(*(f"command:{fault}" for fault in faults), frames=[frame.encode() or None for frame in frames])
+    assert [b"".join(tick).decode() for tick in seen] == ticks
+
+
+@given(delay_ms=st.integers(0, 30), start=st.integers(0, 40), length=st.integers(1, 40))
+def test_every_frame_passes_a_delay_once_and_in_order_and_none_too_late(delay_ms: int, start: int, length: int) -> None:
+    text = f"command:delay={delay_ms / 1000}@{start / 1000}..{(start + length) / 1000}"
+    frames = numbered(60)
+    ticks = passed(text, frames=[*frames, *[None] * 60], period=0.001)
+    assert list(chain(*ticks)) == frames
+    for k, tick in enumerate(ticks):
+        for frame in tick:
+            sent = int.from_bytes(frame, "big")
+            due = sent + delay_ms if start <= sent < start + length else sent
+            assert k == min(due, max(sent, start + length))
+
+
+@pytest.mark.parametrize("kind", ["drop", "garble", "duplicate", "reorder"])
+def test_a_fifth_of_the_frames_fails_and_the_others_pass_as_they_are(kind: str) -> None:
+    """Five binomial deviations of 40. Of n that could be held back, n·p/(1 + p) = 1667 change places."""
+    frames = numbered(MANY)
+    ticks = passed(f"command:{kind}=0.2@0..999.9", frames=frames)
+    whole = list(chain(*ticks))
+    if kind == "drop":
+        assert abs(sum(not tick for tick in ticks) - 2000) <= 200
+        assert all(tick in ([], [frame]) for tick, frame in zip(ticks, frames, strict=True))
+    elif kind == "garble":
+        assert abs(sum(tick != [frame] for tick, frame in zip(ticks, frames, strict=True)) - 2000) <= 200
+    elif kind == "duplicate":
+        assert abs(len(whole) - 12_000) <= 200
+        assert sorted(set(whole)) == frames
+    else:
+        assert sorted(whole) == frames  # nothing is lost or repeated
+        assert abs(sum(len(tick) == 2 for tick in ticks) - 1667) <= 200
+        assert all(tick[0] > tick[1] for tick in ticks if len(tick) == 2)
+
+
+def test_a_garbled_frame_differs_in_exactly_one_bit_and_in_any() -> None:
+    frame = bytes(range(3))
+    flips = set()
+    for (garbled,) in passed("command:garble=1", frames=[frame] * 500):
+        difference = int.from_bytes(garbled, "big") ^ int.from_bytes(frame, "big")
+        assert len(garbled) == 3
+        assert difference.bit_count() == 1
+        flips.add(difference)
+    assert len(flips) == 24  # that a bit is spared 500 times has probability (23/24)^500 = 6e-10
+    assert passed("command:garble=1", frames=[b""]) == [[b""]]
