@@ -22,7 +22,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
-from aeroloop.protocol.runtime.processes import listener
+from aeroloop.protocol.runtime.host import listener
 from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import POLL_S, SETTLE_S, VISIT_S, Visit, visit
 from aeroloop.protocol.transport.network_settings import NetworkSettings

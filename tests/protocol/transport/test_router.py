@@ -14,7 +14,7 @@ import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.network import join, visit
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
@@ -188,7 +188,7 @@ def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions:
          "security": {"directory": str(tmp_path), "vehicles": ["aero"]}}
     )  # fmt: skip
     names = ("router", "plant", "controller", "recorder")
-    roles = {name: open_sessions.enter_context(Role(name, "aero", network, {})) for name in names}
+    roles = {name: open_sessions.enter_context(Node(name, "aero", network, {})) for name in names}
     claims: list[bytes] = []
     key = topics.key("claim", "aero")
 
