@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field, model_validator
 from aeroloop.plant_emulator.plant import Measurement, Plant, State
 from aeroloop.protocol.plugins import PluginError
 from aeroloop.protocol.wire.attitude import Quaternion, Vector
-from aeroloop.protocol.wording import closest, either
+from aeroloop.protocol.wording import closest
 
 Name = Annotated[str, Field(min_length=1, max_length=500)]
 Names3 = tuple[str, str, str]
@@ -384,7 +384,7 @@ def _description(file: Path) -> Any:
         others = sorted({name.split("/")[1] for name in files if re.match("binaries/[^/]+/.", name)})
         sources = any(re.match(r"sources/.+\.c$", name) for name in files)
         remedy = f"`fmpy compile {file}` builds one from its sources" if sources else "export it on this platform"
-        raise FmuError(f"{file.name} has no binary for {platform}, only for {either(others or ['none'])}: {remedy}")
+        raise FmuError(f"{file.name} has no binary for {platform}, only for {' or '.join(others) or 'none'}: {remedy}")
     return description
 
 

@@ -171,10 +171,12 @@ class LastStatus:
         self._taken, self._status = now, status.model_copy(update={**self._known, "recent_skipped": recent})
         return self._status
 
-    def aged(self) -> Status | None:
+    def aged(self) -> bytes | None:
         """The last status with its age, which shows a loop that hangs; None before the first."""
+        if self._status is None:
+            return None
         age_s = round(self._clock.monotonic() - self._taken, 3)
-        return self._status and self._status.model_copy(update={"age_s": age_s})
+        return self._status.model_copy(update={"age_s": age_s}).encode()
 
 
 class Node:
@@ -222,7 +224,7 @@ class Node:
         self._started = clock.monotonic()
         self.publish_description(config)
         self._answer("description", lambda: self._description)
-        self._answer("status", lambda: (status := self._status.aged()) and status.encode())
+        self._answer("status", self._status.aged)
 
     def __enter__(self) -> Self:
         return self

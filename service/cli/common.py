@@ -192,9 +192,9 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
             raise
         if isinstance(error, AeroloopError):
             fail(str(error), 2)
-        from aeroloop.protocol.wording import problems
+        from aeroloop.protocol.wording import problem
 
-        fail(problems(error, *models)[0], 2)
+        fail(problem(error, *models), 2)
 
 
 def run_role(kind: str, settings: Settings, run: Callable[[Node], None], options: DaemonOptions) -> None:
