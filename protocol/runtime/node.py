@@ -69,15 +69,10 @@ def notify_systemd(state: str) -> None:
 
 
 def log_event(event: Event, vehicle: str | None) -> None:
-    """Log an event; `vehicle` is None where the process does not know its name.
-
-    The record's attributes are `event` (the kind), `role`, `vehicle`, `session` and `tick`, for formatters of keys.
-    """
-    log.log(
-        logging.WARNING if event.kind in _GRAVE else logging.INFO,
-        event.text,
-        extra={"event": event.kind, "vehicle": vehicle, **event.model_dump(include={"role", "session", "tick"})},
-    )
+    """Log an event, with `event` (its kind), `role`, `vehicle`, `session` and `tick` as attributes of the record."""
+    level = logging.WARNING if event.kind in _GRAVE else logging.INFO
+    fields = event.model_dump(include={"role", "session", "tick"})
+    log.log(level, event.text, extra={"event": event.kind, "vehicle": vehicle, **fields})
 
 
 class Requests:
@@ -94,23 +89,21 @@ class Requests:
 
         A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
         is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
-
-        Args:
-            topic: Name of a query in the table.
-            model: Model of the request; any other payload is answered by an Answer with the error.
-            prepare: Called with the request in a thread of the topic's, for work that takes time. The function that it
-                returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
+        `prepare` is called with the request in a thread of the topic's, for work that takes time; the function that it
+        returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
         """
         key = topics.key(topic, self._vehicle)
         name = key.rpartition("/")[2]
 
-        def reply(query: zenoh.Query, act: Callable[[], Message]) -> None:
-            try:
-                answer = act()
-            except AeroloopError as error:
-                answer = Answer(done=False, text=str(error))
+        def reply(query: zenoh.Query, answer: Message) -> None:
             query.reply(key, answer.encode())  # not the query's key, which may name many vehicles
             query.drop()
+
+        def act(query: zenoh.Query, action: Callable[[], Message]) -> None:
+            try:
+                reply(query, action())
+            except AeroloopError as error:
+                reply(query, Answer(done=False, text=str(error)))
 
         def received(query: zenoh.Query) -> None:
             payload = query.payload.to_bytes() if query.payload else b"{}"
@@ -123,10 +116,9 @@ class Requests:
                     raise intake.IntakeError(f"{WAITING} requests wait already; ask again")
                 action = prepare(self._read(topic, model, payload))
             except AeroloopError as error:
-                refusal = Answer(done=False, text=str(error))
-                reply(query, lambda: refusal)
+                reply(query, Answer(done=False, text=str(error)))
             else:
-                self._inbox.append(lambda: reply(query, action))
+                self._inbox.append(lambda: act(query, action))
 
         self._session.declare_queryable(key, received, complete=True)
 
@@ -157,8 +149,7 @@ class LastStatus:
     def __init__(self, process: str, certificate_until: Any, clock: Clock) -> None:
         self._known = {"process": process, "certificate_until": certificate_until}
         self._clock = clock
-        self._taken = 0.0
-        self._status: Status | None = None
+        self._last: tuple[float, Status] | None = None  # and when it was taken; another thread reads it
         self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
 
     def take(self, status: Status) -> Status:
@@ -168,15 +159,16 @@ class LastStatus:
         while now - skipped[0][0] > _RECENT_S:
             skipped.popleft()
         recent = status.skipped - skipped[0][1]
-        self._taken, self._status = now, status.model_copy(update={**self._known, "recent_skipped": recent})
-        return self._status
+        status = status.model_copy(update={**self._known, "recent_skipped": recent})
+        self._last = now, status
+        return status
 
     def aged(self) -> bytes | None:
         """The last status with its age, which shows a loop that hangs; None before the first."""
-        if self._status is None:
+        if self._last is None:
             return None
-        age_s = round(self._clock.monotonic() - self._taken, 3)
-        return self._status.model_copy(update={"age_s": age_s}).encode()
+        taken, status = self._last
+        return status.model_copy(update={"age_s": round(self._clock.monotonic() - taken, 3)}).encode()
 
 
 class Node:

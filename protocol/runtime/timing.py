@@ -130,15 +130,10 @@ class Histogram:
 
 
 class RollingHistogram:
-    """Histograms of all durations, and of those in the last ten seconds.
-
-    Attributes:
-        total: All durations.
-    """
+    """Histograms of all durations, `total`, and of those in the last ten seconds, in windows of a second."""
 
     WINDOWS: Final = 10
     SHORTEST_NS: Final = 900_000_000
-    """A window is of a second; reports come nearly so often."""
 
     def __init__(self, clock: Clock = time) -> None:
         self.total = Histogram()

@@ -196,7 +196,7 @@ def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions:
         claims.append(query.payload.to_bytes() if query.payload else b"")
         query.reply(key, b"granted")
 
-    roles["plant"].answer(key, answer)
+    roles["plant"].zenoh.declare_queryable(key, answer, complete=True)
     for each in roles.values():
         each.announce()
         each.status(Status(role=each.role, state="idle", uptime_s=0.0, ticks=0, rate_hz=0.0, skipped=0))
