@@ -77,6 +77,7 @@ def test_every_key_is_described_and_a_quantity_has_a_unit(key: str) -> None:
         ("rate_hz=1", "unknown key rate_hz: did you mean loop.rate_hz?"),
         ("law.c1=1", "unknown key law.c1: did you mean law.C1?"),
         ("plant.mass=1", "unknown key plant.mass: did you mean plant.aero.mass?"),
+        ("reference.pth=1", "unknown key reference.pth: did you mean reference.path?"),
         ("loop.zzz=1", "unknown key loop.zzz"),
         ("law.kp=1", "law.kp is no key of this kind"),
         ("law.C1=0.2", "law.C1: should be a list, not 0.2"),

@@ -97,7 +97,18 @@ def test_only_the_first_of_many_errors_is_put_into_words(monkeypatch: pytest.Mon
     assert searched == ["k0"]
 
 
-def test_an_unknown_key_of_any_length_is_shown_in_part() -> None:
+def test_an_unknown_key_of_any_length_is_shown_in_part_and_nothing_like_it_is_looked_for() -> None:
     with pytest.raises(IntakeError) as refused:
         read(Request, b'{"' + b"x" * 16_000 + b'":0}')
     assert len(str(refused.value)) < 200
+    assert wording.closest("x" * 200, ["x" * 201]) is None
+
+
+def test_what_a_stranger_sends_cannot_move_the_terminals_cursor() -> None:
+    for payload in (b'{"\\u001b[2J\\n": 0}', b'{"by": "\\u001b[2J\\n"}', b'{"by": {"\\u001b[2J\\n": 0}}'):
+        with pytest.raises(IntakeError) as refused:
+            read(Request, payload)
+        assert str(refused.value).isprintable()
+    with pytest.raises(IntakeError, match=r"reference\.kind: tag ' \[2J ' found") as refused:
+        read(Track, b'{"reference": {"kind": "\\u001b[2J\\n"}}')
+    assert str(refused.value).isprintable()
