@@ -103,5 +103,5 @@ def _json(value: object) -> str:
 
 def _line(text: str, length: int) -> str:
     """A text as one printable line, shortened."""
-    text = "".join(character if character.isprintable() else " " for character in text)
-    return text if len(text) <= length else f"{text[:length]}…"
+    shown = "".join(character if character.isprintable() else " " for character in text[:length])
+    return shown if len(text) <= length else f"{shown}…"

@@ -258,11 +258,11 @@ class Node:
         """Answer queries for a message of this node at any time, also while its loop hangs."""
         key = topics.key(topic, self.vehicle, role=self.role)
 
-        def asked(query: zenoh.Query) -> None:
+        def received(query: zenoh.Query) -> None:
             if (answer := payload()) is not None:
                 query.reply(key, answer)
 
-        self.zenoh.declare_queryable(key, asked, complete=True)
+        self.zenoh.declare_queryable(key, received, complete=True)
 
     # ── publications ──
 
