@@ -137,7 +137,7 @@ def own_plant(kind: str, own: Mapping[str, Any], period: float, voltage_limit: f
     except AeroloopError as error:
         raise PlantError(str(error)) from None
     except Exception as error:
-        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.own_words(error)}") from None
+        raise PlantError(f"{found.__name__} (plant.kind) raised {plugins.exception_line(error)}") from None
 
 
 class OwnPlant(Plant):
@@ -211,7 +211,7 @@ class OwnPlant(Plant):
         try:
             return method(*values)
         except Exception as error:
-            words = str(error) if isinstance(error, AeroloopError) else plugins.own_words(error)
+            words = str(error) if isinstance(error, AeroloopError) else plugins.exception_line(error)
             raise self._failure(f"failed in {method.__name__}(): {words}") from None
 
     def _failure(self, what: str) -> PlantError:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, create_model, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
 
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.operator import Reference, Sinusoid
@@ -20,13 +20,13 @@ from aeroloop.protocol.wire.frames import MAX_COUNTER_BITS, MIN_COUNTER_BITS
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wording import Shapes, problems
+from aeroloop.protocol.wording import problems
 from aeroloop.service.config_sources import ENV_PREFIX as ENV_PREFIX
 from aeroloop.service.config_sources import ConfigError as ConfigError
 from aeroloop.service.config_sources import merge, sources, tree_of
 from aeroloop.service.config_text import toml
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.registry import BUILT_IN, LawSection, own_settings
+from aeroloop.service.control.laws.registry import LawSection, own_settings
 from aeroloop.service.points_file import PointsError, read_points
 from aeroloop.service.settings import ControllerSettings, RecorderSettings
 from aeroloop.service.vehicle_address import VehicleAddress
@@ -119,13 +119,7 @@ class Settings(VehicleAddress):
 
     def toml(self, *, comments: bool = False) -> str:
         """The effective configuration as a TOML file that loads to the same, if wanted with a comment on every key."""
-        if not comments:
-            return toml(self.description())
-        model: type[BaseModel] = type(self)
-        if self.law.kind not in BUILT_IN:  # whose keys only its own model explains
-            law = Field(default=..., description=model.model_fields["law"].description)
-            model = create_model("Settings", __base__=model, law=(type(self.law), law))
-        return toml(self.description(), Shapes(model))
+        return toml(self.description(), self if comments else None)
 
 
 def with_law_settings(settings: Settings) -> Settings:

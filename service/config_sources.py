@@ -11,7 +11,7 @@ from typing import Any, Final
 from pydantic import BaseModel
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.wording import Shapes, closest
+from aeroloop.protocol.wording import closest, keys
 
 ENV_PREFIX: Final = "AEROLOOP_"
 """Every variable of the environment that begins with it is a key: `AEROLOOP_LOOP__RATE_HZ` is `loop.rate_hz`."""
@@ -97,7 +97,7 @@ def _environment(model: type[BaseModel], unread: Collection[str]) -> dict[str, A
         for name, text in os.environ.items()
         if name.upper().startswith(ENV_PREFIX) and not name.upper().startswith(elsewhere)
     }
-    known = {_variable(key): key for key, _ in Shapes(model).every_key()} if given else {}
+    known = {_variable(key): key for key in keys(model)} if given else {}
     tree: dict[str, Any] = {}
     for name, text in sorted(given.items()):
         variable = name.upper()

@@ -8,47 +8,67 @@ from collections.abc import Iterator
 from textwrap import wrap
 from typing import Any, Final
 
-from aeroloop.protocol.wording import Shape, Shapes, either, words
+from pydantic import BaseModel
 
 WIDTH: Final = 100
 """Columns of a comment and of a list in one line."""
 
-_EVIDENT: Final = ("", "true or false", "a string", "a path", "a list of strings")
+_BOUNDS: Final = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "below"}
 
 
-def toml(tree: dict[str, Any], shapes: Shapes | None = None) -> str:
+def toml(tree: dict[str, Any], settings: BaseModel | None = None) -> str:
     """A configuration as TOML.
 
     Args:
         tree: The description of the settings.
-        shapes: Of the settings' model: then a comment gives each key's description with its unit, and its bounds.
+        settings: What it describes: then a comment gives each key's description with its unit, and its bounds.
     """
-    return "\n".join(_section(tree, "", shapes, shapes.root if shapes else {})).strip() + "\n"
+    return "\n".join(_section(tree, "", settings, {})).strip() + "\n"
 
 
-def _section(tree: dict[str, Any], path: str, shapes: Shapes | None, shape: Shape) -> Iterator[str]:
-    kinds = shapes.kinds(shape) if shapes else {}
-    if shapes is not None and kinds:
-        shape = {**kinds[tree["kind"]], "description": shape.get("description", "")}
-    fields = shapes.fields(shape) if shapes else {}
+def _section(tree: dict[str, Any], path: str, settings: object, node: dict[str, Any]) -> Iterator[str]:
+    """Lines of a section; `settings` is its model's instance, `node` describes it in the JSON schema of its parent."""
+    nodes = type(settings).model_json_schema()["properties"] if isinstance(settings, BaseModel) else {}
     if path:
         yield ""
-        yield from _comment(shape.get("description", ""))
+        yield from _comment(node.get("description", ""))
         yield f"[{path}]"
     for name, value in tree.items():
         if isinstance(value, dict):
             continue
-        field = fields.get(name, {})
-        expected = either(list(map(json.dumps, kinds))) if kinds and name == "kind" else words(field)
-        bounds = "" if expected in _EVIDENT else f" ({expected})"
-        yield from _comment(field.get("description", "") + bounds)
+        kinds = node.get("discriminator", {}).get("mapping", ()) if name == "kind" else ()
+        bounds = expected({"enum": list(kinds)} if kinds else nodes.get(name, {}))
+        yield from _comment(nodes.get(name, {}).get("description", "") + (f" ({bounds})" if bounds else ""))
         if value is not None or name == "bits":
             yield f"{_key(name)} = {_value('cont' if value is None else value)}"  # TOML has no null
-        elif shapes:
+        elif nodes:
             yield f"# {name} = (not set)"
     for name, value in tree.items():
         if isinstance(value, dict):
-            yield from _section(value, f"{path}.{_key(name)}".removeprefix("."), shapes, fields.get(name, {}))
+            inner = f"{path}.{_key(name)}".removeprefix(".")
+            yield from _section(value, inner, getattr(settings, name, None), nodes.get(name, {}))
+
+
+def expected(node: dict[str, Any]) -> str:
+    """What a JSON schema's node allows, such as `number from 1 to 10000`; empty where the description says enough."""
+    if choices := node.get("enum", [node["const"]] if "const" in node else []):
+        return " or ".join(map(json.dumps, choices))
+    if options := node.get("anyOf"):
+        return " or ".join(filter(None, map(expected, options)))
+    match node.get("type"):
+        case "number" | "integer" as kind:
+            limits = [f" {word} {node[bound]:g}" for bound, word in _BOUNDS.items() if bound in node]
+            return ("whole " if kind == "integer" else "") + "number" + "".join(limits)
+        case "string" if "pattern" in node:
+            return f"string of the form {node['pattern'].strip('^$')}"
+        case "array":
+            items = node.get("prefixItems") or [node.get("items", {})]
+            inner = expected(items[0])
+            most = len(items) if "prefixItems" in node else node.get("maxItems")
+            least = node.get("minItems", 0)
+            count = "list of" if most is None else f"{most} ×" if most == least else f"{least} to {most} ×"
+            return f"{count} {inner}" if inner else ""
+    return ""
 
 
 def _comment(text: str) -> list[str]:

@@ -50,7 +50,7 @@ def read_points(path: Path) -> Points:
     except (OSError, UnicodeDecodeError) as error:
         raise PointsError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}") from None
     except ValidationError as error:
-        raise PointsError(f"{path}: {problems(error, Points)[0]}") from None
+        raise PointsError(f"{path}: {next(problems(error, Points))}") from None
 
 
 def _problem(row: list[str], times: list[float]) -> str | None:

@@ -19,8 +19,8 @@ from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Outcome
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
-from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival
@@ -136,7 +136,7 @@ class Bridge:
     """
 
     def __init__(
-        self, role: Role, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, bus: CanSettings
+        self, role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, bus: CanSettings
     ) -> None:
         self._role = role
         self._loop = loop

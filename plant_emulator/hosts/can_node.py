@@ -14,8 +14,8 @@ from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.driver import PlantNetwork
 from aeroloop.protocol.messages.models import Claim, Event, EventKind
 from aeroloop.protocol.messages.states import PlantState
-from aeroloop.protocol.runtime.event_log import log_event
-from aeroloop.protocol.runtime.throttle import Throttle
+from aeroloop.protocol.runtime.node import log_event
+from aeroloop.protocol.runtime.timing import Throttle
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link

@@ -18,8 +18,7 @@ from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
-from aeroloop.protocol.runtime.tick_grid import TickGrid
-from aeroloop.protocol.runtime.timing import LoopTiming
+from aeroloop.protocol.runtime.timing import Clock, LoopTiming, TickGrid
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -99,9 +98,16 @@ class Driver:
     """
 
     def __init__(
-        self, plant: Plant, loop: LoopSettings, wire: WireSpec, settings: PlantSettings, stop: threading.Event
+        self,
+        plant: Plant,
+        loop: LoopSettings,
+        wire: WireSpec,
+        settings: PlantSettings,
+        stop: threading.Event,
+        clock: Clock = time,
     ) -> None:
         self._plant = plant
+        self._clock = clock
         self._loop = loop
         self._settings = settings
         self._stop = stop
@@ -143,12 +149,12 @@ class Driver:
     def _run_real_time(self) -> None:
         network = self._network
         network.notes = prepare_process(self._loop)
-        timing = network.timing = LoopTiming()
-        grid = None if self._plant.paces else TickGrid(self._loop.period_ns)
+        timing = network.timing = LoopTiming(clock=self._clock)
+        grid = None if self._plant.paces else TickGrid(self._loop.period_ns, clock=self._clock)
         while not self._stop.is_set():
             skipped = grid.skipped if grid else 0
             k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
-            woke_ns = time.monotonic_ns()
+            woke_ns = self._clock.monotonic_ns()
             due_ns = grid.due_ns if grid else woke_ns
             before = self.endpoint.session
             network.take_inbox()
@@ -174,7 +180,7 @@ class Driver:
         while not self._stop.is_set():
             self._network.take_inbox()
             if self._network.link is None or not self._may_step():
-                time.sleep(IDLE_WAIT_S if self._network.link is None else 0)
+                self._clock.sleep(IDLE_WAIT_S if self._network.link is None else 0)
                 self._network.publish_when_due()
                 continue
             echo = self._tick(arrival, self.endpoint.ticked + 1)
@@ -194,7 +200,7 @@ class Driver:
         """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
         network = self._network
         measurement = self.tick(arrival.frame if arrival is not None else None, k)
-        sent_ns = time.monotonic_ns()
+        sent_ns = self._clock.monotonic_ns()
         echo = None
         for sent in self._outgoing(measurement):
             network.send(sent)
@@ -210,13 +216,13 @@ class Driver:
 
     def _await_answer(self, echo: int) -> Arrival | None:
         """Wait for the command that echoes a counter. Returns None if the session ends first."""
-        deadline = time.monotonic() + self._settings.answer_timeout_s
+        deadline = self._clock.monotonic() + self._settings.answer_timeout_s
         while self._network.link and not self._stop.is_set():
             arrival = self._network.link.wait(IDLE_WAIT_S)
             if arrival is not None and self.endpoint.wire.command.counter(arrival.frame) in (echo, None):
                 return arrival
             self._network.take_inbox()
-            if time.monotonic() > deadline:
+            if self._clock.monotonic() > deadline:
                 self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
             self._network.follow_session()
             self._network.publish_when_due()

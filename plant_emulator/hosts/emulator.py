@@ -18,7 +18,7 @@ from aeroloop.plant_emulator.hosts.zenoh_network import ZenohNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -115,7 +115,7 @@ class EmulatorOnZenoh(Emulator):
         ValueError: A fault of a motor that the plant does not have.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
+    def __init__(self, role: Node, loop: LoopSettings, wire: WireSpec, settings: PlantSettings) -> None:
         super().__init__(loop, wire, settings, role.stop)
         self._role = role
         self._steps: int | None = 0 if settings.steps_on_request else None  # steps left; None: no limit

@@ -37,7 +37,7 @@ from aeroloop.protocol.messages.models import (
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches_per_s, record_json
-from aeroloop.protocol.runtime.role import RecorderWatch, Role
+from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import Arrival, ZenohLink
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -59,7 +59,7 @@ class ZenohNetwork(PlantNetwork):
 
     def __init__(
         self,
-        role: Role,
+        role: Node,
         loop: LoopSettings,
         endpoint: VehicleClaim,
         state_directory: Path | None,

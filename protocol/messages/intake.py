@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import MAX_POINTS
-from aeroloop.protocol.wording import Shapes, problem
+from aeroloop.protocol.wording import problem
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -26,11 +26,6 @@ REFERENCE: Final = 4 * MAX_POINTS + FEW
 
 class IntakeError(AeroloopError):
     """The payload is no such message; one line that says why."""
-
-
-def prepare(model: type[BaseModel]) -> None:
-    """Build now what puts the first refusal of a message into words: 10 ms, which a loop would miss."""
-    Shapes(model)
 
 
 def few(payload: bytes, most: int = FEW) -> bool:

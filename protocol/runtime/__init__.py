@@ -1,1 +1,1 @@
-"""Process set-up: role on the network, tick grid, timing statistics, real-time settings, host facts."""
+"""Process set-up: node on the network, tick grid, timing statistics, real-time settings, host facts."""

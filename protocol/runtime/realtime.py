@@ -1,11 +1,8 @@
 """Real-time set-up of a process: scheduling class, locked memory, CPU affinity, garbage between ticks, built parsers.
 
 Memory is locked page by page as it is touched (`MCL_ONFAULT`, Linux 4.4): a loop's pages are touched in its first
-second, which is warm-up, and stay. Without `MCL_ONFAULT`, every thread's stack and malloc's arenas are made resident in
-full, three times what is used.
-
-An idle CPU that sleeps takes long to wake; on a virtual machine, until the host schedules it again. While a process
-keeps /dev/cpu_dma_latency open with 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface.rst).
+second, which is warm-up, and stay. An idle CPU that sleeps takes long to wake; while a process keeps
+/dev/cpu_dma_latency open with 0 µs, idle CPUs poll instead (Linux, Documentation/power/pm_qos_interface.rst).
 """
 
 from __future__ import annotations
@@ -22,16 +19,14 @@ from aeroloop.protocol.messages.operator import build_messages
 from aeroloop.protocol.wire.loop import LoopSettings
 
 _PR_SET_TIMERSLACK: Final = 29
-_MCL_CURRENT: Final = 1
-_MCL_FUTURE: Final = 2
+_MCL_ALL: Final = 1 | 2
+"""MCL_CURRENT | MCL_FUTURE."""
 _MCL_ONFAULT: Final = 4
 _YOUNG: Final = 700
 """New objects after which the youngest generation is collected, which takes 0.04 to 0.3 ms."""
 _COLLECTIONS: Final = 4
 """Collections of a generation after which the next older one is collected with it."""
 _CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
-_NO_LATENCY: Final = bytes(4)
-"""0 µs, as the s32 that the kernel reads."""
 
 
 class RealtimeError(AeroloopError):
@@ -60,26 +55,25 @@ def prepare_process(settings: LoopSettings) -> list[str]:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0):
         refused.append("timer slack stays at the system's default")
-    everything = _MCL_CURRENT | _MCL_FUTURE
-    if libc.mlockall(everything | _MCL_ONFAULT) and (ctypes.get_errno() != EINVAL or libc.mlockall(everything)):
+    if libc.mlockall(_MCL_ALL | _MCL_ONFAULT) and (ctypes.get_errno() != EINVAL or libc.mlockall(_MCL_ALL)):
         refused.append(f"memory lock: {os.strerror(ctypes.get_errno())} (raise LimitMEMLOCK)")
+    # Every thread: Zenoh's, which carry the frames, must not wait for other work any more than the loop.
+    threads = [int(thread) for thread in os.listdir("/proc/self/task")]
     try:
-        # Every thread: Zenoh's, which carry the frames, must not wait for other work any more than the loop.
-        for thread in os.listdir("/proc/self/task"):
-            if settings.cpus:
-                os.sched_setaffinity(int(thread), settings.cpus)
+        for thread in threads if settings.cpus else ():
+            os.sched_setaffinity(thread, settings.cpus)
     except OSError as error:
         refused.append(f"affinity to CPUs {settings.cpus}: {error.strerror}")
     try:
-        for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(settings.priority))
+        for thread in threads:
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(settings.priority))
     except OSError as error:
         refused.append(f"SCHED_FIFO {settings.priority}: {error.strerror} (raise LimitRTPRIO)")
     if refused and settings.realtime == "strict":
         raise RealtimeError(f"loop.realtime is strict, but this machine refuses: {'; '.join(refused)}")
     try:
         # Never closed: the kernel drops the request with the last descriptor, at the end of this process.
-        os.write(os.open(_CPU_LATENCY, os.O_WRONLY), _NO_LATENCY)
+        os.write(os.open(_CPU_LATENCY, os.O_WRONLY), bytes(4))  # 0 µs, as the s32 that the kernel reads
     except OSError as error:
         refused.append(f"idle CPUs sleep: {_CPU_LATENCY}: {error.strerror}")
     return refused

@@ -1,87 +1,156 @@
-"""Timing statistics of a loop: wake-up latency, tick duration and period, in histograms of fixed size."""
+"""Timing of a loop: clock, grid of deadlines, limit of repeated messages, histograms of durations.
+
+CLOCK_MONOTONIC paces everything; the wall clock only stamps logs, and the tick index is the law's time.
+"""
 
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
 from math import exp2, log2
-from typing import Final
+from typing import Final, Protocol
 
 from aeroloop.protocol.messages.models import Percentiles, Timing
 
-_BINS_PER_OCTAVE: Final = 16
-_LONGEST_US: Final = 2.0**32 - 1  # over an hour, in the last bin
-_SHORTEST_WINDOW_NS: Final = 900_000_000
+
+class Clock(Protocol):
+    """What a loop needs of the module `time`, which is the real clock."""
+
+    def monotonic(self) -> float:
+        """Monotonic time [s]."""
+
+    def monotonic_ns(self) -> int:
+        """Monotonic time [ns]."""
+
+    def time_ns(self) -> int:
+        """Wall clock, nanoseconds since 1970."""
+
+    def sleep(self, seconds: float, /) -> None:
+        """Wait [s]."""
+
+
+class TickGrid:
+    """Absolute deadlines: tick k is due at `start_ns + k·period_ns`, on `Clock.monotonic_ns`.
+
+    After a stall the grid continues at the next deadline ahead and counts the missed ticks; it never bursts to catch
+    up, because a plant does not.
+
+    Attributes:
+        tick: Index of the last tick waited for; −1 before the first.
+        skipped: Ticks missed so far.
+    """
+
+    def __init__(self, period_ns: int, start_ns: int | None = None, clock: Clock = time) -> None:
+        self._clock = clock
+        self.period_ns = period_ns
+        self.start_ns = clock.monotonic_ns() if start_ns is None else start_ns
+        self.tick = -1
+        self.skipped = 0
+
+    @property
+    def due_ns(self) -> int:
+        """When the last tick waited for was due."""
+        return self.start_ns + self.tick * self.period_ns
+
+    def wait(self) -> int:
+        """Sleep until the next tick is due and return its index.
+
+        A tick that is less than a period late is taken at once; after a longer stall, the next one ahead.
+        """
+        self.tick += 1
+        now_ns = self._clock.monotonic_ns()
+        late_ns = now_ns - self.due_ns
+        if late_ns >= self.period_ns:
+            missed = -(-late_ns // self.period_ns)
+            self.skipped += missed
+            self.tick += missed
+        if self.due_ns > now_ns:
+            self._clock.sleep((self.due_ns - now_ns) * 1e-9)
+        return self.tick
+
+
+class Throttle:
+    """Passes one message of each kind per `period_s` [s], and counts those it holds back."""
+
+    MAX_KINDS: Final = 1000
+
+    def __init__(self, period_s: float = 10.0, clock: Clock = time) -> None:
+        self.period_s = period_s
+        self._clock = clock
+        self._passed: dict[str, tuple[float, int]] = {}
+
+    def let_pass(self, kind: str) -> int | None:
+        """None if the message is held back; else the number held back since the last one passed."""
+        now = self._clock.monotonic()
+        at, held_back = self._passed.get(kind, (-self.period_s, 0))
+        if now - at < self.period_s:
+            self._passed[kind] = at, held_back + 1
+            return None
+        if len(self._passed) >= self.MAX_KINDS:
+            self._passed.clear()
+        self._passed[kind] = now, 0
+        return held_back
 
 
 class Histogram:
     """Durations in bins 4.4 % wide (16 an octave, from 1 µs): memory stays bounded."""
 
+    PER_OCTAVE: Final = 16
+    LONGEST_US: Final = 2.0**32 - 1  # over an hour, in the last bin
+
     def __init__(self) -> None:
-        self._bins: dict[int, int] = {}
+        self._bins: Counter[int] = Counter()
         self.max_us = 0.0
 
     @property
     def count(self) -> int:
         """Number of durations."""
-        return sum(self._bins.values())
+        return self._bins.total()
 
     def add(self, nanoseconds: int) -> None:
         """Count one duration [ns]; under 1 µs counts as 1 µs, over an hour as an hour."""
         us = nanoseconds * 1e-3
-        i = int(log2(us if us < _LONGEST_US else _LONGEST_US) * _BINS_PER_OCTAVE) if us > 1.0 else 0
-        self._bins[i] = self._bins.get(i, 0) + 1
-        if us > self.max_us:
-            self.max_us = us
+        self._bins[int(log2(min(max(us, 1.0), self.LONGEST_US)) * self.PER_OCTAVE)] += 1
+        self.max_us = max(self.max_us, us)
 
     def merge(self, other: Histogram) -> None:
         """Add the counts of another histogram."""
-        for i, n in other._bins.items():
-            self._bins[i] = self._bins.get(i, 0) + n
+        self._bins.update(other._bins)
         self.max_us = max(self.max_us, other.max_us)
 
     def percentile(self, percent: float) -> float:
         """The middle of the bin that holds this percentile [µs]; NaN if nothing was counted."""
         wanted = self.count * percent / 100
         seen = 0
-        for i in sorted(self._bins):
-            seen += self._bins[i]
+        for i, n in sorted(self._bins.items()):
+            seen += n
             if seen >= wanted:
-                return min(exp2((i + 0.5) / _BINS_PER_OCTAVE), self.max_us)
+                return min(exp2((i + 0.5) / self.PER_OCTAVE), self.max_us)
         return float("nan")
 
 
 class RollingHistogram:
-    """Histograms of all durations, and of those in the last ten seconds.
-
-    Attributes:
-        add: Counts one duration [ns]: `Histogram.add` of this window, without a Python function in between.
-    """
-
-    add: Callable[[int], None]
+    """Histograms of all durations, `total`, and of those in the last ten seconds, in windows of a second."""
 
     WINDOWS: Final = 10
+    SHORTEST_NS: Final = 900_000_000
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = time) -> None:
         self.total = Histogram()
-        self._windows: deque[Histogram] = deque([Histogram()], maxlen=self.WINDOWS)
-        self._current = self._windows[0]
-        self.add = self._current.add
-        self._turned_at = 0
+        self._clock = clock
+        self._windows = deque([Histogram()], maxlen=self.WINDOWS)
+        self._turned_ns = 0
 
-    def turn(self) -> None:
-        """End a window."""
-        self._turned_at = time.monotonic_ns()
-        self.total.merge(self._current)
-        self._current = Histogram()
-        self.add = self._current.add
-        self._windows.append(self._current)
+    def add(self, nanoseconds: int) -> None:
+        """Count one duration [ns]."""
+        self.total.add(nanoseconds)
+        self._windows[-1].add(nanoseconds)
 
     def turn_when_due(self) -> None:
         """End a one-second window, if it is over; called with every report."""
-        if time.monotonic_ns() - self._turned_at >= _SHORTEST_WINDOW_NS:
-            self.turn()
+        if (now_ns := self._clock.monotonic_ns()) - self._turned_ns >= self.SHORTEST_NS:
+            self._turned_ns = now_ns
+            self._windows.append(Histogram())
 
     def recent(self) -> Histogram:
         """The last ten windows."""
@@ -97,17 +166,18 @@ class LoopTiming:
     The first `warm_up_ns` [ns] of ticks are left out: caches are cold, and code and memory are used for the first time.
     """
 
-    def __init__(self, warm_up_ns: int = 1_000_000_000) -> None:
-        self.wake = RollingHistogram()
-        self.busy = RollingHistogram()
-        self.period = RollingHistogram()
+    def __init__(self, warm_up_ns: int = 1_000_000_000, clock: Clock = time) -> None:
+        self.wake = RollingHistogram(clock)
+        self.busy = RollingHistogram(clock)
+        self.period = RollingHistogram(clock)
+        self._clock = clock
         self._warm_up_ns = warm_up_ns
         self._warm_at: int | None = None
         self._woke_at = 0
 
     def woke(self, due_ns: int, woke_ns: int | None = None) -> None:
-        """Count the start of a tick, due at `due_ns`, at `woke_ns`, now if None; on `time.monotonic_ns()`."""
-        now = time.monotonic_ns() if woke_ns is None else woke_ns
+        """Count the start of a tick, due at `due_ns`, at `woke_ns`, now if None; on `Clock.monotonic_ns`."""
+        now = self._clock.monotonic_ns() if woke_ns is None else woke_ns
         if self._warm_at is None:
             self._warm_at = now + self._warm_up_ns
         if now >= self._warm_at:
@@ -119,39 +189,27 @@ class LoopTiming:
     def done(self) -> None:
         """Count the end of the tick."""
         if self._woke_at:
-            self.busy.add(time.monotonic_ns() - self._woke_at)
+            self.busy.add(self._clock.monotonic_ns() - self._woke_at)
 
     def pause(self) -> None:
         """Pause: the time until the next tick is no period."""
         self._woke_at = 0
-
-    def turn(self) -> None:
-        """End a one-second window."""
-        for histogram in (self.wake, self.busy, self.period):
-            histogram.turn_when_due()
 
 
 def summary(durations: Histogram) -> Percentiles | None:
     """Percentiles of a histogram; None if it is empty."""
     if not durations.count:
         return None
-    return Percentiles(
-        count=durations.count,
-        p50=round(durations.percentile(50), 1),
-        p99=round(durations.percentile(99), 1),
-        p999=round(durations.percentile(99.9), 1),
-        max=round(durations.max_us, 1),
-    )
+    points = {"p50": 50, "p99": 99, "p999": 99.9}
+    found = {name: round(durations.percentile(percent), 1) for name, percent in points.items()}
+    return Percentiles(count=durations.count, max=round(durations.max_us, 1), **found)
 
 
 def report(timing: LoopTiming) -> Timing:
     """End a one-second window of a loop's timing, and return its percentiles."""
-    timing.turn()
-    return Timing(
-        wake=summary(timing.wake.total),
-        busy=summary(timing.busy.total),
-        period=summary(timing.period.total),
-        recent_wake=summary(timing.wake.recent()),
-        recent_busy=summary(timing.busy.recent()),
-        recent_period=summary(timing.period.recent()),
-    )
+    found = {}
+    for name, durations in (("wake", timing.wake), ("busy", timing.busy), ("period", timing.period)):
+        durations.turn_when_due()
+        found[name] = summary(durations.total)
+        found[f"recent_{name}"] = summary(durations.recent())
+    return Timing(**found)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from aeroloop.protocol.runtime.role import Role
+    from aeroloop.protocol.runtime.node import Node
     from aeroloop.service.config import Settings
     from aeroloop.service.vehicle_address import VehicleAddress
 
@@ -192,16 +192,16 @@ def checked(*models: type[BaseModel]) -> Iterator[None]:
             raise
         if isinstance(error, AeroloopError):
             fail(str(error), 2)
-        from aeroloop.protocol.wording import problems
+        from aeroloop.protocol.wording import problem
 
-        fail(problems(error, *models)[0], 2)
+        fail(problem(error, *models), 2)
 
 
-def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options: DaemonOptions) -> None:
+def run_role(kind: str, settings: Settings, run: Callable[[Node], None], options: DaemonOptions) -> None:
     """Join the network as a role and run until SIGTERM or SIGINT."""
     _follow_parent(options)
     begun, stop = _stop_on_signals()
-    from aeroloop.protocol.runtime.role import Role
+    from aeroloop.protocol.runtime.node import Node
     from aeroloop.protocol.transport.lingering import no_linger
     from aeroloop.protocol.transport.zenoh_config import THREADS
     from aeroloop.service.daemon.claim import controller_name
@@ -210,7 +210,7 @@ def run_role(kind: str, settings: Settings, run: Callable[[Role], None], options
     if (refused := no_linger()) is not None:
         log.warning("%s", refused)
     name = controller_name() if kind == "controller" else None
-    with guarded(), Role(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
+    with guarded(), Node(kind, settings.vehicle, settings.network, settings.description(), name, stop) as role:
         begun.set()
         run(role)
 

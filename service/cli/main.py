@@ -117,7 +117,7 @@ def _alike(error: TyperException) -> str:
 def _print_version(requested: bool) -> None:
     if requested:
         from aeroloop.protocol.messages.models import PROTOCOL_VERSION
-        from aeroloop.protocol.runtime.host_facts import versions
+        from aeroloop.protocol.runtime.host import versions
 
         found = versions()
         revision = f" (revision {found['revision']})" if "revision" in found else ""

@@ -34,7 +34,7 @@ from aeroloop.service.cli.entry import INTERRUPTED
 if TYPE_CHECKING:
     from threading import Event
 
-    from aeroloop.protocol.runtime.role import Role
+    from aeroloop.protocol.runtime.node import Node
 
 Faults = Annotated[
     list[str] | None,
@@ -103,7 +103,7 @@ def controller(
     words += ["controller.auto_arm=true"] if auto_arm else []
     settings = loop_of(options.config, options.overrides, *words)
 
-    def run(role: Role) -> None:
+    def run(role: Node) -> None:
         from aeroloop.service.control.laws.registry import version_of
         from aeroloop.service.daemon.daemon import Daemon
         from aeroloop.service.theorem.any_law import described_certificate
@@ -160,7 +160,7 @@ def _fault_options(faults: list[str] | None) -> list[str]:
 def _run_plant(options: DaemonOptions, *overrides: str) -> None:
     settings = settings_of(options.config, options.overrides, *overrides)
 
-    def run(role: Role) -> None:
+    def run(role: Node) -> None:
         from aeroloop.service.daemon.plants import run_plant
 
         run_plant(role, settings)
@@ -201,7 +201,7 @@ def recorder(
     words = [f"recorder.path={dumps(str(log))}"] if log is not None else []
     settings = settings_of(options.config, options.overrides, *words)
 
-    def run(role: Role) -> None:
+    def run(role: Node) -> None:
         from aeroloop.service.recording.recorder import Recorder
 
         Recorder(role, settings.recorder).run()

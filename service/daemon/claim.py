@@ -13,8 +13,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, SessionRecord, Tenure
 from aeroloop.protocol.messages.operator import Answer
-from aeroloop.protocol.runtime.event_log import log_event
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node, log_event
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
@@ -37,7 +36,7 @@ class ClaimClient:
         by_datagrams: Whether the last claim's frames travel as datagrams.
     """
 
-    def __init__(self, role: Role, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
+    def __init__(self, role: Node, loop: LoopSettings, wire: WireSpec, *, auto_arm: bool) -> None:
         self._role = role
         self._loop = loop
         self._wire = wire

@@ -9,7 +9,6 @@ the trace, which is published after the command.
 from __future__ import annotations
 
 import secrets
-import time
 from collections.abc import Callable
 from typing import Final, Literal
 
@@ -20,8 +19,8 @@ from aeroloop.protocol.messages.models import SessionRecord, Status, Tenure
 from aeroloop.protocol.messages.operator import Answer, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
+from aeroloop.protocol.runtime.node import Node, RecorderWatch
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
-from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.wire.transmit import SILENCE
@@ -61,12 +60,13 @@ class Daemon:
 
     def __init__(
         self,
-        role: Role,
+        role: Node,
         configured: Settings,
     ) -> None:
         loop, wire, law, reference = configured.loop, configured.wire, configured.law, configured.reference
         settings = configured.controller
         self._role = role
+        self._clock = role.clock
         self._loop = loop
         self._wire = wire
         self._settings = settings
@@ -97,11 +97,11 @@ class Daemon:
         self._ticks = self._sent = self._received = self._skipped = self._refused = self._saturated = self._stale = 0
         self._notes: list[str] = []
         self._timing: LoopTiming | None = None
-        self._age = RollingHistogram()
+        self._age = RollingHistogram(self._clock)
         self._status_due = 0
         self._shown: SessionRecord | None = None  # by the last status
         self._status_ticks = 0
-        self._status_time = time.monotonic()
+        self._status_time = self._clock.monotonic()
         self._stale_s = settings.stale_s
         self._law_timeout_s = settings.law_timeout_s
         self._telemetry_every = max(1, round(loop.rate_hz / settings.telemetry_rate_hz))
@@ -110,7 +110,7 @@ class Daemon:
         """Run until the role's `stop` is set or `duration_s` of the law's time is over."""
         if not self._loop.lockstep:
             self._notes = prepare_process(self._loop)
-            self._timing = LoopTiming()
+            self._timing = LoopTiming(clock=self._clock)
         role, loop = self._role, self._loop
         role.declare("telemetry", self._settings.telemetry_rate_hz)
         role.declare("trace", batches_per_s(loop), lossless=loop.lockstep)
@@ -155,13 +155,15 @@ class Daemon:
         """Run one session. True once the duration is over, False if the session was lost."""
         controller, changes, timing, lockstep = self._controller, self._changes, self._timing, self._loop.lockstep
         watch = self._watch
-        source = TickSource(link, self._loop, self._wire, own_grid=self._own_grid, stale_s=self._stale_s)
-        k, last = -1, time.monotonic()
+        source = TickSource(
+            link, self._loop, self._wire, own_grid=self._own_grid, stale_s=self._stale_s, clock=self._clock
+        )
+        k, last = -1, self._clock.monotonic()
         while self._may_continue() and (self._last_tick is None or k < self._last_tick):
             now = source.next(min(WAIT_S, self._stale_s))
             if now is not None and now.fresh:
-                last = time.monotonic()
-            elif (reason := self._is_lost(time.monotonic() - last)) is not None:
+                last = self._clock.monotonic()
+            elif (reason := self._is_lost(self._clock.monotonic() - last)) is not None:
                 return self._lose(reason)
             if now is None:
                 if lockstep:  # a plant may pause for any time, and a request does not wait for its next step
@@ -172,19 +174,19 @@ class Daemon:
             if now.received_as is Received.LATE or now.tick == k:
                 self._take_late(now)
                 continue
-            woke_ns = time.monotonic_ns()
+            woke_ns = self._clock.monotonic_ns()
             changes.before_tick(now.tick, now.frame)
             if not self._may_continue():
                 break
-            watch.begun = time.monotonic()
+            watch.begun = self._clock.monotonic()
             command = controller.tick(now.frame, now.tick)
-            took_s, watch.begun = time.monotonic() - watch.begun, None
+            took_s, watch.begun = self._clock.monotonic() - watch.begun, None
             if took_s > self._law_timeout_s and not lockstep:
                 self._too_slow, command = took_s, None
             if command or (command is not None and lockstep):
                 link.send(command)
             k = now.tick
-            sent_ns = time.monotonic_ns()
+            sent_ns = self._clock.monotonic_ns()
             if timing:
                 timing.woke(now.due_ns, woke_ns)
             self._age.add(sent_ns - now.at_ns)
@@ -215,9 +217,9 @@ class Daemon:
         self._publish_trace_when_due()
 
     def _publish_trace_when_due(self) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
         if self._trace.due(now_ns):
-            self._role.publish_bytes("trace", self._trace.take(now_ns, time.time_ns()))
+            self._role.publish_bytes("trace", self._trace.take(now_ns, self._clock.time_ns()))
             self._trace.state = self._controller.state.model_dump(mode="json")
 
     def _may_continue(self) -> bool:
@@ -309,7 +311,9 @@ class Daemon:
         if self._timing:
             self._timing.pause()
         self._changes.end()
-        self._role.publish_bytes("trace", self._trace.take(time.monotonic_ns(), time.time_ns(), final=True))
+        self._role.publish_bytes(
+            "trace", self._trace.take(self._clock.monotonic_ns(), self._clock.time_ns(), final=True)
+        )
         self._claims.release()
         link.close()
         self._link, self._refused = None, self._refused + link.refused
@@ -326,7 +330,7 @@ class Daemon:
 
     def _read_plant(self) -> Tenure | None:
         """The plant's newest status; None before the first, and once the plant is gone. Reads what came, at times."""
-        now, plants = time.monotonic(), self._plants
+        now, plants = self._clock.monotonic(), self._plants
         if now < self._plant_due:
             return self._plant
         self._plant_due = now + READ_S
@@ -381,11 +385,11 @@ class Daemon:
     # ── publications ──
 
     def _publish_when_due(self) -> None:
-        if time.monotonic_ns() >= self._status_due or self._shown is not self._changes.record:
+        if self._clock.monotonic_ns() >= self._status_due or self._shown is not self._changes.record:
             self._publish_status()
 
     def _publish_status(self) -> None:
-        now = time.monotonic()
+        now = self._clock.monotonic()
         self._shown = record = self._changes.record
         self._claims.keep(record)
         self._age.turn_when_due()
@@ -418,4 +422,4 @@ class Daemon:
             )
         )
         self._status_ticks, self._status_time = self._ticks, now
-        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
+        self._status_due = self._clock.monotonic_ns() + STATUS_PERIOD_NS

@@ -12,7 +12,7 @@ import time
 from threading import Thread
 from typing import Final
 
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 
 REPORT_S: Final = 1.0
 """A tick that lasts longer is reported while it lasts [s]."""
@@ -25,10 +25,10 @@ class LawWatch(Thread):
     """Watches the ticks of a law.
 
     Attributes:
-        begun: When the tick that runs began, on `time.monotonic()`; None between ticks. The loop sets it.
+        begun: When the tick that runs began, on the node's clock; None between ticks. The loop sets it.
     """
 
-    def __init__(self, role: Role, law: str) -> None:
+    def __init__(self, role: Node, law: str) -> None:
         super().__init__(name="law watch", daemon=True)
         self._role = role
         self._law = law
@@ -40,7 +40,7 @@ class LawWatch(Thread):
         stopping: float | None = None
         while True:
             time.sleep(_EVERY_S)
-            begun, now = self.begun, time.monotonic()
+            begun, now = self.begun, self._role.clock.monotonic()
             stopping = (stopping or now) if self._role.stop.is_set() else None
             if begun is None or now - begun < REPORT_S:
                 continue

@@ -24,7 +24,7 @@ from aeroloop.protocol.messages.operator import (
 )
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import TraceWriter
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.attitude import distance
 from aeroloop.service.control.approach import Approach, nearest_turn
 from aeroloop.service.control.controller import Controller
@@ -76,7 +76,7 @@ class OperatorChanges:
 
     def __init__(
         self,
-        role: Role,
+        role: Node,
         law: LawSettings,
         reference: Reference,
         settings: ControllerSettings,

@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 from aeroloop.protocol.messages.models import Source
 from aeroloop.protocol.messages.operator import Answer, Gains, Track
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.daemon.operator_changes import OperatorChanges
 
 
-def serve(role: Role, changes: OperatorChanges) -> None:
+def serve(role: Node, changes: OperatorChanges) -> None:
     """Serve the requests. FollowError is the answer where one is refused."""
     vehicle = role.vehicle
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.config import Settings
 
 
-def run_plant(role: Role, settings: Settings) -> None:
+def run_plant(role: Node, settings: Settings) -> None:
     """Run the configured plant end until the role's `stop` is set.
 
     Raises:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 
 STATUS_EVERY_S: Final = 1.0
 
 
-def run_router(role: Role) -> None:
+def run_router(role: Node) -> None:
     """Run until the role's `stop` is set; Zenoh's threads route."""
     role.announce()
     role.event("started", "routing")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Final
 
 from zenoh.handlers import RingChannel
@@ -10,7 +9,7 @@ from zenoh.handlers import RingChannel
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.operator import Hold, Setpoint, Stream
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.service.control.reference import FollowError, Limits, Plan
 
 SETPOINTS: Final = 4
@@ -25,7 +24,7 @@ class SetpointStream:
         refused: Set-points so far that were malformed, or beyond the limits.
     """
 
-    def __init__(self, role: Role) -> None:
+    def __init__(self, role: Node) -> None:
         self._role = role
         self._received = role.zenoh.declare_subscriber(topics.key("reference", role.vehicle), RingChannel(SETPOINTS))
         self._last_s = 0.0  # when the last one was read, or the stream begun; 0 once its silence was an event
@@ -40,11 +39,11 @@ class SetpointStream:
     def begin(self) -> None:
         """Begin a stream: silence counts from now on."""
         self.discard()
-        self._last_s = time.monotonic()
+        self._last_s = self._role.clock.monotonic()
 
     def newest(self, stream: Stream, limits: Limits, k: int) -> tuple[Hold, Plan] | None:
         """The newest set-point received since the last tick that is not refused; silence of `timeout_s` is an event."""
-        now, newest = time.monotonic(), None
+        now, newest = self._role.clock.monotonic(), None
         for _ in range(SETPOINTS):
             if (sample := self._received.try_recv()) is None:
                 break

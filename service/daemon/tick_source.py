@@ -13,7 +13,7 @@ import time
 from typing import Final, NamedTuple
 
 from aeroloop.protocol.messages.trace import Received
-from aeroloop.protocol.runtime.tick_grid import TickGrid
+from aeroloop.protocol.runtime.timing import Clock, TickGrid
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.frames import TickCounter
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -65,15 +65,19 @@ class TickSource:
         wire: Format of the frames, and whether every tick has one.
         own_grid: Whether to tick on a grid of its own.
         stale_s: A frame that arrives later than this is not answered [s].
+        clock: Of the link's arrivals.
 
     Attributes:
         tick: The last; −1 before the first.
     """
 
-    def __init__(self, link: Link, loop: LoopSettings, wire: WireSpec, *, own_grid: bool, stale_s: float) -> None:
+    def __init__(
+        self, link: Link, loop: LoopSettings, wire: WireSpec, *, own_grid: bool, stale_s: float, clock: Clock = time
+    ) -> None:
         self._link = link
+        self._clock = clock
         self._counter = wire.measurement.counter
-        self._grid = TickGrid(loop.period_ns) if own_grid else None
+        self._grid = TickGrid(loop.period_ns, clock=clock) if own_grid else None
         self._ticks = TickCounter(loop.period_ns, wire.measurement.counters, lockstep=loop.lockstep)
         self._lockstep = loop.lockstep
         self._sparse = wire.transmit.measurement == "on_change" and not loop.lockstep
@@ -119,7 +123,7 @@ class TickSource:
             self._no_tick = False
             return self._link.take()
         if self._sparse and self._ticks.known:
-            timeout_s = min(timeout_s, 1e-9 * max(0, self._over_ns(self.tick + 1) - time.monotonic_ns()))
+            timeout_s = min(timeout_s, 1e-9 * max(0, self._over_ns(self.tick + 1) - self._clock.monotonic_ns()))
         return self._link.wait(timeout_s)
 
     def _over_ns(self, tick: int) -> int:
@@ -128,7 +132,7 @@ class TickSource:
 
     def _last_over(self) -> int:
         """The last tick that is silent if it has no frame by now."""
-        return self._ticks.tick_at(time.monotonic_ns() - self._patience_ns)
+        return self._ticks.tick_at(self._clock.monotonic_ns() - self._patience_ns)
 
     def _not_a_tick(
         self, tick: int, arrival: Arrival, received_as: Received, late_ns: int, *, fresh: bool

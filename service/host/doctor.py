@@ -16,10 +16,9 @@ from typing import Final
 from pydantic import BaseModel, Field
 
 from aeroloop.protocol.messages.models import Percentiles
-from aeroloop.protocol.runtime.host_facts import host_facts
+from aeroloop.protocol.runtime.host import host_facts
 from aeroloop.protocol.runtime.realtime import prepare_process
-from aeroloop.protocol.runtime.tick_grid import TickGrid
-from aeroloop.protocol.runtime.timing import LoopTiming, summary
+from aeroloop.protocol.runtime.timing import LoopTiming, TickGrid, summary
 from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError, read_certificate
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
 from aeroloop.protocol.transport.probe import PLAIN_S, refusal
@@ -82,7 +81,6 @@ def diagnose(
         if progress is not None and k % report_every == 0:
             progress(k * loop.period)
         timing.done()
-    timing.turn()
     wake = summary(timing.wake.total)
     limit_us = SHARE_OF_PERIOD * loop.period_ns / 1000
     late = wake is None or wake.p999 > limit_us

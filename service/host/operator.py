@@ -22,7 +22,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Message, Request
-from aeroloop.protocol.runtime.processes import listener
+from aeroloop.protocol.runtime.host import listener
 from aeroloop.protocol.transport.endpoint import Endpoint
 from aeroloop.protocol.transport.network import COMMAND_S, DECLARED_S, POLL_S, CommandSession, command_session
 from aeroloop.protocol.transport.network_settings import READER, Identity, NetworkSettings

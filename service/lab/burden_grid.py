@@ -17,7 +17,7 @@ from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_BITS
 from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
 from aeroloop.protocol.wire.transmit import Transmit
-from aeroloop.protocol.wording import problems
+from aeroloop.protocol.wording import problem
 from aeroloop.service.config import Settings
 
 _Bits = tuple[int | None, int | None]  # out and in; None is float64
@@ -119,7 +119,7 @@ def cell_settings(settings: Settings, cell: BurdenCell) -> Settings:
         sensors = plant.sensors.model_copy(update=SENSORS[cell.sensors].changes)
         measured = type(plant).model_validate({**plant.model_dump(), "sensors": sensors.model_dump()})
     except ValidationError as error:
-        why = problems(error, SignalSpec, WireSpec, type(plant))[0]
+        why = problem(error, SignalSpec, WireSpec, type(plant))
         bits = "/".join("cont" if one is None else str(one) for one in (out, inp))
         raise BurdenError(f"{bits} {cell.quantizer or 'float64'} with sensors {cell.sensors}: {why}") from None
     return settings.model_copy(update={"wire": chosen, "plant": measured})

@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 from distributed import Client, KilledWorker, Security, get_worker
 from distributed.comm.core import connect
 
-from aeroloop.protocol.runtime.host_facts import versions
+from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.lab.sentinel import fingerprint
 from aeroloop.service.lab.workers import WorkersError
 

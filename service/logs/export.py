@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from aeroloop.protocol.messages.models import Truth
 from aeroloop.protocol.messages.topics import Address
-from aeroloop.protocol.runtime.host_facts import versions
+from aeroloop.protocol.runtime.host import versions
 from aeroloop.service.config import ConfigError, Settings
 from aeroloop.service.control.laws.registry import law_of
 from aeroloop.service.logs.files import LogFiles, Progress

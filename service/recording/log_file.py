@@ -16,7 +16,7 @@ from typing import Final
 from mcap.writer import Writer
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.runtime.host_facts import versions
+from aeroloop.protocol.runtime.host import versions
 from aeroloop.protocol.transport.history import Delivery
 from aeroloop.service.logs.mcap_file import CHUNK_BYTES, with_checksum
 from aeroloop.service.viewers.schemas import Decoded, Shape, json_shape

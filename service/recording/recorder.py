@@ -21,7 +21,7 @@ from aeroloop.protocol.messages import intake, topics
 from aeroloop.protocol.messages.models import LOSS_REASONS, Description, Loss, LossReason, Status
 from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
 from aeroloop.protocol.messages.trace import read_batch
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.history import ANSWER_S, SOON_S, Delivery
 from aeroloop.service.recording.backlog import Backlog
 from aeroloop.service.recording.rolling import RollingLog
@@ -61,7 +61,7 @@ _address = lru_cache(maxsize=4096)(topics.read_key)
 class Recorder:
     """The recorder as a process. Raises RecorderError if the log cannot be written."""
 
-    def __init__(self, role: Role, settings: RecorderSettings) -> None:
+    def __init__(self, role: Node, settings: RecorderSettings) -> None:
         self._role = role
         self._backlog = Backlog()
         self._lost: Counter[LossReason] = Counter()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 import pyarrow.parquet
 
-from aeroloop.protocol.wording import Shapes
+from aeroloop.protocol import wording
 from aeroloop.service.config import Settings
 from aeroloop.service.figures import Figures
 from aeroloop.service.lab.sentinel import fingerprint
@@ -83,9 +83,9 @@ def _continues(planned: Plan, out: Path, within_deg: float | None) -> bool:
 def write_table(out: Path, planned: Plan, keys: Sequence[Key], rows: Sequence[Measured]) -> None:
     """Write the table, in place of an older one. Raises OutputError."""
     varied = zip(*(each.values for each in planned.found for _ in range(planned.seeds)), strict=True)
-    known = dict(Shapes(Settings).every_key())
+    known = wording.keys(Settings)
     columns: dict[str, tuple[Any, str]] = {
-        axis.key: (_varied(values), known.get(axis.key, {}).get("description", ""))
+        axis.key: (_varied(values), (axis.key in known and known[axis.key].description) or "")
         for axis, values in zip(planned.axes, varied, strict=True)
     }
     columns["seed"] = pa.array([key.seed for key in keys], pa.int64()), ""

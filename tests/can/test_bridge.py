@@ -20,7 +20,7 @@ from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Rele
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -40,7 +40,7 @@ class Ends:
 
     def __init__(self, gathering: Gathering) -> None:
         bus = virtual()
-        self.role = Role("plant", "aero", gathering.settings, {})
+        self.role = Node("plant", "aero", gathering.settings, {})
         # No watchdog here: it counts real time, and the relay's is tried without.
         self._bridge = Bridge(self.role, LOOP, WIRE, PlantSettings(watchdog_s=10), bus)
         self.node = CanLink(bus, WIRE, "plant")

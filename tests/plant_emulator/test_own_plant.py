@@ -53,7 +53,7 @@ def test_a_class_is_made_with_its_own_settings_and_the_period() -> None:
         (f"{HERE}:NoPlant", {}, "does not derive from aeroloop.Plant"),
         (f"{HERE}:Unfinished", {}, "Unfinished"),
         (TABLE, {"inertai": 1}, "unknown key plant.own.inertai: did you mean plant.own.inertia?"),
-        (TABLE, {"inertia": -1}, "plant.own.inertia must be a number above 0, not -1"),
+        (TABLE, {"inertia": -1}, "plant.own.inertia: should be greater than 0, not -1"),
         (TABLE, {"fails_in": "__init__"}, "Turntable (plant.kind) raised RuntimeError: no such table (own_plants.py"),
         (f"{HERE}:Legless", {}, "Legless has actuators = 0, which must be a whole number from 1 to 8"),
     ],

@@ -173,7 +173,7 @@ def test_what_errs_by_more_promises_less() -> None:
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["wire.rate.kind=loud"], 'wire.rate.kind must be "uniform", "hysteresis-uniform" or'),
+        (["wire.rate.kind=loud"], "wire.rate.kind: should be 'uniform', 'hysteresis-uniform' or"),
         (["wire.rate.hysteresis=0.1"], "wire.rate: hysteresis belongs to kind"),
         (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.bits=2"], "wire.voltage: a logarithmic-uniform"),
         (["wire.voltage.kind=logarithmic-uniform", "wire.voltage.threshold=13"], "wire.voltage: a threshold is"),

@@ -1,7 +1,7 @@
 """A controller's loop with operator changes, without network and clock.
 
-A real Role on a double of the network: outgoing messages are kept as bytes, incoming ones are fed through the declared
-callbacks. Time stands still unless the test moves it (fixture `time` of tests/service/daemon).
+A real Node on a double of the network: outgoing messages are kept as bytes, incoming ones are fed through the declared
+callbacks. Time stands still unless the test moves `Loop.clock`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, SessionRecord
 from aeroloop.protocol.messages.operator import Answer, Change, Gains, Hold, Message, Reference, Setpoint, Sinusoid
 from aeroloop.protocol.messages.trace import TraceWriter
-from aeroloop.protocol.runtime import role, throttle
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime import node
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.spec import SignalSpec, WireSpec
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.daemon import operator_requests, setpoint_stream
+from aeroloop.service.daemon import operator_requests
 from aeroloop.service.daemon.operator_changes import OperatorChanges
 from aeroloop.service.daemon.setpoint_stream import SETPOINTS
 from aeroloop.service.settings import ControllerSettings
+from tests.support.clock import FakeClock
 
 PERIOD = 0.002
 LAW = AdaptiveSettings()
@@ -98,7 +99,7 @@ class Network:
         """Nothing to close."""
 
 
-class LonelyRole(Role):
+class LonelyNode(Node):
     """A role whose publications stay on the network of the test."""
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
@@ -109,22 +110,11 @@ class LonelyRole(Role):
         self._publishers[topic] = publisher
 
 
-class FakeTime:
-    """A clock that moves only when set."""
-
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.now = 1000.0
-        for module in (throttle, role, setpoint_stream):
-            patch.setattr(module, "time", self)
-
-    def monotonic(self) -> float:
-        return self.now
-
-
 class Loop:
     """What the daemon does around OperatorChanges, with a log of what a recorder would have kept.
 
     Attributes:
+        clock: The fake clock of the node.
         k: The next tick.
         session: Name of the session, or "".
         log: Of each session, its frames: (tick, measurement, command).
@@ -137,10 +127,11 @@ class Loop:
         *,
         rolls: bool = False,
     ) -> None:
+        self.clock = FakeClock()
         with pytest.MonkeyPatch.context() as patch:
             self.network = Network()
-            patch.setattr(role, "join", lambda *_: self.network)
-            self.role = LonelyRole("controller", "aero", NetworkSettings(), {}, name="controller-7")
+            patch.setattr(node, "join", lambda *_: self.network)
+            self.role = LonelyNode("controller", "aero", NetworkSettings(), {}, name="controller-7", clock=self.clock)
         self.configured = reference
         self.trace = TraceWriter("controller", WIRE, 1, 10**8)
         self.live = OperatorChanges(

@@ -126,7 +126,7 @@ class Stage(PlantNetwork):
         """Run so many ticks of the plant, and leave."""
         self._ends = ticks
         with (
-            patch("aeroloop.plant_emulator.hosts.driver.TickGrid", lambda _: Grid(self._skip)),
+            patch("aeroloop.plant_emulator.hosts.driver.TickGrid", lambda *_, **__: Grid(self._skip)),
             patch("aeroloop.plant_emulator.hosts.driver.prepare_process", lambda _: []),
             patch("aeroloop.plant_emulator.hosts.driver.IDLE_WAIT_S", 0.0),
         ):

@@ -22,6 +22,7 @@ from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.transmit import SILENCE
 from aeroloop.service.config import Settings, load
 from aeroloop.service.daemon.tick_source import MAILBOX, TickSource
+from tests.support.clock import FakeClock
 from tests.support.made_log import RUNS, SESSION, Clock, ControllerEnd, Messages
 
 
@@ -50,7 +51,7 @@ class Known:
     outcomes: list[Outcome] = field(default_factory=list)
 
 
-class World(Link):
+class World(FakeClock, Link):
     """Plant, network and the controller's end of its link, in one simulated time [ns since the plant's first tick]."""
 
     def __init__(self, known: Known, chance: random.Random, plant_clock: Clock, clock: Clock, depth: int) -> None:
@@ -160,7 +161,7 @@ class World(Link):
     def close(self) -> None:
         pass
 
-    # what the tick source has of `time`
+    # the tick source's clock
 
     def monotonic_ns(self) -> int:
         return self._clock.monotonic_ns()
@@ -178,11 +179,7 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
     plant_clock, clock = Clock("plant"), Clock("controller", drift=chance.choice([0.0, 1e-4, -5e-5]))
     sparse = settings.wire.transmit.measurement == "on_change"
     world = World(known, chance, plant_clock, clock, MAILBOX if sparse else 1)
-    with (
-        patch("aeroloop.plant_emulator.hosts.zenoh_network.time", plant_clock),
-        patch("aeroloop.service.daemon.tick_source.time", world),
-        patch("aeroloop.protocol.runtime.tick_grid.time", world),
-    ):
+    with patch("aeroloop.plant_emulator.hosts.zenoh_network.time", plant_clock):
         endpoint, loop, wire = world.emulator.endpoint, settings.loop, settings.wire
         claim = Claim(
             controller="c", session=SESSION, period_ns=loop.period_ns, lockstep=False, auto_arm=True, wire=wire
@@ -190,7 +187,8 @@ def rough_loop(seed: int, ticks: int = 1500, *overrides: str) -> Known:
         assert isinstance(endpoint.claim(claim), Grant)
         world.trace.follow(endpoint)
         end = ControllerEnd(settings, known.messages, clock)
-        source = TickSource(world, loop, wire, own_grid=chance.random() < 0.3, stale_s=settings.controller.stale_s)
+        own_grid, stale_s = chance.random() < 0.3, settings.controller.stale_s
+        source = TickSource(world, loop, wire, own_grid=own_grid, stale_s=stale_s, clock=world)
         k = -1
         while world.now_ns < ticks * loop.period_ns and endpoint.session is not None:
             now = source.next(0.02)

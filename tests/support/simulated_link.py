@@ -8,6 +8,7 @@ from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import Policy, Transmit
+from tests.support.clock import FakeClock
 
 PERIOD_NS = 2_000_000
 LOOP = LoopSettings(rate_hz=500)
@@ -17,17 +18,14 @@ def wire_of(measurement: Policy, command: Policy) -> WireSpec:
     return WireSpec(transmit=Transmit(measurement=measurement, command=command))
 
 
-class SimulatedLink(Link):
-    """Arrivals at their times; replace the `time` module of what is tested by it."""
+class SimulatedLink(FakeClock, Link):
+    """Arrivals at their times."""
 
     def __init__(self, arrivals: list[Arrival], depth: int) -> None:
-        self.now_ns = 0
+        super().__init__(now_ns=0)
         self._coming = deque(arrivals)
         self._waiting: deque[Arrival] = deque(maxlen=depth)
         self.sent: list[tuple[int, bytes]] = []
-
-    def monotonic_ns(self) -> int:
-        return self.now_ns
 
     def sleep(self, seconds: float) -> None:
         self.pass_time(self.now_ns + round(seconds * 1e9))

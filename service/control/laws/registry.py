@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, Validatio
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import Gains
-from aeroloop.protocol.plugins import PluginError, find, own_words, source_of
+from aeroloop.protocol.plugins import PluginError, exception_line, find, source_of
 from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.control.laws.interface import Law, LawSettings
@@ -144,7 +144,7 @@ def words_of(kind: str, error: Exception) -> str:
     """What a law of this kind raised, in one line."""
     if kind in BUILT_IN:
         return str(error)
-    return f"law {kind}: {own_words(error)}"
+    return f"law {kind}: {exception_line(error)}"
 
 
 def _class_and_settings(section: LawSettings) -> tuple[type[Law[Any]], LawSettings]:

@@ -86,7 +86,7 @@ def test_a_session_begins_with_a_measurement_on_the_grid_however_long_its_grant_
 ) -> None:
     """The controller derives the grid from it; one sent late would put it ticks back."""
     stop, grid = threading.Event(), Grid(LOOP.period_ns)
-    monkeypatch.setattr(driver, "TickGrid", lambda _period_ns: grid)
+    monkeypatch.setattr(driver, "TickGrid", lambda *_, **__: grid)
     front = Granting(grid, stop)
     front.driver = Driver(PlantSettings().build(LOOP.period), LOOP, WireSpec(), PlantSettings(), stop)
     front.driver.run(front)
@@ -120,7 +120,7 @@ def test_the_cycles_of_a_plant_of_ones_own_are_collected_with_a_session_and_with
 ) -> None:
     ticks, wire = 20_000, WireSpec(actuators=1)
     stop, grid = threading.Event(), Grid(LOOP.period_ns)
-    monkeypatch.setattr(driver, "TickGrid", lambda _period_ns: grid)
+    monkeypatch.setattr(driver, "TickGrid", lambda *_, **__: grid)
     front = Granting(grid, stop, ticks, wire)
     settings = PlantSettings(watchdog_s=ticks / 4 * LOOP.period)
     front.driver = Driver(Cyclic(TurntableSettings(), LOOP.period), LOOP, wire, settings, stop)

@@ -21,7 +21,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Status
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
@@ -111,7 +111,7 @@ class Plant:
 
     def __init__(self, folder: Path) -> None:
         self._gathering = Gathering()
-        self._role = Role("plant", "aero", self._gathering.settings, {})
+        self._role = Node("plant", "aero", self._gathering.settings, {})
         settings = PlantSettings(state_directory=folder, armed_at_start=True)
         self.emulator = EmulatorOnZenoh(self._role, LOOP, WIRE, settings)
         self._session = self._gathering.join()

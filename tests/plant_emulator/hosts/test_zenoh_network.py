@@ -15,7 +15,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Claim, Grant, Release
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
-from aeroloop.protocol.runtime.role import OccupiedError, Role
+from aeroloop.protocol.runtime.node import Node, OccupiedError
 from aeroloop.protocol.transport.history import RecoveringSubscriber
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
@@ -30,7 +30,7 @@ ANSWERED = 60
 
 
 def test_a_subscriber_that_joins_after_a_session_recovers_its_trace_and_the_plant_replays() -> None:
-    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
         emulator = EmulatorOnZenoh(role, LOOP, WIRE, PLANT)
         thread = threading.Thread(target=emulator.run)
         thread.start()
@@ -87,7 +87,7 @@ def test_a_subscriber_that_joins_after_a_session_recovers_its_trace_and_the_plan
 @contextmanager
 def running(network: NetworkSettings, vehicle: str = "aero") -> Iterator[EmulatorOnZenoh]:
     """An armed emulator on a network."""
-    with Role("plant", vehicle, network, {}) as role:
+    with Node("plant", vehicle, network, {}) as role:
         emulator = EmulatorOnZenoh(role, LOOP, WIRE, PLANT.model_copy(update={"armed_at_start": True}))
         thread = threading.Thread(target=emulator.run)
         thread.start()
@@ -104,7 +104,7 @@ def test_a_second_plant_of_a_vehicle_refuses_to_start_and_names_the_first() -> N
         key = topics.key("status", "aero", role="plant")
         eventually("a status", lambda: any(reply.ok is not None for reply in zenoh.get(key)))
         with pytest.raises(OccupiedError, match=r"aero has a plant already \(.*, pid \d+\); stop that one, or"):
-            Role("plant", "aero", gathering.settings, {})
+            Node("plant", "aero", gathering.settings, {})
         with running(gathering.settings, "another") as emulator:
             assert emulator.endpoint.cause is None
 

@@ -45,7 +45,7 @@ def test_an_unknown_kind_is_refused_also_within_what_may_be_absent() -> None:
         "reference": {"kind": "x"},
     }
     record |= {"reference_from": "operator", "within_s": 1.0, "since_tick": 0}
-    with pytest.raises(IntakeError, match=r'last\.reference\.kind must be "hold", .* or "stream", not "x"'):
+    with pytest.raises(IntakeError, match=r"last\.reference\.kind: tag 'x' .* 'hold', .* 'stream'"):
         read(Grant, json.dumps({"session": "s", "last": record}).encode())
 
 
@@ -89,21 +89,26 @@ def test_every_message_that_a_role_may_send_is_read() -> None:
 
 def test_only_the_first_of_many_errors_is_put_into_words(monkeypatch: pytest.MonkeyPatch) -> None:
     """Words for all of them took a second."""
-    said, say = list[str](), wording._problem
-
-    def counted(shapes: wording.Shapes, error: dict[str, Any]) -> str:
-        said.append(say(shapes, error))
-        return said[-1]
-
-    monkeypatch.setattr(wording, "_problem", counted)
+    searched: list[str] = []
+    monkeypatch.setattr(wording, "closest", lambda key, _: searched.append(key))
     keys = "{" + ",".join(f'"k{number}":0' for number in range(FEW)) + "}"
-    with pytest.raises(IntakeError) as refused:
+    with pytest.raises(IntakeError, match=r"^not a Request: unknown key k0$"):
         read(Request, keys.encode())
-    assert said == [str(refused.value).removeprefix("not a Request: ")]
-    assert said[0].startswith("unknown key k0")
+    assert searched == ["k0"]
 
 
-def test_an_unknown_key_of_any_length_is_shown_in_part() -> None:
+def test_an_unknown_key_of_any_length_is_shown_in_part_and_nothing_like_it_is_looked_for() -> None:
     with pytest.raises(IntakeError) as refused:
         read(Request, b'{"' + b"x" * 16_000 + b'":0}')
     assert len(str(refused.value)) < 200
+    assert wording.closest("x" * 200, ["x" * 201]) is None
+
+
+def test_what_a_stranger_sends_cannot_move_the_terminals_cursor() -> None:
+    for payload in (b'{"\\u001b[2J\\n": 0}', b'{"by": "\\u001b[2J\\n"}', b'{"by": {"\\u001b[2J\\n": 0}}'):
+        with pytest.raises(IntakeError) as refused:
+            read(Request, payload)
+        assert str(refused.value).isprintable()
+    with pytest.raises(IntakeError, match=r"reference\.kind: tag ' \[2J ' found") as refused:
+        read(Track, b'{"reference": {"kind": "\\u001b[2J\\n"}}')
+    assert str(refused.value).isprintable()

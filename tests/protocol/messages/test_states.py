@@ -30,8 +30,6 @@ from aeroloop.protocol.messages.states import (
     PlantTrigger,
     TripCause,
 )
-from aeroloop.protocol.runtime import throttle
-from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.spec import WireSpec
 
@@ -417,65 +415,3 @@ def test_a_command_that_answers_no_measurement_of_this_session_does_not_drive() 
     endpoint.tick(None, 100)  # the measurement with counter 0, the only one that there is to answer
     endpoint.tick(WIRE.command.pack(5, (31, 31)), 101)
     assert endpoint.state is PlantState.GRANTED
-
-
-# How often it may warn
-
-
-class FakeTime:
-    """A clock that moves only when set."""
-
-    def __init__(self) -> None:
-        self.now = 5.0
-
-    def monotonic(self) -> float:
-        """The time [s]."""
-        return self.now
-
-
-@pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
-    """The fake clock in place of the module's `time`."""
-    time = FakeTime()
-    monkeypatch.setattr(throttle, "time", time)
-    return time
-
-
-def test_the_first_of_a_kind_passes_and_what_follows_is_held_back_and_counted(fake: FakeTime) -> None:
-    throttle = Throttle(10.0)
-    assert throttle.let_pass("stall") == 0
-    for _ in range(7):
-        fake.now += 1.0
-        assert throttle.let_pass("stall") is None
-    fake.now += 2.75
-    assert throttle.let_pass("stall") is None
-    fake.now += 0.25
-    assert throttle.let_pass("stall") == 8  # what was held back did not put it off
-    assert throttle.let_pass("stall") is None
-    fake.now += 10.0
-    assert throttle.let_pass("stall") == 1  # counted anew
-
-
-def test_one_kind_does_not_hold_another_back(fake: FakeTime) -> None:
-    throttle = Throttle(10.0)
-    assert throttle.let_pass("stall") == 0
-    fake.now += 5.0
-    assert throttle.let_pass("set-point") == 0
-    fake.now += 5.0
-    assert throttle.let_pass("stall") == 0
-    assert throttle.let_pass("set-point") is None
-
-
-def test_a_first_warning_just_after_the_machine_has_started_passes(fake: FakeTime) -> None:
-    fake.now = 0.0
-    assert Throttle(10.0).let_pass("stall") == 0
-
-
-def test_a_throttle_is_of_bounded_size_however_many_kinds_there_are(fake: FakeTime) -> None:
-    throttle = Throttle(10.0)
-    sizes = set()
-    for i in range(5 * Throttle.MAX_KINDS):
-        fake.now += 1e-3
-        assert throttle.let_pass(f"from {i}") == 0
-        sizes.add(sum(len(kept) for kept in vars(throttle).values() if isinstance(kept, dict)))
-    assert max(sizes) == Throttle.MAX_KINDS

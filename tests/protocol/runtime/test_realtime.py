@@ -9,8 +9,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -72,6 +73,10 @@ def test_a_prepared_process_is_as_it_reports() -> None:
     assert ("idle CPUs sleep" in reported) == (not awake)
 
 
+def refuse(*_: object) -> None:
+    raise PermissionError(1, "Operation not permitted")
+
+
 @pytest.fixture
 def cpu_latency(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A file in place of the kernel's, which would keep CPUs awake until the tests end; the collector stays on."""
@@ -83,23 +88,27 @@ def cpu_latency(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return file
 
 
+def system(
+    monkeypatch: pytest.MonkeyPatch, mlockall: Callable[[int], int], schedule: Callable[..., None] = lambda *_: None
+) -> None:
+    """System calls in place of the kernel's."""
+    libc = SimpleNamespace(prctl=lambda *_: 0, mlockall=mlockall)
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: libc)
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+
+
 @pytest.mark.parametrize(("known", "called"), [(True, [7]), (False, [7, 3])])
 def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_than_4_4(
     monkeypatch: pytest.MonkeyPatch, cpu_latency: Path, known: bool, called: list[int]
 ) -> None:
     flags: list[int] = []
 
-    class Libc:
-        prctl = madvise = staticmethod(lambda *_: 0)
+    def mlockall(value: int) -> int:
+        flags.append(value)
+        ctypes.set_errno(0 if known or value < 4 else errno.EINVAL)
+        return 0 if known or value < 4 else -1
 
-        @staticmethod
-        def mlockall(value: int) -> int:
-            flags.append(value)
-            ctypes.set_errno(0 if known or value < 4 else errno.EINVAL)
-            return 0 if known or value < 4 else -1
-
-    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
-    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
+    system(monkeypatch, mlockall)
     assert prepare_process(LoopSettings(realtime="try")) == []
     assert flags == called
     assert cpu_latency.read_bytes() == bytes(4)
@@ -108,15 +117,7 @@ def test_memory_is_locked_as_it_is_touched_or_at_once_where_the_kernel_is_older_
 def test_strict_names_what_is_refused_and_off_asks_for_nothing(
     monkeypatch: pytest.MonkeyPatch, cpu_latency: Path
 ) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    class Libc:
-        prctl = madvise = staticmethod(lambda *_: 0)
-        mlockall = staticmethod(lambda *_: -1)
-
-    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    system(monkeypatch, lambda _: -1, refuse)
     assert prepare_process(LoopSettings(realtime="off")) == []
     assert cpu_latency.read_bytes() == b""
     cpu_latency.unlink()
@@ -124,17 +125,6 @@ def test_strict_names_what_is_refused_and_off_asks_for_nothing(
     assert [line.split(":")[0] for line in refused] == ["memory lock", "SCHED_FIFO 10", "idle CPUs sleep"]
     with pytest.raises(RealtimeError, match="SCHED_FIFO"):
         prepare_process(LoopSettings(realtime="strict"))
-
-
-def test_a_strict_process_starts_although_idle_cpus_may_sleep(
-    monkeypatch: pytest.MonkeyPatch, cpu_latency: Path
-) -> None:
-    cpu_latency.unlink()
-
-    class Libc:
-        prctl = mlockall = madvise = staticmethod(lambda *_: 0)
-
-    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
-    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
-    [line] = prepare_process(LoopSettings(realtime="strict"))
+    system(monkeypatch, lambda _: 0)
+    (line,) = prepare_process(LoopSettings(realtime="strict"))  # a strict process starts although idle CPUs may sleep
     assert "idle CPUs sleep" in line

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.topics import QUERIES_PER_S, TOPICS, Topic
-from aeroloop.protocol.runtime.processes import listener, name_process
+from aeroloop.protocol.runtime.host import listener, name_process
 from aeroloop.protocol.transport.network import command_session
 from aeroloop.protocol.transport.network_settings import NetworkError, NetworkSettings
 from aeroloop.protocol.transport.probe import accepting

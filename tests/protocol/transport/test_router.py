@@ -14,7 +14,7 @@ import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.history import CachedPublisher, RecoveringSubscriber
 from aeroloop.protocol.transport.network import command_session, join, route, zenohd_config
 from aeroloop.protocol.transport.network_settings import Identity, NetworkError, NetworkSettings, protected
@@ -180,7 +180,7 @@ def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions:
     """The router has rules, too: a claim of the controller passes it, one of a recorder does not."""
     network = of(Authority(tmp_path))
     names = ("router", "plant", "controller", "recorder")
-    roles = {name: open_sessions.enter_context(Role(name, "aero", network, {})) for name in names}
+    roles = {name: open_sessions.enter_context(Node(name, "aero", network, {})) for name in names}
     claims: list[bytes] = []
     key = topics.key("claim", "aero")
 
@@ -188,7 +188,7 @@ def test_roles_keep_to_their_rights_over_a_router(tmp_path: Path, open_sessions:
         claims.append(query.payload.to_bytes() if query.payload else b"")
         query.reply(key, b"granted")
 
-    roles["plant"].answer(key, answer)
+    roles["plant"].zenoh.declare_queryable(key, answer, complete=True)
     for each in roles.values():
         each.announce()
         each.status(Status(role=each.role, state="idle", uptime_s=0.0, ticks=0, rate_hz=0.0, skipped=0))

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from aeroloop.protocol.runtime import role
+from aeroloop.protocol.runtime import node
 from aeroloop.protocol.transport import lingering
 from aeroloop.protocol.transport.zenoh_config import THREADS
 from aeroloop.service.cli.common import DaemonOptions, run_role
@@ -23,7 +23,7 @@ def test_zenoh_gets_several_threads_in_a_daemon_unless_the_user_says_otherwise(m
         threads.append(os.environ.get("ZENOH_RUNTIME"))
         return nullcontext(Mock())
 
-    monkeypatch.setattr(role, "Role", joins)
+    monkeypatch.setattr(node, "Node", joins)
     monkeypatch.setattr(lingering, "no_linger", lambda: None)  # it would filter the tests' own system calls
     for configured, used in ((None, THREADS), ("(rx: (worker_threads: 2))", "(rx: (worker_threads: 2))")):
         monkeypatch.delenv("ZENOH_RUNTIME", raising=False)

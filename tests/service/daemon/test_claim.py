@@ -12,7 +12,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.intake import STATUS
 from aeroloop.protocol.messages.models import Grant, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Gains, Hold
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.daemon import claim
@@ -46,7 +46,7 @@ def reply(answer: Answer) -> SimpleNamespace:
 
 def test_a_record_is_sent_until_the_plant_has_answered_and_then_only_when_it_changes() -> None:
     queries = Queries()
-    role = cast(Role, SimpleNamespace(zenoh=queries, vehicle="aero"))
+    role = cast(Node, SimpleNamespace(zenoh=queries, vehicle="aero"))
     claims = ClaimClient(role, LoopSettings(), WireSpec(), auto_arm=False)
     first, second = record(1.0), record(2.0)
     claims.keep(first)
@@ -118,7 +118,7 @@ def test_a_claims_frames_travel_by_datagrams_where_the_plant_takes_them(
         return object()
 
     monkeypatch.setattr(claim, "ZenohLink", link)
-    claims = ClaimClient(cast(Role, role), LoopSettings(), WireSpec(), auto_arm=False)
+    claims = ClaimClient(cast(Node, role), LoopSettings(), WireSpec(), auto_arm=False)
     assert (claims.claim() is not None) == (carrier != "none")
     assert used == {"datagrams": [datagrams], "first": [first], "none": []}[carrier]
     assert claims.by_datagrams == (carrier == "datagrams")

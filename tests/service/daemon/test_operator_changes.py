@@ -14,7 +14,7 @@ from aeroloop.protocol.messages.operator import Change, Gains, Hold, Message, Po
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, gains_with, measured, turned
+from tests.support.operated_loop import LAW, LEVEL, PERIOD, SWING, WIRE, Loop, gains_with, measured, turned
 
 NO_VALID_VALUE: Final = [float("nan")] * 6
 LATER_TOO_FAST = Points(
@@ -158,7 +158,6 @@ def test_coming_to_rest_is_published_as_the_attitude_at_which_it_does(loop: Loop
     assert loop.changes()[0].reference == rest  # and there the next session begins, not at 0
 
 
-@pytest.mark.usefixtures("time")
 def test_going_back_in_the_middle_of_a_turn_brakes_first_and_never_swings_out() -> None:
     """Yaw 70°, turning by 12°/s, and 40 s to go to 30°: a single quintic would turn on to 115°."""
     loop = Loop(Sinusoid(amplitude=(0.0, 0.0, 100.0), frequency=(0.0, 0.0, 0.17)))
@@ -176,7 +175,6 @@ def test_going_back_in_the_middle_of_a_turn_brakes_first_and_never_swings_out() 
 
 
 @pytest.mark.parametrize("at_s", [2.0, 7.0, 12.0, 17.0, 22.0, 33.0])
-@pytest.mark.usefixtures("time")
 def test_more_time_than_needed_is_never_too_much(at_s: float) -> None:
     """Going to 0 within 60 s in the middle of the default sinusoid; a single quintic would tilt upside down."""
     loop = Loop(Sinusoid())
@@ -290,30 +288,28 @@ steps: st.SearchStrategy[tuple[str, Any]] = st.one_of(
 def test_from_the_logged_changes_a_fresh_controller_gives_the_same_commands_byte_for_byte(
     configured: Reference, after_restart: str, history: list[tuple[str, Any]]
 ) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        time = FakeTime(patch)
-        given = {"max_reference_rate": 50.0, "after_restart": after_restart}
-        loop = Loop(configured, ControllerSettings.model_validate(given))
-        loop.begin()
-        for what, value in [*history, ("ticks", [[0.1, 0.0, 0.2, 0.0, 0.1, 0.3]] * 30)]:
-            match what:
-                case "ticks":
-                    for row in value:
-                        loop.tick(row)
-                case "set_gains" | "track":
-                    loop.ask(what, value)
-                case "set-points":
-                    for _, pitch, yaw in value:
-                        loop.stream(yaw, pitch)
-                case "time":
-                    time.now += value
-                case "no valid value":
-                    loop.tick(NO_VALID_VALUE)
-                case "malformed":
-                    loop.malformed()
-                case "gap":
-                    loop.k += 40
-                case "next session":
-                    loop.end()
-                    loop.begin()
-        loop.assert_it_runs_again()
+    given = {"max_reference_rate": 50.0, "after_restart": after_restart}
+    loop = Loop(configured, ControllerSettings.model_validate(given))
+    loop.begin()
+    for what, value in [*history, ("ticks", [[0.1, 0.0, 0.2, 0.0, 0.1, 0.3]] * 30)]:
+        match what:
+            case "ticks":
+                for row in value:
+                    loop.tick(row)
+            case "set_gains" | "track":
+                loop.ask(what, value)
+            case "set-points":
+                for _, pitch, yaw in value:
+                    loop.stream(yaw, pitch)
+            case "time":
+                loop.clock.advance(value)
+            case "no valid value":
+                loop.tick(NO_VALID_VALUE)
+            case "malformed":
+                loop.malformed()
+            case "gap":
+                loop.k += 40
+            case "next session":
+                loop.end()
+                loop.begin()
+    loop.assert_it_runs_again()

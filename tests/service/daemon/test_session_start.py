@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from math import cos, degrees, radians, sin
 
 import pytest
@@ -23,7 +22,7 @@ from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, distance, received_quaternion
 from aeroloop.service.daemon.session_start import remaining
 from aeroloop.service.settings import ControllerSettings
-from tests.support.operated_loop import LEVEL, PERIOD, SWING, WIRE, FakeTime, Loop, turned
+from tests.support.operated_loop import LEVEL, PERIOD, SWING, WIRE, Loop, turned
 
 GAINS = Gains(C1=(0.5, 0.5, 0.5), C2=(0.4, 0.4, 0.4), Gamma=(0.1, 0.1, 0.1))
 TARGET = Hold(attitude=(0.0, 0.0, 60.0))
@@ -74,12 +73,6 @@ def reached(loop: Loop, yaw: float) -> float:
     for _ in range(3500):
         loop.tick(turned(yaw))
     return loop.yaw()
-
-
-@pytest.fixture(autouse=True)
-def _still(time: FakeTime) -> Iterable[None]:  # the clock moves only when set
-    del time
-    return iter([None])
 
 
 # ── hold ──

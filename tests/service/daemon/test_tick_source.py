@@ -15,8 +15,7 @@ from aeroloop.protocol.transport.link import Arrival
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE, Sender
-from aeroloop.service.daemon import tick_source
-from aeroloop.service.daemon.tick_source import PlantTick, TickSource
+from aeroloop.service.daemon.tick_source import MAILBOX, PlantTick, TickSource
 from tests.support.simulated_link import LOOP, PERIOD_NS, SimulatedLink, wire_of
 
 WIRE = wire_of("on_change", "on_change")
@@ -46,18 +45,15 @@ class Source:
     def __init__(
         self,
         arrivals: Iterable[Arrival],
-        monkeypatch: pytest.MonkeyPatch,
         *,
+        depth: int = MAILBOX,
         wire: WireSpec = WIRE,
         loop: LoopSettings = LOOP,
         own_grid: bool = False,
         stale_s: float = 0.1,
     ) -> None:
-        self.link = SimulatedLink(sorted(arrivals, key=lambda each: each.at_ns), tick_source.MAILBOX)
-        monkeypatch.setattr(tick_source, "time", self.link)
-        if own_grid:
-            monkeypatch.setattr("aeroloop.protocol.runtime.tick_grid.time", self.link)
-        self.source = TickSource(self.link, loop, wire, own_grid=own_grid, stale_s=stale_s)
+        self.link = SimulatedLink(sorted(arrivals, key=lambda each: each.at_ns), depth)
+        self.source = TickSource(self.link, loop, wire, own_grid=own_grid, stale_s=stale_s, clock=self.link)
         self.taken: list[tuple[PlantTick, int]] = []  # and when
 
     def run(self, until_ns: int) -> list[PlantTick]:
@@ -93,8 +89,8 @@ def heartbeats(last: int, codes: Mapping[int, int] | None = None) -> list[Arriva
     return sent
 
 
-def test_a_frame_is_a_tick_as_it_arrives_and_silence_half_a_period_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Source(heartbeats(40, {7: 1}), monkeypatch)
+def test_a_frame_is_a_tick_as_it_arrives_and_silence_half_a_period_later() -> None:
+    source = Source(heartbeats(40, {7: 1}))
     ticks = source.run(until(40))
     assert source.ticks == list(range(41))
     sent = {k: at_ns for at_ns, k in ((k * PERIOD_NS + DELAY_NS, k) for k in (0, 7, 22, 37))}
@@ -108,26 +104,24 @@ def test_a_frame_is_a_tick_as_it_arrives_and_silence_half_a_period_later(monkeyp
     assert all(each.due_ns == source.when(each.tick) for each in ticks)
 
 
-def test_there_is_no_tick_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Source([arrival(30)], monkeypatch)
+def test_there_is_no_tick_before_the_first_frame() -> None:
+    source = Source([arrival(30)])
     source.run(until(32))
     assert source.taken[0][0].frame == frame(30)
     assert source.ticks == [30 + i for i in range(3)]  # a session's first frame has its tick for a counter
 
 
-def test_a_late_frame_is_no_second_tick_and_brings_its_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_late_frame_is_no_second_tick_and_brings_its_levels() -> None:
     late = arrival(5, 9, late_ns=HALF_NS + 1)
-    source = Source([arrival(0), late], monkeypatch)
+    source = Source([arrival(0), late])
     ticks = source.run(until(8))
     assert source.ticks == list(range(9))
     assert [(each.tick, each.frame) for each in ticks if in_passing(each)] == [(5, frame(5, 9))]
     assert source.when(5) == until(5)
 
 
-def test_of_frames_that_wait_together_the_newest_is_computed_and_the_others_are_missed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    source = Source([arrival(0), *(arrival(k, k) for k in range(5, 9))], monkeypatch)
+def test_of_frames_that_wait_together_the_newest_is_computed_and_the_others_are_missed() -> None:
+    source = Source([arrival(0), *(arrival(k, k) for k in range(5, 9))])
     source.run(until(4))
     source.link.pass_time(until(8) - HALF_NS)  # the controller was kept waiting for three ticks
     ticks = source.run(until(10))[5:]
@@ -136,9 +130,9 @@ def test_of_frames_that_wait_together_the_newest_is_computed_and_the_others_are_
     assert source.ticks == [0, 1, 2, 3, 4, 8, 9, 10]
 
 
-def test_a_frame_whose_tick_is_long_over_is_not_answered_but_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_whose_tick_is_long_over_is_not_answered_but_held() -> None:
     """A controller that wakes from a stall goes on with the present."""
-    source = Source([arrival(0), arrival(5, 9)], monkeypatch)
+    source = Source([arrival(0), arrival(5, 9)])
     source.run(until(4))
     source.link.pass_time(until(9) + 1)
     ticks = source.run(until(10))[5:]
@@ -149,17 +143,17 @@ def test_a_frame_whose_tick_is_long_over_is_not_answered_but_held(monkeypatch: p
     ]
 
 
-def test_the_levels_of_a_frame_are_used_for_no_tick_before_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_levels_of_a_frame_are_used_for_no_tick_before_its_own() -> None:
     """By its counter, the only evidence, one may be of a tick that is still to come."""
     early = arrival(8, 9)._replace(at_ns=arrival(5).at_ns)
     nonsense = arrival(5, content=b"\0")  # waits behind it, so that it is taken in passing
-    source = Source([arrival(0), early, nonsense], monkeypatch)
+    source = Source([arrival(0), early, nonsense])
     source.run(until(9))
     assert [tick for tick in source.ticks if tick > 4][:2] == [8, 9]
 
 
-def test_a_stall_of_the_controller_in_silence_counts_as_ticks_missed(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Source([arrival(0)], monkeypatch)
+def test_a_stall_of_the_controller_in_silence_counts_as_ticks_missed() -> None:
+    source = Source([arrival(0)])
     source.run(until(4))
     source.link.pass_time(until(9) + 1)
     ticks = source.run(until(11))
@@ -169,9 +163,7 @@ def test_a_stall_of_the_controller_in_silence_counts_as_ticks_missed(monkeypatch
 
 @pytest.mark.parametrize("drift", [-1e-2, -1e-4, 1e-4, 1e-2])
 @pytest.mark.parametrize("jitter_ns", [0, 150_000])
-def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(
-    drift: float, jitter_ns: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(drift: float, jitter_ns: int) -> None:
     """The plant's period is longer or shorter by the controller's clock, up to one that runs 1 % fast or slow."""
     last = 12_000
     sent = []
@@ -179,7 +171,7 @@ def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(
         k = (each.at_ns - DELAY_NS) // PERIOD_NS
         at_ns = round(k * PERIOD_NS * (1 + drift)) + DELAY_NS + (k * 7919 % 97) * jitter_ns // 97
         sent.append(each._replace(at_ns=at_ns))
-    source = Source(sent, monkeypatch)
+    source = Source(sent)
     ticks = source.run(round(last * PERIOD_NS * (1 + drift)))
     assert source.ticks == list(range(len(source.ticks)))
     assert len(source.ticks) >= last - 1
@@ -187,8 +179,8 @@ def test_clocks_that_drift_apart_neither_miss_nor_double_a_tick(
 
 
 @pytest.mark.parametrize("nonsense", [SILENCE, b"\0", frame(5) + b"\0"], ids=["empty", "short", "long"])
-def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Source([arrival(0), *(arrival(k, content=nonsense) for k in range(1, 9))], monkeypatch)
+def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes) -> None:
+    source = Source([arrival(0), *(arrival(k, content=nonsense) for k in range(1, 9))])
     ticks = source.run(until(8))
     assert source.ticks == list(range(9))
     assert [source.when(k) for k in range(1, 9)] == [until(k) for k in range(1, 9)]
@@ -196,34 +188,34 @@ def test_nonsense_is_no_tick_and_no_sign_of_life(nonsense: bytes, monkeypatch: p
     assert [each.frame for each in ticks if in_passing(each)] == [nonsense] * 8
 
 
-def test_a_frame_that_nonsense_follows_at_once_keeps_its_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_nonsense_follows_at_once_keeps_its_levels() -> None:
     both = [arrival(5, 9, late_ns=HALF_NS - 10), arrival(5, late_ns=HALF_NS - 10, content=b"\0")]
-    source = Source([arrival(0), *both], monkeypatch)
+    source = Source([arrival(0), *both])
     ticks = source.run(until(6))
     assert [each.frame for each in ticks if each.tick >= 4] == [SILENCE, frame(5, 9), b"\0", SILENCE, SILENCE]
     assert source.ticks == list(range(7))
 
 
-def test_a_frame_that_comes_twice_is_one_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_comes_twice_is_one_tick() -> None:
     twice = [arrival(3, 1), arrival(3, 1, late_ns=1000), arrival(3, 1, late_ns=PERIOD_NS)]
-    source = Source([arrival(0), *twice], monkeypatch)
+    source = Source([arrival(0), *twice])
     source.run(until(6))
     assert source.ticks == list(range(7))
     assert not any(in_passing(each) for each, _ in source.taken)
 
 
-def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_lockstep_an_empty_frame_is_the_next_tick_whatever_the_time() -> None:
     contents = [frame(0), *[SILENCE] * 14, frame(15), *[SILENCE] * 3]
     arrivals = [Arrival(content, 7 * PERIOD_NS * i) for i, content in enumerate(contents)]
-    source = Source(arrivals, monkeypatch, loop=LOOP.model_copy(update={"lockstep": True}))
+    source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
     ticks = source.run(7 * PERIOD_NS * 18)
     assert [(each.tick, each.frame, each.missed) for each in ticks] == [(k, each, 0) for k, each in enumerate(contents)]
 
 
-def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost() -> None:
     contents = [frame(0), *[SILENCE] * 14, *[SILENCE] * 14, frame(30)]  # the frame of tick 15 is not there
     arrivals = [Arrival(content, PERIOD_NS * i) for i, content in enumerate(contents)]
-    source = Source(arrivals, monkeypatch, loop=LOOP.model_copy(update={"lockstep": True}))
+    source = Source(arrivals, loop=LOOP.model_copy(update={"lockstep": True}))
     source.run(PERIOD_NS * 30)
     assert source.ticks == [*range(29), 30]
 
@@ -233,12 +225,10 @@ def test_in_lockstep_ticks_count_on_over_a_heartbeat_that_was_lost(monkeypatch: 
 
 @pytest.mark.parametrize("phase_ns", [250_000, 700_000, 1_300_000, 1_900_000])
 @pytest.mark.parametrize("every", [1, 2, 5])
-def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(
-    phase_ns: int, every: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(phase_ns: int, every: int) -> None:
     """Wherever in the plant's period it stands, but for its first tenth, and however often there is a frame."""
     last = 300
-    source = Source(heartbeats(last, {k: k % 5 for k in range(0, last, every)}), monkeypatch, own_grid=True)
+    source = Source(heartbeats(last, {k: k % 5 for k in range(0, last, every)}), own_grid=True)
     source.source._grid.start_ns = phase_ns + DELAY_NS  # type: ignore[union-attr]  # it has one
     ticks = source.run(last * PERIOD_NS)
     assert len(source.ticks) > last - 5
@@ -246,8 +236,8 @@ def test_on_a_grid_of_ones_own_every_tick_of_the_plant_still_comes(
     assert sum(each.missed for each in ticks) <= 1
 
 
-def test_on_a_grid_of_ones_own_what_has_piled_up_is_caught_up_with_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Source([arrival(k, k % 5) for k in range(100)], monkeypatch, own_grid=True)
+def test_on_a_grid_of_ones_own_what_has_piled_up_is_caught_up_with_at_once() -> None:
+    source = Source([arrival(k, k % 5) for k in range(100)], own_grid=True)
     source.run(until(9))
     source.link.pass_time(until(14))
     source.run(until(60))
@@ -261,15 +251,11 @@ def test_on_a_grid_of_ones_own_what_has_piled_up_is_caught_up_with_at_once(monke
 PERIODIC = WireSpec()
 
 
-def test_a_frame_that_is_later_than_the_stale_time_is_not_answered_and_shows_no_life(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_frame_that_is_later_than_the_stale_time_is_not_answered_and_shows_no_life() -> None:
     """A link that holds everything up for a while and then delivers it: what is old is refused, what is new is not."""
-    held = range(100, 200)  # all of them arrive 250 ms after tick 100
-    arrivals = [arrival(k, late_ns=max(0, 125 - (k - 100)) * PERIOD_NS if k in held else 0) for k in range(300)]
-    source = Source(arrivals, monkeypatch, wire=PERIODIC)
-    source.link = source.source._link = SimulatedLink(arrivals, 300)  # each is taken
-    monkeypatch.setattr(tick_source, "time", source.link)
+    held = range(100, 225)  # all of them arrive with tick 225
+    arrivals = [arrival(k, late_ns=(225 - k) * PERIOD_NS if k in held else 0) for k in range(300)]
+    source = Source(arrivals, depth=300, wire=PERIODIC)  # each is taken
     taken = source.run(until(299))
     stale = [each.tick for each in taken if each.received_as is Received.LATE]
     assert stale
@@ -280,11 +266,11 @@ def test_a_frame_that_is_later_than_the_stale_time_is_not_answered_and_shows_no_
 
 
 @pytest.mark.parametrize("offset_ns", [0, 10**10, -(10**9), 3_600 * 10**9])
-def test_what_a_clock_reads_makes_no_difference(offset_ns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_clock_reads_makes_no_difference(offset_ns: int) -> None:
     start = 10**10 + offset_ns
     arrivals = [arrival(k, late_ns=(k * 7919 % 97) * 1000)._replace() for k in range(600) if k % 50]
     arrivals = [each._replace(at_ns=each.at_ns + start) for each in arrivals]
-    source = Source(arrivals, monkeypatch, wire=PERIODIC)
+    source = Source(arrivals, wire=PERIODIC)
     taken = source.run(start + until(599))
     assert source.ticks == [k for k in range(600) if k % 50]
     assert all(each.late_ns < PERIOD_NS for each in taken)

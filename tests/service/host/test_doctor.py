@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from aeroloop.protocol.runtime import tick_grid
+from aeroloop.protocol.runtime.timing import TickGrid
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, SecuritySettings
 from aeroloop.protocol.wire.loop import LoopSettings
@@ -46,14 +46,14 @@ def test_the_trial_runs_at_the_configured_rate_and_every_finding_is_reported() -
 def test_a_machine_that_stalls_does_not_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "prepare_process", lambda _settings: [])
     monkeypatch.setattr(doctor, "CHECK_S", 1.0)
-    wait = tick_grid.TickGrid.wait
+    wait = TickGrid.wait
 
-    def stalling(grid: tick_grid.TickGrid) -> int:
+    def stalling(grid: TickGrid) -> int:
         if grid.tick == 70:
             time.sleep(0.1)
         return wait(grid)
 
-    monkeypatch.setattr(tick_grid.TickGrid, "wait", stalling)
+    monkeypatch.setattr(TickGrid, "wait", stalling)
     diagnosis = doctor.diagnose(LoopSettings(rate_hz=100.0))
     assert not diagnosis.holds
     assert diagnosis.skipped > 0

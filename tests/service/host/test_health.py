@@ -6,7 +6,6 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,13 +13,14 @@ import pytest
 from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 from aeroloop.protocol.messages.models import Percentiles, Status, Timing
 from aeroloop.protocol.messages.states import NOT_RECORDING, STOPPED
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.service.cli.main import execute as run
 from aeroloop.service.config import load
 from aeroloop.service.daemon.daemon import Daemon
 from aeroloop.service.host.health import LATE_SHARE, SILENT_S, Trouble, troubles
 from aeroloop.service.host.operator import Gathered, OperatorError, gather
+from tests.support.clock import FakeClock
 from tests.support.zenoh_network import Gathering, eventually
 
 PERIOD = Percentiles(count=5000, p50=2000, p99=2100, p999=2200, max=2300)
@@ -94,22 +94,13 @@ def test_what_skips_and_delays_within_the_limits_is_not_late() -> None:
     assert of(controller=lockstep) == []
 
 
-def clock_of_roles(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The clock of roles [s], to be set."""
-    clock = [100.0]
-    monkeypatch.setattr("aeroloop.protocol.runtime.role.time", SimpleNamespace(monotonic=lambda: clock[0]))
-    return clock
-
-
-def test_a_loop_that_hangs_is_known_by_the_age_of_its_status(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Zenoh's threads answer for it. The role's clock is moved instead of waiting."""
-    clock = clock_of_roles(monkeypatch)
-    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+def test_a_loop_that_hangs_is_known_by_the_age_of_its_status(capfd: pytest.CaptureFixture[str]) -> None:
+    """Zenoh's threads answer for it. The node's clock is moved instead of waiting."""
+    clock = FakeClock()
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}, clock=clock) as role:
         role.status(status("plant", "driven"))
         assert gather(gathering.settings).statuses["aero"]["plant"].age_s == 0
-        clock[0] += 10
+        clock.advance(10)
         network = f"network.rendezvous={gathering.settings.rendezvous[0]}"
         capfd.readouterr()
         assert run(["op", "status", "--set", network]) == 0
@@ -127,11 +118,11 @@ def test_a_loop_that_hangs_is_known_by_the_age_of_its_status(
 
 def test_skipped_ticks_are_counted_over_the_last_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     published: list[int] = []
-    clock = clock_of_roles(monkeypatch)
-    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+    clock = FakeClock()
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}, clock=clock) as role:
         monkeypatch.setattr(role, "publish", lambda _, message: published.append(message.recent_skipped))
         for at, skipped in ((100, 7), (105, 9), (110, 9), (111, 9), (116, 10)):
-            clock[0] = at
+            clock.now_ns = at * 10**9
             role.status(PLANT.model_copy(update={"skipped": skipped}))
     assert published == [0, 2, 2, 0, 1]
 
@@ -161,7 +152,7 @@ def ends(network: NetworkSettings, *, require_recorder: bool) -> Iterator[None]:
         "wire.counter_bits=16",
     ]
     settings = load(overrides=[*words, "plant.armed_at_start=true", f"controller.require_recorder={require_recorder}"])
-    with Role("plant", "aero", network, {}) as plant, Role("controller", "aero", network, {}) as controller:
+    with Node("plant", "aero", network, {}) as plant, Node("controller", "aero", network, {}) as controller:
         loops = [
             EmulatorOnZenoh(plant, settings.loop, settings.wire, settings.plant).run,
             Daemon(controller, settings).run,
@@ -181,7 +172,7 @@ def ends(network: NetworkSettings, *, require_recorder: bool) -> Iterator[None]:
 @contextmanager
 def recorder(network: NetworkSettings, last: str) -> Iterator[None]:
     """A recorder with its presence alone; `last` is the state in its last status."""
-    with Role("recorder", "aero", network, {}) as role:
+    with Node("recorder", "aero", network, {}) as role:
         role.announce()
         role.status(status("recorder", "recording"))
         yield

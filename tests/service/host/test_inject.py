@@ -11,7 +11,7 @@ from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Event, Status
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.service.cli.main import execute
@@ -25,7 +25,7 @@ Inject = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def plant(capsys: pytest.CaptureFixture[str]) -> Iterator[tuple[Inject, Callable[[], list[str]], list[Event]]]:
     """`op inject` with exit code and lines of stdout and stderr; the faults of the plant's status; its events."""
-    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
         emulator = EmulatorOnZenoh(role, LOOP, WireSpec(), PlantSettings(faults=["rate:bias=0.1@9"]))
         thread = threading.Thread(target=emulator.run)
         zenoh, events = gathering.join(), list[Event]()

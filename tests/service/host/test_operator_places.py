@@ -6,7 +6,7 @@ import socket
 from types import SimpleNamespace
 from typing import cast
 
-from aeroloop.protocol.runtime.processes import name_process
+from aeroloop.protocol.runtime.host import name_process
 from aeroloop.protocol.transport.network import CommandSession
 from aeroloop.service.host.operator import _unanswered
 

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import Loss, Status
 from aeroloop.protocol.messages.trace import read_batch
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport import history
 from aeroloop.protocol.transport.history import SOON_S, CachedPublisher, attachment
 from aeroloop.protocol.transport.network_settings import NetworkSettings
@@ -56,7 +56,7 @@ class Running:
         self.full = False
         self.error: Exception | None = None
         self._write = os.pwrite
-        self.role = Role("recorder", "aero", network or gathering.settings, {})
+        self.role = Node("recorder", "aero", network or gathering.settings, {})
         options = {"chunk_s": 0.05, "decoded_hz": 0.0, **settings}
         self.recorder = Recorder(self.role, RecorderSettings.model_validate({"path": path, **options}))
         self._thread = threading.Thread(target=self._run)

@@ -11,7 +11,7 @@ from typing import get_args
 import pytest
 
 from aeroloop.protocol.messages.models import Event, EventKind
-from aeroloop.protocol.runtime.event_log import log_event
+from aeroloop.protocol.runtime.node import log_event
 from aeroloop.service.terminal import log_lines
 
 KEYS = ["time", "level", "logger", "event", "role", "vehicle", "session", "tick", "message"]

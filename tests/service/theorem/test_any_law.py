@@ -72,7 +72,7 @@ def test_a_law_that_brings_a_certificate_has_its_own(
         ("pd", "no theorem for this law, pd"),
         (
             f"{HERE}:Boastful",
-            f"the certificate of law {HERE}:Boastful is none: verdict is missing: it must be a string",
+            f"the certificate of law {HERE}:Boastful is none: verdict: is missing",
         ),
         (f"{HERE}:Careless", f"no certificate: law {HERE}:Careless: KeyError: 'decay' (test_any_law.py, line "),
     ],

@@ -21,7 +21,7 @@ import pytest
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.protocol.messages.models import Claim, Event, Status
 from aeroloop.protocol.messages.topics import key
-from aeroloop.protocol.runtime.role import Role
+from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.attitude import Quaternion, angle, distance
 from aeroloop.service.cli.main import execute
@@ -73,8 +73,8 @@ class Loop:
         self._settings = settings
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
-        self._plant = Role("plant", "aero", settings.network, settings.description())
-        self._controller = Role("controller", "aero", settings.network, settings.description())
+        self._plant = Node("plant", "aero", settings.network, settings.description())
+        self._controller = Node("controller", "aero", settings.network, settings.description())
         self.attitudes: list[Quaternion] = []
         self.errors: dict[float, float] = {}
 

@@ -121,5 +121,5 @@ def test_a_name_that_no_vehicle_can_have_is_refused(capfd: pytest.CaptureFixture
     assert execute(["show", "layout", "--vehicle", "a/b"]) == 2
     captured = capfd.readouterr()
     assert captured.out == ""
-    assert captured.err.startswith("aeroloop: vehicle must be ")
+    assert captured.err.startswith("aeroloop: vehicle: ")
     assert len(captured.err.splitlines()) == 1

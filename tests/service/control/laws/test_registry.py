@@ -64,7 +64,7 @@ def test_settings_that_are_not_the_laws_are_named_with_their_key(overrides: list
         (f"{HERE}:", "does not name a class"),
         (":PD", "does not name a class"),
         ("tests.support.their_laws:PD", "there is no module tests.support.their_laws here"),
-        ("their_lab.laws:PD", "there is no module their_lab.laws here; install it, or add its folder to PYTHONPATH"),
+        ("their_lab.laws:PD", "there is no module their_lab here; install it, or add its folder to PYTHONPATH"),
         (f"{FAILING}:Picky", f"law {FAILING}:Picky: ValueError: flies with eight motors only (failing_laws.py, line "),
     ],
 )
@@ -141,4 +141,4 @@ def test_a_module_of_the_current_folder_is_found_and_its_faults_are_in_its_own_w
     (tmp_path / "lab_syntax.py").write_text("x = (\n")
     assert "SyntaxError: '(' was never closed (lab_syntax.py, line 1)" in refused("lab_syntax:Lab")
     (tmp_path / "lab_needs.py").write_text("import lab_not_installed\n")
-    assert "needs the module lab_not_installed, which is not installed here" in refused("lab_needs:Lab")
+    assert "there is no module lab_not_installed here; install it" in refused("lab_needs:Lab")

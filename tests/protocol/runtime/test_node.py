@@ -1,33 +1,32 @@
-"""Role on the network: which queries act, at what cost, and whose token counts."""
+"""Node on the network: which queries act, at what cost, and whose token counts."""
 
 from __future__ import annotations
 
-import time as clock
+import time
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.intake import FEW
 from aeroloop.protocol.messages.models import Status
 from aeroloop.protocol.messages.operator import Answer, Message, Points, Request, Track
-from aeroloop.protocol.runtime.role import AT_ONCE, LONG_S, WAITING, Role
+from aeroloop.protocol.runtime.node import AT_ONCE, LONG_S, WAITING, Node
 from aeroloop.protocol.transport.certificate import read_certificate
 from aeroloop.protocol.transport.network_settings import NetworkSettings, SecuritySettings
 from aeroloop.service.host.operator import gather
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority
 from tests.support.operated_loop import LEVEL as AT_REST
-from tests.support.operated_loop import FakeTime, Loop, Query
+from tests.support.operated_loop import Loop, Query
 from tests.support.zenoh_network import Gathering, eventually
 
 
 def test_only_a_query_that_names_its_verb_acts() -> None:
     """Tools that list a network query `**`: a plant must be neither stopped nor armed by that."""
     done: list[str] = []
-    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
 
         def serve(verb: str) -> None:
             def act() -> Answer:
@@ -43,7 +42,7 @@ def test_only_a_query_that_names_its_verb_acts() -> None:
 
         def answers(key: str) -> list[str]:
             got: list[str] = []
-            clock.sleep(2 / topics.QUERIES_PER_S)  # sooner after the last query, this one is dropped
+            time.sleep(2 / topics.QUERIES_PER_S)  # sooner after the last query, this one is dropped
             session.get(
                 key, lambda reply: got.append(str(reply.ok and reply.ok.key_expr)), target=zenoh.QueryTarget.ALL
             )
@@ -65,20 +64,15 @@ def test_a_status_says_until_when_the_certificate_is_good(tmp_path: Path) -> Non
         security=SecuritySettings(directory=str(authority.folder), vehicles=["aero"]),
         loopback_secured=True,
     )
-    with Role("plant", "aero", network, {}) as role:
+    with Node("plant", "aero", network, {}) as role:
         role.status(Status(role="plant", state="idle", uptime_s=0, ticks=0, rate_hz=0, skipped=0))
         assert gather(network).statuses["aero"]["plant"].certificate_until == mine.not_after
-
-
-@pytest.fixture
-def time(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
-    return FakeTime(monkeypatch)
 
 
 LONG = Track(reference=Points(times=[float(n) for n in range(FEW)], attitudes=[(0.0, 0.0, 0.0)] * FEW))
 
 
-def asked(role: Role, loop: Loop, topic: str, payload: bytes) -> Query:
+def asked(role: Node, loop: Loop, topic: str, payload: bytes) -> Query:
     query = Query(topics.key(topic, "aero"), payload)
     loop.network.queryables[topics.key(topic, "aero")](query)
     role.take_inbox()
@@ -89,7 +83,7 @@ def done() -> Message:
     return Answer(done=True, text="done")
 
 
-def test_of_requests_that_take_long_to_parse_one_is_parsed_in_ten_seconds(time: FakeTime) -> None:
+def test_of_requests_that_take_long_to_parse_one_is_parsed_in_ten_seconds() -> None:
     """And short ones meanwhile as ever; garbage counts, as it takes as long."""
     loop, taken = Loop(AT_REST), list[Track]()
 
@@ -103,14 +97,14 @@ def test_of_requests_that_take_long_to_parse_one_is_parsed_in_ten_seconds(time: 
         (answer,) = asked(loop.role, loop, "track", payload).answers
         return answer.text
 
-    time.now += LONG_S
+    loop.clock.advance(LONG_S)
     assert ask(LONG.encode()) == "done"
     assert "one in 10 s is taken" in ask(LONG.encode())
     assert ask(Track(reference=AT_REST).encode()) == "done"
-    time.now += LONG_S
+    loop.clock.advance(LONG_S)
     assert "not a Track" in ask(b"[" + b"0," * 2000 + b"0]")
     assert "one in 10 s is taken" in ask(LONG.encode())
-    time.now += LONG_S
+    loop.clock.advance(LONG_S)
     assert ask(LONG.encode()) == "done"
     assert taken == [LONG, Track(reference=AT_REST), LONG]
 
@@ -148,7 +142,7 @@ def test_what_waits_for_the_loop_is_bounded_and_so_is_what_it_does_between_two_t
 
 def test_a_token_of_another_name_and_one_that_another_holds_too_change_nothing() -> None:
     """Zenoh merges tokens of one name, so a second one neither appears nor disappears."""
-    with Gathering() as gathering, Role("plant", "aero", gathering.settings, {}) as role:
+    with Gathering() as gathering, Node("plant", "aero", gathering.settings, {}) as role:
         seen = list[bool]()
         role.watch_token("controller", seen.append)
         marks = list[bool]()

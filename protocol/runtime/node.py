@@ -1,0 +1,369 @@
+"""Node: a process's presence on the network, with description, status, events, requests and liveliness.
+
+A Node joins the network and answers queries for its description and status. Its owner declares the liveliness token
+once ready, and publishes through it. It is a context manager: leaving it closes the Zenoh session, without which a
+Python process would not end.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final, Self, TypeVar
+
+import zenoh
+from pydantic import ValidationError
+from zenoh.handlers import RingChannel
+
+from aeroloop.protocol.errors import AeroloopError
+from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status, Tenure
+from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.messages.states import STOPPED
+from aeroloop.protocol.runtime.host import host_facts, name_process, versions
+from aeroloop.protocol.runtime.timing import Clock, Throttle
+from aeroloop.protocol.transport.history import ADDED_BYTES, CachedPublisher
+from aeroloop.protocol.transport.network import COMMAND_S, FrameSession, command_session, join, route
+from aeroloop.protocol.transport.network_settings import Identity, NetworkSettings, protected
+from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import WireSpec
+
+M = TypeVar("M", bound=Message)
+Action = Callable[[], object]
+"""A function to run between two ticks."""
+
+AT_ONCE: Final = 8
+"""Actions that run between two ticks; the others wait."""
+WAITING: Final = 64
+"""Queries that may wait to be answered between ticks; more are refused."""
+LONG_S: Final = 10.0
+"""Least time between two requests of a topic that are too long to be parsed in a fraction of a tick [s]."""
+_RECENT_S: Final = 10.0
+_SELDOM_PER_S: Final = 8.0
+"""Cached messages per second of a topic that was not declared beforehand: statuses, events."""
+_GRAVE: Final = ("tripped", "lost", "fault", "refused")
+
+log: Final = logging.getLogger("aeroloop")
+
+
+class OccupiedError(AeroloopError):
+    """The vehicle has a plant already; one line that names it."""
+
+
+def notify_systemd(state: str) -> None:
+    """Notify the service manager if `NOTIFY_SOCKET` is set (sd_notify(3)); failures are ignored."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if not address:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager, suppress(OSError):
+        manager.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+
+
+def log_event(event: Event, vehicle: str | None) -> None:
+    """Log an event, with `event` (its kind), `role`, `vehicle`, `session` and `tick` as attributes of the record."""
+    level = logging.WARNING if event.kind in _GRAVE else logging.INFO
+    fields = event.model_dump(include={"role", "session", "tick"})
+    log.log(level, event.text, extra={"event": event.kind, "vehicle": vehicle, **fields})
+
+
+class Requests:
+    """Requests received from the network, answered between two ticks: when the owner of the loop calls `take_inbox`."""
+
+    def __init__(self, session: zenoh.Session, vehicle: str, clock: Clock) -> None:
+        self._session = session
+        self._vehicle = vehicle
+        self._inbox: deque[Action] = deque()
+        self._long = Throttle(LONG_S, clock)
+
+    def serve(self, topic: str, model: type[M], prepare: Callable[[M], Callable[[], Message]]) -> None:
+        """Answer a topic's queries between ticks.
+
+        A query whose key expression does not end with the topic's name, or that is longer than the topic's requests,
+        is not answered and changes nothing. Of requests that take milliseconds to parse, one in `LONG_S` is parsed.
+        `prepare` is called with the request in a thread of the topic's, for work that takes time; the function that it
+        returns runs between ticks and returns the reply. An AeroloopError from either is the reply.
+        """
+        key = topics.key(topic, self._vehicle)
+        name = key.rpartition("/")[2]
+
+        def reply(query: zenoh.Query, answer: Message) -> None:
+            query.reply(key, answer.encode())  # not the query's key, which may name many vehicles
+            query.drop()
+
+        def act(query: zenoh.Query, action: Callable[[], Message]) -> None:
+            try:
+                reply(query, action())
+            except AeroloopError as error:
+                reply(query, Answer(done=False, text=str(error)))
+
+        def received(query: zenoh.Query) -> None:
+            payload = query.payload.to_bytes() if query.payload else b"{}"
+            named = str(query.key_expr).endswith(f"/{name}")  # `**`, by which tools list a network, names no verb
+            if not named or len(payload) > topics.TOPICS[topic].request:  # wildcards pass Zenoh's filter of lengths
+                query.drop()
+                return
+            try:
+                if len(self._inbox) >= WAITING:
+                    raise intake.IntakeError(f"{WAITING} requests wait already; ask again")
+                action = prepare(self._read(topic, model, payload))
+            except AeroloopError as error:
+                reply(query, Answer(done=False, text=str(error)))
+            else:
+                self._inbox.append(lambda: act(query, action))
+
+        self._session.declare_queryable(key, received, complete=True)
+
+    def _read(self, topic: str, model: type[M], payload: bytes) -> M:
+        """Read a request. Raises IntakeError."""
+        short = len(payload) <= topics.MESSAGE_BYTES and intake.few(payload)
+        if short or topics.TOPICS[topic].request <= topics.MESSAGE_BYTES:
+            return intake.read(model, payload)
+        if self._long.let_pass(topic) is None:
+            raise intake.IntakeError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
+        return intake.read(model, payload, intake.REFERENCE)
+
+    def enqueue(self, action: Action) -> None:
+        """Queue an action to run between two ticks; may be called from any thread."""
+        self._inbox.append(action)
+
+    def take_inbox(self) -> bool:
+        """Run the oldest `AT_ONCE` of the queued actions; whether there were any."""
+        waiting = min(AT_ONCE, len(self._inbox))
+        for _ in range(waiting):
+            self._inbox.popleft()()
+        return waiting > 0
+
+
+class LastStatus:
+    """The last status of a node, completed by what its owner does not count."""
+
+    def __init__(self, process: str, certificate_until: Any, clock: Clock) -> None:
+        self._known = {"process": process, "certificate_until": certificate_until}
+        self._clock = clock
+        self._last: tuple[float, Status] | None = None  # and when it was taken; another thread reads it
+        self._skipped: deque[tuple[float, int]] = deque()  # of the last `_RECENT_S`, by time
+
+    def take(self, status: Status) -> Status:
+        """The status with process, certificate and ticks skipped in the last 10 s."""
+        now, skipped = self._clock.monotonic(), self._skipped
+        skipped.append((now, status.skipped))
+        while now - skipped[0][0] > _RECENT_S:
+            skipped.popleft()
+        recent = status.skipped - skipped[0][1]
+        status = status.model_copy(update={**self._known, "recent_skipped": recent})
+        self._last = now, status
+        return status
+
+    def aged(self) -> bytes | None:
+        """The last status with its age, which shows a loop that hangs; None before the first."""
+        if self._last is None:
+            return None
+        taken, status = self._last
+        return status.model_copy(update={"age_s": round(self._clock.monotonic() - taken, 3)}).encode()
+
+
+class Node:
+    """A process's presence on the network.
+
+    `role` is `plant`, `controller`, `recorder` or `router`, `vehicle` the vehicle in the keys of its topics, `config`
+    its effective configuration, for the description. `name` is its liveliness token's; the role's if None. Its owner
+    runs until `stop` is set, by `clock`.
+
+    Raises:
+        NetworkError: The network cannot be joined.
+        CertificateError: Its links cannot be secured.
+        OccupiedError: It is a plant's, and the vehicle has one.
+    """
+
+    def __init__(
+        self,
+        role: str,
+        vehicle: str,
+        network: NetworkSettings,
+        config: dict[str, Any],
+        name: str | None = None,
+        stop: threading.Event | None = None,
+        clock: Clock = time,
+    ) -> None:
+        self.role = role
+        self.vehicle = vehicle
+        self.name = name or role
+        self.stop = stop or threading.Event()
+        self.clock = clock
+        if role == "plant":
+            _refuse_second_plant(network, vehicle)
+        name_process(role)
+        identity = Identity((role,), vehicle)
+        certificate = protected(network, identity).certificate
+        self.zenoh = (route if role == "router" else join)(network, identity)
+        self.datagrams = FrameSession(network, identity)
+        self.process = f"{socket.gethostname()}, pid {os.getpid()}"
+        self.own_versions: dict[str, str] = {}  # of a user's classes that it runs, for its description
+        self._publishers: dict[str, CachedPublisher] = {}
+        requests = Requests(self.zenoh, vehicle, clock)
+        self.serve, self.enqueue, self.take_inbox = requests.serve, requests.enqueue, requests.take_inbox
+        self._status = LastStatus(self.process, certificate and certificate.not_after, clock)
+        self._throttle = Throttle(clock=clock)
+        self._started = clock.monotonic()
+        self.publish_description(config)
+        self._answer("description", lambda: self._description)
+        self._answer("status", self._status.aged)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        notify_systemd("STOPPING=1")
+        self.datagrams.close()
+        self.zenoh.close()
+
+    @property
+    def uptime_s(self) -> float:
+        """Seconds since the node joined."""
+        return self.clock.monotonic() - self._started
+
+    # ── liveliness ──
+
+    def announce(self) -> None:
+        """Declare the liveliness token. A link keeps order: a peer that sees it has all earlier declarations."""
+        notify_systemd("READY=1")
+        self._token = self.zenoh.liveliness().declare_token(topics.key("alive", self.vehicle, role=self.name))
+
+    def watch_token(self, name: str, callback: Callable[[bool], None]) -> Callable[[], None]:
+        """Call back when a node's liveliness token appears (True) and disappears, in a thread of its own.
+
+        A token of another name calls no Python. Zenoh merges those of one name: the first appears, the last disappears.
+
+        Returns:
+            Ends it.
+        """
+        key = topics.key("alive", self.vehicle, role=name)
+
+        def seen(sample: zenoh.Sample) -> None:
+            if str(sample.key_expr) == key:  # a token may have wildcards
+                callback(sample.kind == zenoh.SampleKind.PUT)
+
+        return self.zenoh.liveliness().declare_subscriber(key, seen, history=True).undeclare
+
+    def _answer(self, topic: str, payload: Callable[[], bytes | None]) -> None:
+        """Answer queries for a message of this node at any time, also while its loop hangs."""
+        key = topics.key(topic, self.vehicle, role=self.role)
+
+        def received(query: zenoh.Query) -> None:
+            if (answer := payload()) is not None:
+                query.reply(key, answer)
+
+        self.zenoh.declare_queryable(key, received, complete=True)
+
+    # ── publications ──
+
+    def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
+        """Declare a topic's publisher before its first message."""
+        json = topics.TOPICS[topic].carries == "json"
+        self._publishers[topic] = CachedPublisher(
+            self.zenoh,
+            topics.key(topic, self.vehicle, role=self.role),
+            per_s,
+            lossless=lossless,
+            encoding=zenoh.Encoding.APPLICATION_JSON if json else zenoh.Encoding.ZENOH_BYTES,
+        )
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Publish a message on one of the table's JSON topics."""
+        self.publish_bytes(topic, message.encode())
+
+    def publish_bytes(self, topic: str, payload: bytes) -> None:
+        """Publish on one of the table's topics of JSON or traces; what exceeds the topic's limit is not published."""
+        limit = topics.TOPICS[topic].limit - ADDED_BYTES
+        if len(payload) > limit:
+            self.warn(topic, "fault", f"a {topic} of {len(payload)} bytes is not published: at most {limit} may be")
+            return
+        if topic not in self._publishers:
+            self.declare(topic, _SELDOM_PER_S)
+        self._publishers[topic].put(payload)
+
+    def publish_description(self, config: dict[str, Any], certificate: dict[str, Any] | None = None) -> None:
+        """Publish the node's description: its effective configuration and, from a controller, its certificate."""
+        freshness_s = None
+        if "wire" in config and "loop" in config:
+            period_ns = LoopSettings.model_validate(config["loop"]).period_ns
+            freshness_s = WireSpec.model_validate(config["wire"]).freshness_ns(period_ns) * 1e-9
+        self._description = Description(
+            protocol=PROTOCOL_VERSION,
+            role=self.role,
+            vehicle=self.vehicle,
+            host=socket.gethostname(),
+            versions=versions() | self.own_versions,
+            facts=host_facts(),
+            config=config,
+            freshness_s=freshness_s,
+            certificate=certificate,
+        ).encode()
+        self.publish_bytes("description", self._description)
+
+    def status(self, status: Status) -> None:
+        """Publish the status, and answer queries with it until the next one."""
+        notify_systemd("WATCHDOG=1")
+        self.publish("status", self._status.take(status))
+
+    def event(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Publish and log an event, with the session's tick if there is one."""
+        event = Event(role=self.role, kind=kind, text=text, session=session, tick=tick)
+        log_event(event, self.vehicle)
+        self.publish("event", event)
+
+    def warn(self, about: str, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Publish an event that may recur for long: at most once in ten seconds for each `about`."""
+        held_back = self._throttle.let_pass(about)
+        if held_back is not None:
+            more = f" ({held_back} more like it in the last {self._throttle.period_s:g} s)" if held_back else ""
+            self.event(kind, text + more, session, tick)
+
+
+def _refuse_second_plant(network: NetworkSettings, vehicle: str) -> None:
+    with command_session(network, identity=Identity(("plant",), vehicle), patient=True) as here:
+        here.wait_for_links()
+        if not list(here.session.liveliness().get(topics.key("alive", vehicle, role="plant"), timeout=COMMAND_S)):
+            return
+        where = ""
+        for reply in here.session.get(topics.key("status", vehicle, role="plant"), timeout=COMMAND_S):
+            if reply.ok is not None:
+                with suppress(ValidationError):
+                    where = f" ({Status.model_validate_json(reply.ok.payload.to_bytes()).process})"
+    raise OccupiedError(
+        f"{vehicle} has a plant already{where}; stop that one, or give this one a name of its own with "
+        "--set vehicle=NAME"
+    )
+
+
+class RecorderWatch:
+    """Whether the recorder of a node's vehicle is there, or was there and is gone, killed or cut off.
+
+    Attributes:
+        present: Whether its liveliness token is there.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.present = False
+        self._was_there = self._stopped = False
+        key = topics.key("status", node.vehicle, role="recorder")
+        self._statuses = node.zenoh.declare_subscriber(key, RingChannel(1))
+        node.watch_token("recorder", self._see)
+
+    @property
+    def gone(self) -> bool:
+        """Whether it disappeared and its last status does not say that it stopped."""
+        if (sample := self._statuses.try_recv()) is not None:
+            with suppress(intake.IntakeError):
+                self._stopped = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).state == STOPPED
+        return self._was_there and not self.present and not self._stopped
+
+    def _see(self, appeared: bool) -> None:
+        self.present = appeared
+        self._was_there |= appeared

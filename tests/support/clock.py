@@ -1,0 +1,35 @@
+"""Fake clock, for whatever takes a `clock` argument: time passes by request, or by a sleep, which returns at once."""
+
+from __future__ import annotations
+
+
+class FakeClock:
+    """A clock that moves only when `now_ns` is set, by `advance`, or by a sleep.
+
+    Attributes:
+        now_ns: The time, monotonic and of the wall clock [ns].
+        oversleep_ns: By how much a sleep takes longer than asked for [ns].
+        slept: How long each sleep was to take [s].
+    """
+
+    def __init__(self, now_ns: int = 1_000_000_000_000) -> None:
+        self.now_ns = now_ns
+        self.oversleep_ns = 0
+        self.slept: list[float] = []
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def monotonic(self) -> float:
+        return self.monotonic_ns() / 1e9
+
+    def time_ns(self) -> int:
+        return self.now_ns
+
+    def advance(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds >= 0
+        self.slept.append(seconds)
+        self.now_ns += round(seconds * 1e9) + self.oversleep_ns
