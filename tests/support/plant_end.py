@@ -91,10 +91,14 @@ def state_of(endpoint: Endpoint) -> PlantState:
 
 
 class Asker:
-    """Queries to the plant end of the vehicle `aero`, over a Zenoh session; each is repeated until it is answered."""
+    """Queries to the plant end of the vehicle `aero`, over a Zenoh session; each is repeated until it is answered.
 
-    def __init__(self, session: zenoh.Session) -> None:
+    Its claims are of WIRE and of this period [ns].
+    """
+
+    def __init__(self, session: zenoh.Session, period_ns: int = PERIOD_NS) -> None:
         self._session = session
+        self._period_ns = period_ns
         self._claims = 0
 
     @property
@@ -118,14 +122,15 @@ class Asker:
         """The answer to an operator's command or a release."""
         return Answer.model_validate_json(self.query(topic, (request or Request()).encode()))
 
-    def claim(self, period_ns: int, *, auto_arm: bool = True) -> Grant | Refusal:
+    def claim(self, *, auto_arm: bool = True) -> Grant | Refusal:
         """Claim the plant as controller `a`, each time for another session."""
         self._claims += 1
-        payload = self.query("claim", claim_of(period_ns=period_ns, auto_arm=auto_arm, session=self.session).encode())
+        claim = claim_of(period_ns=self._period_ns, auto_arm=auto_arm, session=self.session)
+        payload = self.query("claim", claim.encode())
         return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
 
-    def refusal(self, period_ns: int, *, auto_arm: bool = True) -> str:
+    def refusal(self, *, auto_arm: bool = True) -> str:
         """Why a claim is refused."""
-        refused = self.claim(period_ns, auto_arm=auto_arm)
+        refused = self.claim(auto_arm=auto_arm)
         assert isinstance(refused, Refusal)
         return refused.reason
