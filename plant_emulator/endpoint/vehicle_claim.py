@@ -56,8 +56,7 @@ class Freshness:
     counter is back at 0. A counter shorter than twice the watchdog's time cannot detect this, and gets the usual time.
 
     Attributes:
-        answered: Session tick that the last fresh command answers; −1 for none.
-        echo: Counter that it echoes; −1 for none.
+        answered, echo: Session tick that the last fresh command answers, and its counter; −1 for none.
         since_ns: Since when the next command is waited for; None while there is nothing to answer.
     """
 
@@ -108,15 +107,9 @@ class Freshness:
 class VehicleClaim:
     """A plant that one controller at a time may drive.
 
-    Args:
-        wire: Format of the frames.
-        period_ns: Period of a tick [ns].
-        lockstep: Whether the loop waits for each command; a claim must have the same value.
-        watchdog_s: The longest time without a fresh command [s].
-        armed: Whether the first claim is granted without `arm`.
+    `watchdog_s` is the longest time without a fresh command [s]; if `armed`, the first claim is granted without `arm`.
 
     Attributes:
-        session, holder: Name of the session, and of the controller that holds the plant; None without a session.
         trip: Cause of the last trip, until it is cleared.
         cause: Why the latch refuses claims, or None.
         operator_only: Whether only an operator's `arm` clears the latch.
@@ -126,7 +119,7 @@ class VehicleClaim:
         ticked: Index of the last tick; −1 before the first.
         outcome: How the last tick judged the command received before it.
         voltages: In force from the last tick to the next command [V]. Shape (actuators,).
-        refused, stale: Malformed commands, and commands with too old an answer, so far.
+        refused, stale: Malformed and stale frames so far.
     """
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:

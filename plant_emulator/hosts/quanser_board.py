@@ -46,6 +46,7 @@ COLOURS: Final[Mapping[PlantState, tuple[float, float, float]]] = {
     PlantState.TRIPPED: (1.0, 0.0, 0.0),
 }
 """Blue, yellow, green, red."""
+DARK: Final = (0.0, 0.0, 0.0)
 
 _SAMPLES_IN_BUFFER: Final = 1  # a read returns the newest sample, and the board counts those it overwrote
 _UNLIMITED: Final = 2**32 - 1  # samples; as in Quanser's own class for this board
@@ -88,12 +89,12 @@ class QuanserPlant(Plant):
     that passed; the next `passed` − 1 calls return at once and measure NaN. A caller that raises its tick index by
     `passed` stays on the board's clock. `period` is the time between samples [s].
 
-    Raises:
-        QuanserError: The interface is missing, or the board cannot be opened and prepared.
+    `failures` counts failed calls, reads without a sample and expiries of the watchdog; `failure` is the last one's
+    message.
 
-    Attributes:
-        failures: Failed calls of the interface so far, reads without a sample and expiries of the watchdog included.
-        failure: Message of the last failure, or None.
+    Raises:
+        QuanserError: The interface is missing, or the board cannot be opened and prepared; or, at the first `actuate`
+            or `advance`, it cannot be started.
     """
 
     actuators = 2
@@ -123,7 +124,6 @@ class QuanserPlant(Plant):
         self._gyro = np.zeros(3) if settings.rate == "gyro" else None
         self._measurement = NO_MEASUREMENT
 
-        self._volts = np.zeros(2)
         self._held: tuple[float, ...] = (0.0, 0.0)
         self._state = PlantState.IDLE
         self._lit: PlantState | None = None
@@ -143,9 +143,6 @@ class QuanserPlant(Plant):
         """Hold voltages [V], clipped to the limit; NaN is 0 V. Shape (2,).
 
         An expired board watchdog is cleared by 0 V only; until then nothing is written.
-
-        Raises:
-            QuanserError: The board cannot be started.
         """
         limit = self._settings.voltage_limit
         self._held = tuple(0.0 if isnan(v) else max(-limit, min(limit, v)) for v in voltages)
@@ -155,11 +152,7 @@ class QuanserPlant(Plant):
         self._write_outputs()
 
     def advance(self) -> None:
-        """Wait for the board's next sample; a failed read takes a period, too.
-
-        Raises:
-            QuanserError: The board cannot be started.
-        """
+        """Wait for the board's next sample; a failed read takes a period, too."""
         if self._owed:
             self._owed -= 1
             self._measurement = NO_MEASUREMENT
@@ -193,9 +186,9 @@ class QuanserPlant(Plant):
             return
         self._closed = True
         board = self._board
-        still = self._try(board.write_analog, MOTORS, len(MOTORS), np.zeros(2))
+        still = self._write_motors((0.0, 0.0))
         off = self._amplify(False)
-        self._try(board.write_other, LEDS, len(LEDS), np.zeros(3))
+        self._light(DARK)
         if still or off:
             self._try(board.watchdog_stop)
         if self._running:
@@ -216,7 +209,7 @@ class QuanserPlant(Plant):
                 self._write_outputs()
         if state is not self._lit and not self._expired:
             self._lit = state
-            self._try(self._board.write_other, LEDS, len(LEDS), np.array(COLOURS[state]))
+            self._light(COLOURS[state])
 
     @property
     def _driven(self) -> bool:
@@ -316,18 +309,24 @@ class QuanserPlant(Plant):
     def _write_outputs(self) -> None:
         if self._amplified is not self._driven:
             self._amplify(self._driven)
-        volts = self._held if self._driven else (0.0, 0.0)
-        settings = self._settings
-        for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, volts, strict=True):
-            self._volts[channel] = sign * voltage
-        self._written &= self._try(self._board.write_analog, MOTORS, len(MOTORS), self._volts)
+        self._write_motors(self._held if self._driven else (0.0, 0.0))
+
+    def _write_motors(self, voltages: Sequence[float]) -> bool:
+        settings, volts = self._settings, np.zeros(2)
+        for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, voltages, strict=True):
+            volts[channel] = sign * voltage
+        done = self._try(self._board.write_analog, MOTORS, len(MOTORS), volts)
+        self._written &= done
+        return done
 
     def _amplify(self, on: bool) -> bool:
         done = self._try(self._board.write_digital, MOTORS, len(MOTORS), np.full(len(MOTORS), on, dtype=np.int8))
-        if done:
-            self._amplified = on
+        self._amplified = on if done else self._amplified
         self._written &= done
         return done
+
+    def _light(self, colour: tuple[float, float, float]) -> None:
+        self._try(self._board.write_other, LEDS, len(LEDS), np.array(colour))
 
     def _keep_alive(self, *, reload: bool) -> bool:
         """Reload the watchdog or read its state. False if it has expired or cannot be read."""
@@ -350,7 +349,7 @@ class QuanserPlant(Plant):
         self._unlock()
         # Clearing may restore the outputs of before the expiry, so a failed step must not prevent the next.
         armed = self._try(self._board.watchdog_start, self._settings.board_watchdog_s)
-        still = self._try(self._board.write_analog, MOTORS, len(MOTORS), np.zeros(2))
+        still = self._write_motors((0.0, 0.0))
         done = self._amplify(False) and still and armed
         self._expired = not done
         if done:

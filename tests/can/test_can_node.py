@@ -152,16 +152,6 @@ def test_another_number_is_another_session(bus: Bus) -> None:
     assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
 
 
-def test_a_session_begins_afresh_with_counter_0_whatever_the_last_one_came_to(bus: Bus) -> None:
-    for number in range(1, 6):
-        bus.begin(number)
-        assert bus.counters(1)[0] == 0
-        bus.turn_for(0.01 * number)
-        bus.send_heartbeat(PlantState.IDLE)
-        bus.until("the release", lambda: bus.endpoint.session is None)
-        bus.stranger.everything()
-
-
 def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus: Bus) -> None:
     bus.begin(number=1)
     bus.drive()

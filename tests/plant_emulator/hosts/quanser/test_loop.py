@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from math import isnan
+from threading import Event
 
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
 from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.plant import Plant
 from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.service.config import Settings, with_bits
 from aeroloop.service.control.controller import Controller
 from tests.support.plant_end import claim_of
+from tests.support.plant_stage import Stage
 from tests.support.quanser_board import AERO, PERIOD, emulated_aero, plant_on_board
 
 
@@ -86,3 +90,18 @@ def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_
     assert "no valid value" in loop.endpoint.notices[-1].text
     assert board.analog == [0.0, 0.0]  # no write reaches it any more: the board's watchdog did
     assert board.expired
+
+
+def test_failed_calls_of_the_board_are_notes_of_the_status() -> None:
+    plant, board = plant_on_board(session=False)
+    plant.close()  # the driver opens it again
+    loop, wire, stop = LoopSettings(realtime="off"), Settings().wire, Event()
+
+    def fail(stage: Stage) -> None:
+        if stage.endpoint.ticked in (20, 30):
+            board.fail_next("task_read")
+
+    stage = Stage(loop, wire, AERO, driver=BoardDriver(loop, wire, AERO, stop), between=fail)
+    stage.stop = stop
+    stage.run(50)
+    assert stage.notes == ["the board: 2 failed calls, the last: task_read was made to fail"]

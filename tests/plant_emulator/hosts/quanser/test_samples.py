@@ -7,13 +7,12 @@ from math import cos, pi, sin
 
 import pytest
 
-from aeroloop.plant_emulator.model.sensors import FilteredDerivative, SensorSettings
+from aeroloop.plant_emulator.model.sensors import FilteredDerivative
 from aeroloop.plant_emulator.plant import Measurement
-from aeroloop.plant_emulator.settings import CardType, PlantSettings, QuanserSettings
+from aeroloop.plant_emulator.settings import CardType, QuanserSettings
 from aeroloop.protocol.wire.attitude import IDENTITY
 from tests.support.fake_quanser import FakeQuanser
 from tests.support.quanser_board import (
-    AERO,
     PERIOD,
     Calls,
     HandClock,
@@ -86,22 +85,6 @@ def test_a_gyros_rates_need_no_filter_and_its_axes_signs_and_scale_can_be_set(
     true = board.truth().rate
     assert 0.0 not in true
     assert plant.measure().rate == tuple(sign * scale * true[axis] for axis, sign in zip(axes, signs, strict=True))
-
-
-def test_a_gyros_bias_is_that_of_the_emulated_aero() -> None:
-    settings = AERO.model_copy(update={"sensors": SensorSettings(gyro_bias=(0.1, 0.2, 0.3))})
-    plant, _ = plant_on_board(settings, rate="gyro")
-    plant.advance()
-    assert plant.measure().rate == pytest.approx((0.1, 0.2, 0.3), abs=1e-4)  # it has begun to sink by less
-
-
-def test_the_ideal_aero_on_the_board_has_encoders_all_the_same() -> None:
-    plant, board = plant_on_board(PlantSettings(ideal=True, voltage_limit=18.0))
-    for _ in range(100):
-        drive(plant, 1)
-        seen, true = plant.measure().attitude, board.truth().attitude
-        assert seen == pytest.approx(true, abs=2 * pi / 2880)  # half a count in pitch and in yaw, halved again
-    assert seen != true
 
 
 # Reads that fail
@@ -218,32 +201,6 @@ def test_a_board_that_does_not_count_overflows_is_taken_to_be_in_time() -> None:
 
 
 # A board that samples by the clock
-
-
-def test_the_clocks_board_paces_its_reader_on_an_absolute_grid(clock: HandClock) -> None:
-    plant, board = plant_on_board(realtime=True)
-    began = clock.ns
-    for k in range(1, 20):
-        plant.actuate((0.0, 0.0))
-        plant.advance()
-        assert clock.ns == began + k * PERIOD_NS
-        assert (plant.passed, board.time) == (1, k)
-        clock.ns += 100_000 * (k % 7)  # the owner's work, of less than a period
-
-
-def test_the_clocks_board_goes_on_while_its_reader_is_late(clock: HandClock) -> None:
-    plant, board = plant_on_board(realtime=True)
-    plant.advance()
-    slept = len(clock.slept)
-    clock.ns += 25 * PERIOD_NS + PERIOD_NS // 2
-    plant.advance()
-    assert (plant.passed, board.time) == (25, 26)
-    assert not is_nothing(plant.measure())
-    assert len(clock.slept) == slept  # the newest sample was there
-    for _ in range(25):
-        plant.advance()
-    assert clock.slept[-1] == PERIOD / 2  # and the next is due where it always was
-    assert plant.passed == 1
 
 
 def test_reads_that_fail_by_the_clock_keep_the_loop_in_the_boards_time(clock: HandClock) -> None:
