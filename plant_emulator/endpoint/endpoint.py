@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.endpoint.vehicle_claim import Trip, VehicleClaim
 from aeroloop.plant_emulator.plant import Measurement, Plant
-from aeroloop.protocol.messages.states import PlantState, TripCause
+from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome
 from aeroloop.protocol.wire.attitude import sent_vector
 from aeroloop.protocol.wire.loop import WATCHDOG_S
@@ -24,10 +24,7 @@ from aeroloop.protocol.wire.transmit import SILENCE, Sender
 
 
 class Endpoint(VehicleClaim):
-    """One plant, one controller at a time.
-
-    After `watchdog_s` without a fresh command [s] the plant gets 0 V; at its `limits`, if there are any, it trips. The
-    other arguments are VehicleClaim's.
+    """One plant, one controller at a time. At its `limits`, if there are any, it trips, too.
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
@@ -49,27 +46,20 @@ class Endpoint(VehicleClaim):
     ) -> None:
         if plant.actuators != wire.actuators:
             raise ValueError(f"wire.actuators is {wire.actuators}, but the plant has {plant.actuators} actuators")
-        super().__init__(wire, period_ns, lockstep=lockstep, armed=armed)
+        super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
         self.plant = plant
         self.accepted = 0
+        self._limits = limits
         self._quantizers = [signal.quantizer() for signal in (wire.attitude, wire.rate) for _ in range(3)]
-        self._encode = tuple(quantizer.encode for quantizer in self._quantizers)
         self._no_measurement = [quantizer.invalid for quantizer in self._quantizers]
-        self._write = wire.measurement.pack
-        transmit = wire.transmit
-        heartbeat = transmit.heartbeat_ticks(period_ns, self._counters)
-        self._sender = Sender(transmit.measurement, heartbeat, self._counters)
+        heartbeat = wire.transmit.heartbeat_ticks(period_ns, self._counters)
+        self._sender = Sender(wire.transmit.measurement, heartbeat, self._counters)
         # On change and without lockstep, a controller learns that values are valid again only from the next frame that
         # it receives in time, a heartbeat later at most: until then its commands may still have no valid value.
-        clocked = transmit.measurement == "on_change" and not lockstep
+        clocked = wire.transmit.measurement == "on_change" and not lockstep
         self._forgiven = heartbeat if clocked else 0
-        self._limits = limits
-        self.protect(watchdog_s)
-        self._first_command = max(1, self._first_command_ns // period_ns)
-        self._start = 0  # tick of the session's first measurement
-        self._unmeasured_yet = False
-        self._fresh_tick = 0  # tick of the last fresh command, or of the session's first measurement
-        self._unmeasured = [False] * self._counters  # whether the last measurement of each counter had no valid value
+        self._measured = False  # whether the session has a measurement
+        self._invalid = [False] * self._counters  # whether the last measurement of each counter had no valid value
 
     @property
     def saturated(self) -> int:
@@ -88,70 +78,46 @@ class Endpoint(VehicleClaim):
         Returns:
             The measurement frame; SILENCE if it would repeat the last one and need not be sent; None without a session.
         """
+        self.outcome = Outcome.NONE
         if self.ticked < 0:
-            self.ticked, self.outcome = 0, Outcome.NONE
-        else:
-            self.outcome = Outcome.NONE if frame is None or self.session is None else self._command(frame)
+            self.ticked = 0
+        elif frame is not None and self.session is not None:
+            self.outcome = self._command(frame, self._now_ns)
+            self.accepted += self.outcome is Outcome.ACTED
         while self.ticked < k:
-            self._watch(self.ticked + 1)
+            if (reason := self._freshness.overdue(self._now_ns)) is not None:
+                self._trip(TripCause.COMMAND_TIMEOUT, reason)
             self.plant.actuate(self.voltages)
             self.plant.advance()
             self.ticked += 1
         if self.session is None:
             return None
-        if self._unmeasured_yet:
-            self._unmeasured_yet = False
-            self._start = self._fresh_tick = self.ticked
+        if not self._measured:  # the first measurement has counter 0, whichever tick it is
+            self._measured = True
+            self._start = self.ticked
+            self._freshness.measured(self._now_ns)
         seen = self.plant.measure()
         if self._limits is not None and (trip := self._limits.check(seen, self.voltages)) is not None:
             self._trip(*trip)
             self.plant.actuate(self.voltages)
             return None
         codes = self._encoded(seen)
-        counter = self.counter
-        self._unmeasured[counter] = codes is self._no_measurement
-        return self._write(counter, codes) if self._sender.due(k, codes) else SILENCE
+        self._invalid[self.counter] = codes is self._no_measurement
+        return self.wire.measurement.pack(self.counter, codes) if self._sender.due(k, codes) else SILENCE
 
     @property
-    def session_tick(self) -> int:
-        """Tick of the last measurement since the session's first, which has 0; −1 before that."""
-        return self.ticked - self._start
-
-    @property
-    def counter(self) -> int:
-        """Counter of the last measurement."""
-        return (self.ticked - self._start) % self._counters
+    def _now_ns(self) -> int:
+        return self.ticked * self.period_ns
 
     def _encoded(self, seen: Measurement) -> list[float]:
-        (w, x, y, z), (a, b, c) = seen
-        if not isfinite((w + x + y + z) + (a + b + c)):
+        values = (*sent_vector(seen.attitude), *seen.rate)
+        if not isfinite(sum(seen.attitude) + sum(seen.rate)):
             return self._no_measurement
-        x, y, z = sent_vector((w, x, y, z))
-        of_x, of_y, of_z, of_a, of_b, of_c = self._encode  # by name: a loop over them costs as much as they do
-        return [of_x(x), of_y(y), of_z(z), of_a(a), of_b(b), of_c(c)]
-
-    def _command(self, frame: bytes) -> Outcome:
-        outcome = super()._command(frame)
-        if outcome is Outcome.ACTED:
-            self._fresh_tick = self.ticked
-            self.accepted += 1
-        return outcome
+        return [quantizer.encode(value) for quantizer, value in zip(self._quantizers, values, strict=True)]
 
     def _may_be_invalid(self, echo: int) -> bool:
         """An invalid command is the right answer to an invalid measurement; the limits bound how long that lasts."""
-        return any(self._unmeasured[(echo - ago) % self._counters] for ago in range(self._forgiven + 1))
-
-    def _watch(self, tick: int) -> None:
-        """Trip if no fresh command was received in time."""
-        if self.session is None or self._unmeasured_yet:
-            return
-        driven, waited = self.state is PlantState.DRIVEN, tick - 1 - self._fresh_tick
-        if waited < (self._watchdog if driven else self._first_command):
-            return
-        text = f"no fresh command for {waited * self.period_ns * 1e-6:.0f} ms"
-        if not driven:
-            text = f"no first command within {self._first_command * self.period_ns * 1e-9:.3g} s"
-        self._trip(TripCause.COMMAND_TIMEOUT, text)
+        return any(self._invalid[(echo - ago) % self._counters] for ago in range(self._forgiven + 1))
 
     def _begin(self) -> None:
         super()._begin()
@@ -159,9 +125,8 @@ class Endpoint(VehicleClaim):
             self._limits.reset()
         for quantizer in self._quantizers:
             quantizer.reset()
-        self._start = self._fresh_tick = self.ticked + 1
-        self._unmeasured = [False] * self._counters
-        self._unmeasured_yet = True  # the first measurement has counter 0, whichever tick it is
+        self._invalid = [False] * self._counters
+        self._measured = False
         self._sender.forget()
 
 
@@ -194,7 +159,7 @@ class LimitMonitor:
         self._period_ns = period_ns
         self._full = voltage_limit
         self._least_upright = cos(radians(settings.max_tilt_deg))
-        self._saturated = self._invalid = 0
+        self.reset()
 
     def reset(self) -> None:
         """Reset the counts for a new session."""
@@ -206,9 +171,8 @@ class LimitMonitor:
         (w, x, y, z), (wx, wy, wz) = seen
         if not isfinite(w + x + y + z + wx + wy + wz):
             self._invalid += 1
-            if (invalid_s := self._seconds(self._invalid)) > limits.max_invalid_s:
-                reason = f"the sensors have had no valid value for {invalid_s * 1e3:.0f} ms"
-                return Trip(TripCause.SENSORS, reason)
+            if (invalid_s := self._invalid * self._period_ns * 1e-9) > limits.max_invalid_s:
+                return Trip(TripCause.SENSORS, f"the sensors have had no valid value for {invalid_s * 1e3:.0f} ms")
             return None
         self._invalid = 0
         upright = 1 - 2 * (x * x + y * y)  # cosine of the tilt
@@ -219,14 +183,7 @@ class LimitMonitor:
         if (speed := hypot(wx, wy, wz)) > limits.max_rate:
             reason = f"turns at {speed:.2f} rad/s, more than limits.max_rate = {limits.max_rate:g} rad/s"
             return Trip(TripCause.ENVELOPE, reason)
-        if max(voltages) < self._full and min(voltages) > -self._full:
-            self._saturated = 0
-            return None
-        self._saturated += 1
-        if (saturated_s := self._seconds(self._saturated)) > limits.max_saturated_s:
-            reason = f"a motor has been at its voltage limit for {saturated_s:.1f} s"
-            return Trip(TripCause.SATURATION, reason)
+        self._saturated = self._saturated + 1 if max(map(abs, voltages)) >= self._full else 0
+        if (saturated_s := self._saturated * self._period_ns * 1e-9) > limits.max_saturated_s:
+            return Trip(TripCause.SATURATION, f"a motor has been at its voltage limit for {saturated_s:.1f} s")
         return None
-
-    def _seconds(self, ticks: int) -> float:
-        return ticks * self._period_ns * 1e-9

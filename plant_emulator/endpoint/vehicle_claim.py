@@ -11,21 +11,21 @@ One controller at a time holds the plant, by name. Base of the plant's Endpoint 
 
 A plant that tripped or started unarmed refuses claims with the reason. A claim with `auto_arm` arms the plant itself,
 except after `stop`.
-
-Freshness is counted in ticks: a command echoes the counter of the measurement that it answers, which gives its age.
 """
 
 from __future__ import annotations
 
 from math import isfinite
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal, SessionRecord
 from aeroloop.protocol.messages.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
 from aeroloop.protocol.messages.trace import Outcome, PlantChange, PlantChangeKind
-from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, WATCHDOG_S
+from aeroloop.protocol.wire.loop import FIRST_COMMAND_S
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
+
+_FIRST_COMMAND_NS: Final = round(FIRST_COMMAND_S * 1e9)
 
 
 class Notice(NamedTuple):
@@ -44,39 +44,95 @@ class Trip(NamedTuple):
     reason: str
 
 
+class Freshness:
+    """Judge of a session's commands: which of them are fresh, and whether the next one is overdue.
+
+    A command echoes the counter of the measurement that it answers, which gives its age in ticks: no clocks of two
+    hosts are compared. The wait for the next command is measured on the clock of the judge's owner [ns]: the Endpoint's
+    is its tick index times the period, the Relay's is monotonic.
+
+    Why the first command of a session has a deadline of its own: the age of an echo is known modulo the counter.
+    Commands late by a whole round of the counter would look fresh, so the first one must be received before the
+    counter is back at 0. A counter shorter than twice the watchdog's time cannot detect this, and gets the usual time.
+
+    Attributes:
+        answered, echo: Session tick that the last fresh command answers, and its counter; −1 for none.
+        since_ns: Since when the next command is waited for; None while there is nothing to answer.
+    """
+
+    def __init__(self, counters: int, period_ns: int, watchdog_s: float) -> None:
+        self._counters = counters
+        watchdog_ns = round(watchdog_s * 1e9)
+        self._oldest = max(1, round(watchdog_ns / period_ns))  # age of a fresh command at the most [ticks]
+        self._watchdog_ns = self._oldest * period_ns
+        first_ns = _FIRST_COMMAND_NS
+        if counters * period_ns >= 2 * watchdog_ns:
+            first_ns = min(first_ns, (counters - 1) * period_ns)
+        self._first_ns = max(1, first_ns // period_ns) * period_ns
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the session; the next one has no measurement yet."""
+        self.echo = self.answered = -1
+        self.since_ns: int | None = None
+        self._limit_ns = _FIRST_COMMAND_NS
+
+    def measured(self, now_ns: int | None) -> None:
+        """Wait for the first command from now on: the session has its first measurement."""
+        self.since_ns, self._limit_ns = now_ns, self._first_ns
+
+    def judge(self, echo: int, session_tick: int, now_ns: int) -> Outcome:
+        """Judge a command, received after the measurement of a session's tick: ACTED if fresh, REPEATED or STALE.
+
+        A repeated echo is refused: after a whole round of the counter it would look fresh again.
+        """
+        age = (session_tick - echo) % self._counters
+        if echo == self.echo or session_tick - age <= self.answered:
+            return Outcome.REPEATED
+        if age > self._oldest:
+            return Outcome.STALE
+        self.echo, self.answered = echo, session_tick - age
+        self.since_ns, self._limit_ns = now_ns, self._watchdog_ns
+        return Outcome.ACTED
+
+    def overdue(self, now_ns: int) -> str | None:
+        """Why the session must end now, in words; None while a command may still be received in time."""
+        if self.since_ns is None or now_ns - self.since_ns < self._limit_ns:
+            return None
+        if self.answered < 0:
+            return f"no first command within {self._limit_ns * 1e-9:.3g} s"
+        return f"no fresh command for {(now_ns - self.since_ns) * 1e-6:.0f} ms"
+
+
 class VehicleClaim:
     """A plant that one controller at a time may drive.
 
-    Args:
-        wire: Format of the frames.
-        period_ns: Period of a tick [ns].
-        lockstep: Whether the loop waits for each command; a claim must have the same value.
-        armed: Whether the first claim is granted without `arm`.
+    `watchdog_s` is the longest time without a fresh command [s]; if `armed`, the first claim is granted without `arm`.
 
     Attributes:
-        session: Name of the session, or None.
-        holder: Controller that holds the plant, or None.
         trip: Cause of the last trip, until it is cleared.
         cause: Why the latch refuses claims, or None.
-        notices: Events since the owner last emptied this list.
-        changes: Of this end between ticks since the owner last emptied this list.
+        operator_only: Whether only an operator's `arm` clears the latch.
+        unavailable: Reason set by the owner to refuse every claim, such as a bus fault; None for none.
+        last: Record of the last session, for the next controller; None if it left none.
+        notices, changes: Events, and changes for the trace, since the owner last emptied these lists.
         ticked: Index of the last tick; −1 before the first.
         outcome: How the last tick judged the command received before it.
         voltages: In force from the last tick to the next command [V]. Shape (actuators,).
-        refused: Malformed frames so far.
-        stale: Commands so far that answered a measurement older than the watchdog's time.
-        last: Record of the last session, for the next controller; None if it left none.
-        unavailable: Reason set by the owner to refuse every claim, such as a bus fault; None for none.
-        operator_only: Whether only an operator's `arm` clears the latch.
+        refused, stale: Malformed and stale frames so far.
     """
 
-    def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool = False, armed: bool = False) -> None:
+    def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
         self.wire = wire
         self.period_ns = period_ns
         self.lockstep = lockstep
         self.session: str | None = None
         self.holder: str | None = None
         self.trip: TripCause | None = None
+        self.cause: str | None = None if armed else "not armed since it was started"
+        self.operator_only = False
+        self.unavailable: str | None = None
+        self.last: SessionRecord | None = None
         self.notices: list[Notice] = []
         self.changes: list[PlantChange] = []
         self.ticked = -1
@@ -84,18 +140,14 @@ class VehicleClaim:
         self.off = (0.0,) * wire.actuators
         self.voltages: tuple[float, ...] = self.off
         self.refused = self.stale = 0
-        self.last: SessionRecord | None = None
-        self.unavailable: str | None = None
         self._record: SessionRecord | None = None  # of the running session
         self._machine = Machine(PlantState.IDLE, PLANT_TABLE)
         self._counters = wire.measurement.counters
+        self._freshness = Freshness(self._counters, period_ns, watchdog_s)
         self._level = wire.voltage.quantizer().level
         self._silent_commands = lockstep and wire.transmit.command == "on_change"
         self._codes: tuple[float, ...] = ()  # of the last fresh command
-        self._echo = self._answered = -1  # its echo, and the session tick that it answers
-        self.protect(WATCHDOG_S)
-        self.cause: str | None = None if armed else "not armed since it was started"
-        self.operator_only = False
+        self._start = 0  # tick of the session's first measurement
 
     @property
     def state(self) -> PlantState:
@@ -105,12 +157,17 @@ class VehicleClaim:
     @property
     def session_tick(self) -> int:
         """Tick of the last measurement since the session's first, which has 0; −1 before that."""
-        return -1
+        return self.ticked - self._start
+
+    @property
+    def counter(self) -> int:
+        """Counter of the session's last measurement."""
+        return self.session_tick % self._counters
 
     @property
     def answered(self) -> int:
         """Session tick that the command in force answers; −1 for none."""
-        return self._answered
+        return self._freshness.answered
 
     @property
     def event_tick(self) -> int | None:
@@ -122,6 +179,8 @@ class VehicleClaim:
         """Measured values beyond their quantizer's range so far; 0 where nothing is quantized."""
         return 0
 
+    # ── claim, release, latch ──
+
     def start_tripped(self, trip: TripCause, cause: str, *, operator_only: bool) -> None:
         """Begin with the latch that an earlier process left. No PlantChange: a replay begins at the first grant."""
         self._machine.fire(PlantTrigger.TRIP)
@@ -130,12 +189,9 @@ class VehicleClaim:
     def claim(self, claim: Claim) -> Grant | Refusal:
         """Grant a claim, or refuse it with the fields that differ, the holder or the latch's reason."""
         differences = self.wire.differences(claim.wire)
-        if claim.protocol != PROTOCOL_VERSION:
-            differences.append(f"protocol: {PROTOCOL_VERSION}, not {claim.protocol}")
-        if claim.period_ns != self.period_ns:
-            differences.append(f"period_ns: {self.period_ns}, not {claim.period_ns}")
-        if claim.lockstep != self.lockstep:
-            differences.append(f"lockstep: {self.lockstep}, not {claim.lockstep}")
+        for name, ours in (("protocol", PROTOCOL_VERSION), ("period_ns", self.period_ns), ("lockstep", self.lockstep)):
+            if (theirs := getattr(claim, name)) != ours:
+                differences.append(f"{name}: {ours}, not {theirs}")
         if self.unavailable is not None:
             return Refusal(reason=self.unavailable)
         if differences:
@@ -213,47 +269,29 @@ class VehicleClaim:
         """Record a change of this end after its last tick; fields as in PlantChange."""
         self.changes.append(PlantChange(tick=self.ticked, kind=kind, **what))
 
-    def protect(self, watchdog_s: float) -> None:
-        """Set the watchdog's time [s].
+    # ── commands ──
 
-        Why the first command of a session has a deadline of its own: the age of an echo is known modulo the counter.
-        Commands late by a whole round of the counter would look fresh, so the first one must be received before the
-        counter is back at 0. A counter shorter than twice the watchdog's time cannot detect this, and gets the usual
-        time.
-        """
-        self._watchdog_ns = round(watchdog_s * 1e9)
-        self._watchdog = max(1, round(self._watchdog_ns / self.period_ns))
-        self._first_command_ns = round(FIRST_COMMAND_S * 1e9)
-        if self._counters * self.period_ns >= 2 * self._watchdog_ns:
-            self._first_command_ns = min(self._first_command_ns, (self._counters - 1) * self.period_ns)
-
-    def _command(self, frame: bytes) -> Outcome:
+    def _command(self, frame: bytes, now_ns: int) -> Outcome:
         """Put a command's voltages in force if it is well-formed, fresh and valid."""
         if frame == SILENCE and self._silent_commands and self._codes:
-            read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
+            read: tuple[int, tuple[float, ...]] | None = (self._freshness.echo + 1) % self._counters, self._codes
         else:
             read = self.wire.command.unpack(frame)
         if read is None:
             self.refused += 1
             return Outcome.MALFORMED
         echo, codes = read
-        # The echo is a tick modulo `counters` and means the latest measurement with that counter. A repeated echo is
-        # refused: after a whole round of the counter it would look fresh again.
-        now = self.session_tick
-        age = (now - echo) % self._counters
-        if echo == self._echo or now - age <= self._answered:
-            return Outcome.REPEATED
-        if age > self._watchdog:
-            self.stale += 1
-            return Outcome.STALE
+        outcome = self._freshness.judge(echo, self.session_tick, now_ns)
+        self.stale += outcome is Outcome.STALE
+        if outcome is not Outcome.ACTED:
+            return outcome
         voltages = tuple(map(self._level, codes))
         if not isfinite(sum(voltages)):
             if not self._may_be_invalid(echo):
                 self._trip(TripCause.INVALID_COMMAND, f"{self.holder} commands 'no valid value'")
                 return Outcome.INVALID
             voltages = self.off
-        self.voltages = voltages
-        self._codes, self._echo, self._answered = codes, echo, now - age
+        self.voltages, self._codes = voltages, codes
         if self.state is not PlantState.DRIVEN:
             self._machine.fire(PlantTrigger.COMMAND)
         return Outcome.ACTED
@@ -263,13 +301,11 @@ class VehicleClaim:
         del echo
         return True
 
-    def _begin(self) -> None:
-        """Reset the state of a session when one begins."""
-        self._codes, self._echo, self._answered = (), -1, -1
+    # ── begin and end of a session ──
 
-    def _rest(self) -> None:
-        """Set 0 V when a session has ended."""
-        self.voltages, self._answered = self.off, -1
+    def _begin(self) -> None:
+        """Begin a session; its first measurement is the next tick's."""
+        self._start = self.ticked + 1
 
     def _trip(self, cause: TripCause, reason: str) -> None:
         self._end(PlantTrigger.TRIP, "tripped", f"{reason}: 0 V", cause)
@@ -286,7 +322,8 @@ class VehicleClaim:
             self.last, self._record = self._record and self._record.model_copy(update=how), None
         self._machine.fire(trigger)
         self.session = self.holder = None
-        self._rest()
+        self.voltages, self._codes = self.off, ()
+        self._freshness.reset()
 
     def _notice(self, kind: EventKind, text: str) -> None:
         self.notices.append(Notice(kind, text, self.session, self.event_tick))

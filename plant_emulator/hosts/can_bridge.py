@@ -5,7 +5,7 @@ the bus it is the controller's side. Frames pass unchanged, byte for byte. It ru
 and trips when the bus fails or the node is silent, has another wire spec or trips. It reopens a failed bus by itself;
 the plant is driven again once it is armed.
 
-A tick of the bridge is a forwarded measurement. Commands are judged fresh or stale by the node's rule.
+A tick of the bridge is a forwarded measurement. Commands are judged by the node's own rule, `Freshness`.
 """
 
 from __future__ import annotations
@@ -24,62 +24,45 @@ from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, LoopSettings
+from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
 
 WAIT_S: Final = 0.01
 SESSIONS: Final = 16
-_UNBEGUN_NS: Final = round(FIRST_COMMAND_S * 1e9)  # for the first command, before the session's first measurement
 
 
 class Relay(VehicleClaim):
-    """Claims, sessions and watchdog for a plant on a bus, sans-I/O.
-
-    The session ends after `watchdog_s` without a fresh command [s]; the other arguments are VehicleClaim's.
-
-    Attributes:
-        number: Number of the session on the bus.
-        counter: Counter of the last forwarded measurement.
-    """
+    """Claims, sessions and watchdog for a plant on a bus, sans-I/O; `number` is the session's on the bus."""
 
     def __init__(self, wire: WireSpec, period_ns: int, *, lockstep: bool, watchdog_s: float, armed: bool) -> None:
-        super().__init__(wire, period_ns, lockstep=lockstep, armed=armed)
+        super().__init__(wire, period_ns, lockstep=lockstep, watchdog_s=watchdog_s, armed=armed)
         self.number = 0
-        self.counter = 0
         self._silent_measurements = lockstep and wire.transmit.measurement == "on_change"
-        self.protect(watchdog_s)
-        self._begun = False  # from the first measurement with counter 0; frames before it are of another session
-        self._session_tick = -1
-        self._fresh_ns: int | None = None  # time of the last fresh command or of the session's start
         self._judged = Outcome.NONE  # of the last command since the last tick
 
-    @property
-    def session_tick(self) -> int:
-        """Tick of the last measurement since the session's first, by its counter; a lost round goes unnoticed."""
-        return self._session_tick
-
     def measurement(self, frame: bytes) -> bytes | None:
-        """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick."""
+        """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick.
+
+        A session begins with counter 0; frames before it are of another session. A lost round of the counter goes
+        unnoticed.
+        """
         if self.session is None:
             return None
+        begun = self.session_tick >= 0
         if frame == SILENCE and self._silent_measurements:
-            if not self._begun:
-                return None
-            self.counter = (self.counter + 1) % self._counters
-            self._count(1)
-            return frame
-        read = self.wire.measurement.unpack(frame)
-        if read is None:
+            ticks = int(begun)
+        elif (read := self.wire.measurement.unpack(frame)) is None:
             self.refused += 1
             return None
-        last, self.counter = self.counter, read[0]
-        if self._begun:
-            self._count((self.counter - last - 1) % self._counters + 1)
-        elif self.counter == 0:
-            self._begun, self._fresh_ns = True, None
-            self._count(1)
-        return frame if self._begun else None
+        else:
+            ticks = (read[0] - self.counter - 1) % self._counters + 1 if begun else int(read[0] == 0)
+        if not ticks:
+            return None
+        if not begun:
+            self._freshness.measured(None)  # the wait for the first command begins with the next `watch`
+        self._count(ticks)
+        return frame
 
     def command(self, frame: bytes, now_ns: int) -> bytes | None:
         """Take a frame from the session's controller. Returns it if it is to be forwarded.
@@ -88,9 +71,7 @@ class Relay(VehicleClaim):
         """
         if self.session is None:
             return None
-        self._judged = self._command(frame)
-        if self._judged is Outcome.ACTED:
-            self._fresh_ns = now_ns
+        self._judged = self._command(frame, now_ns)
         return None if self._judged is Outcome.MALFORMED else frame
 
     def watch(self, now_ns: int) -> bool:
@@ -99,32 +80,24 @@ class Relay(VehicleClaim):
         Returns:
             Whether it tripped, which is a tick without a measurement.
         """
-        if self.session is None:
+        if self.session is None or (self.lockstep and self.state is PlantState.DRIVEN):
             return False
-        if self._fresh_ns is None:
-            self._fresh_ns = now_ns
-        waited_ns = now_ns - self._fresh_ns
-        first_ns = self._first_command_ns if self._begun else _UNBEGUN_NS
-        if self.state is PlantState.DRIVEN and waited_ns > self._watchdog_ns and not self.lockstep:
-            text = f"no fresh command for {waited_ns * 1e-6:.0f} ms"
-        elif self.state is PlantState.GRANTED and waited_ns > first_ns:
-            text = f"no first command within {first_ns * 1e-9:.3g} s"
-        else:
+        if self._freshness.since_ns is None:
+            self._freshness.since_ns = now_ns
+        if (reason := self._freshness.overdue(now_ns)) is None:
             return False
         self._count(1)
-        self._trip(TripCause.COMMAND_TIMEOUT, text)
+        self._trip(TripCause.COMMAND_TIMEOUT, reason)
         return True
 
     def _count(self, ticks: int) -> None:
         """Count a tick, this many periods after the session's last one."""
         self.ticked += ticks
-        self._session_tick += ticks
         self.outcome, self._judged = self._judged, Outcome.NONE
 
     def _begin(self) -> None:
         super()._begin()
         self.number = (self.number + 1) % SESSIONS
-        self._begun, self._session_tick, self._fresh_ns = False, -1, None
         self._judged = Outcome.NONE
 
 
@@ -151,14 +124,12 @@ class Bridge:
         self._beat_due = 0.0
         self._sent_state = self._relay.state  # by heartbeat
         self._arrival: Arrival | None = None  # the last command since the last tick
-        self._machine_notes: list[str] = []
         self._granted_ns = 0
 
     def run(self) -> None:
         """Run until the role stops; then release the node and publish a last status."""
-        network, relay = self._network, self._relay
-        if not self._loop.lockstep:
-            network.notes = self._machine_notes = prepare_process(self._loop)
+        network, relay, bus = self._network, self._relay, self._bus
+        machine_notes = [] if self._loop.lockstep else prepare_process(self._loop)
         network.serve()
         try:
             while not self._role.stop.is_set():
@@ -166,23 +137,22 @@ class Bridge:
                     self._changed.wait_for(self._frame_pending, WAIT_S)
                 relay.unavailable = self._unavailable()
                 network.take_inbox()
-                self._follow()
+                self._follow_state()
                 self._pass_frames()
                 if relay.watch(now_ns := time.monotonic_ns()):
                     self._account(None, now_ns)
                 self._watch_node()
-                self._follow()
-                if self._bus.errors or self._bus.refused:
-                    count = f"the bus: {self._bus.errors} errors, {self._bus.refused} malformed frames"
-                    network.notes = [*self._machine_notes, count]
+                self._follow_state()
+                failed = bus.errors or bus.refused
+                count = [f"the bus: {bus.errors} errors, {bus.refused} malformed frames"] if failed else []
+                network.notes = machine_notes + count
                 network.follow_session()
-                network.publish_when_due()
                 collect_garbage()
         finally:
             if relay.session is not None:
                 relay.release(relay.session)
             self._beat()
-            self._bus.close()
+            bus.close()
             network.leave()
 
     def _frame_pending(self) -> bool:
@@ -208,27 +178,25 @@ class Bridge:
 
     def _watch_node(self) -> None:
         """Trip when the bus fails, or the node is silent, tripped, restarted or of another wire spec."""
-        relay, bus = self._relay, self._bus
+        relay, bus, node = self._relay, self._bus, f"node {self._node}"
         if bus.fault is not None:
             relay.expire(TripCause.BUS, bus.fault)
             self._role.warn("bus", "fault", f"{bus.fault}; trying again twice a second")
             if bus.mend():
                 self._role.event("changed", "the bus is open again")
-            return
-        peer = bus.peer
-        if relay.session is None or peer is None:
-            return
-        if bus.silent:
-            relay.expire(TripCause.NODE, f"node {self._node} has been silent for {bus.silent_s() * 1e3:.0f} ms")
-        elif peer.at_ns < self._granted_ns:
-            return  # this heartbeat may be from before the session
-        elif peer.fingerprint != self._fingerprint:
-            relay.expire(TripCause.NODE, f"node {self._node} has another wire spec now")
-        elif peer.state is PlantState.IDLE:
-            relay.expire(TripCause.NODE, f"node {self._node} was started again")
-        elif peer.state is PlantState.TRIPPED:
-            cause = peer.cause or "no cause reported"
-            relay.expire(peer.cause or TripCause.NODE, f"node {self._node} tripped: {cause}")
+        elif relay.session is None or bus.peer is None:
+            pass
+        elif bus.silent:
+            relay.expire(TripCause.NODE, f"{node} has been silent for {bus.silent_s() * 1e3:.0f} ms")
+        elif bus.peer.at_ns < self._granted_ns:
+            pass  # this heartbeat may be from before the session
+        elif bus.peer.fingerprint != self._fingerprint:
+            relay.expire(TripCause.NODE, f"{node} has another wire spec now")
+        elif bus.peer.state is PlantState.IDLE:
+            relay.expire(TripCause.NODE, f"{node} was started again")
+        elif bus.peer.state is PlantState.TRIPPED:
+            cause = bus.peer.cause
+            relay.expire(cause or TripCause.NODE, f"{node} tripped: {cause or 'no cause reported'}")
 
     def _unavailable(self) -> str | None:
         bus = self._bus
@@ -240,23 +208,22 @@ class Bridge:
             return f"node {self._node} has another wire spec, period or lockstep setting than the bridge"
         return None
 
-    def _follow(self) -> None:
+    def _follow_state(self) -> None:
         """Send a heartbeat when it is due, and at once when the state has changed: the node follows it."""
         relay = self._relay
         if relay.state is not self._sent_state:
+            self._sent_state = relay.state
+            self._beat_due = 0.0
             if relay.state is PlantState.GRANTED:
                 self._bus.take()  # drop a frame from before the session
                 self._arrival = None
                 # The node sends its state ten times a second and at every change. Until it has received the first
                 # heartbeat of this session, it may still send its state of before.
                 self._granted_ns = time.monotonic_ns() + round(HEARTBEAT_S * 1e9)
-            self._sent_state = relay.state
-            self._beat()
-        elif time.monotonic() >= self._beat_due:
+        if time.monotonic() >= self._beat_due:
             self._beat()
 
     def _beat(self) -> None:
-        driven = self._relay.session is not None
-        state = PlantState.GRANTED if driven else PlantState.IDLE
+        state = PlantState.GRANTED if self._relay.session is not None else PlantState.IDLE
         self._beat_due = time.monotonic() + HEARTBEAT_S
         self._bus.beat(Heartbeat(state, self._relay.number, self._fingerprint))

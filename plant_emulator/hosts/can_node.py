@@ -38,7 +38,7 @@ class CanNetwork(PlantNetwork):
         self._endpoint = endpoint
         self._bus = CanLink(settings, endpoint.wire, "plant", lockstep=loop.lockstep)
         self._fingerprint = fingerprint(endpoint.wire, loop.period_ns, lockstep=loop.lockstep)
-        self._number = -1  # of the session
+        self._number: int | None = None  # of the session
         self._throttle = Throttle()
         self._beat_due = 0.0
         self._sent_state = endpoint.state  # by heartbeat
@@ -58,56 +58,47 @@ class CanNetwork(PlantNetwork):
         """Follow the controller side's heartbeat: begin, end or lose a session."""
         bus, endpoint = self._bus, self._endpoint
         if bus.fault is not None:
-            if self._throttle.let_pass("bus") is not None:
-                self._log("fault", f"{bus.fault}; trying again twice a second")
+            self._warn("bus", "fault", f"{bus.fault}; trying again twice a second")
             bus.mend()
         peer = bus.peer
-        gone = peer is None or bus.silent
-        if gone or peer is None or peer.state is not PlantState.GRANTED:
-            if endpoint.session is not None:
-                if gone:
-                    endpoint.lost(MASTER)
-                else:
-                    endpoint.release(endpoint.session)
-                self.follow_session()
-            self._number = -1
-        elif peer.number != self._number:
+        if peer is None or bus.silent:
+            endpoint.lost(MASTER)
+            self._number = None
+        elif peer.state is not PlantState.GRANTED or peer.number != self._number:
             if endpoint.session is not None:
                 endpoint.release(endpoint.session)
-            self._begin(peer)
-            self.follow_session()
+            self._number = None
+            if peer.state is PlantState.GRANTED:
+                self._begin(peer)
+        self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        """Send a measurement frame; SILENCE only in lockstep."""
         if frame or self._loop.lockstep:
             self._bus.send(frame)
 
-    def follow_session(self) -> None:
-        """Log events, and send a heartbeat at once if the state has changed."""
-        for notice in self._endpoint.notices:
-            self._log(*notice)
-        self._endpoint.notices.clear()
-        self._endpoint.changes.clear()  # the bridge writes the trace
-        if self._endpoint.state is not self._sent_state:
-            self._sent_state = self._endpoint.state
-            self.publish_status()
-
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """Log events and send a heartbeat that is due. The bridge writes the trace."""
+        """As `follow_session`. The bridge writes the trace."""
         del measurement, arrival, sent_ns
         self.follow_session()
-        self.publish_when_due()
 
-    def publish_when_due(self) -> None:
-        """Send a heartbeat ten times a second."""
-        if time.monotonic() >= self._beat_due:
+    def follow_session(self) -> None:
+        """Log events, and send a heartbeat ten times a second, and at once if the state has changed."""
+        endpoint = self._endpoint
+        for notice in endpoint.notices:
+            self._log(*notice)
+        endpoint.notices.clear()
+        endpoint.changes.clear()  # they belong to the trace
+        if endpoint.state is not self._sent_state or time.monotonic() >= self._beat_due:
             self.publish_status()
 
     def publish_status(self) -> None:
         """Send a heartbeat."""
+        endpoint = self._endpoint
+        self._sent_state = endpoint.state
         self._beat_due = time.monotonic() + HEARTBEAT_S
-        trip = self._endpoint.trip
-        self._bus.beat(Heartbeat(self._endpoint.state, trip.number if trip else 0, self._fingerprint))
+        cause = endpoint.trip.number if endpoint.trip else 0
+        self._bus.beat(Heartbeat(endpoint.state, cause, self._fingerprint))
 
     def leave(self) -> None:
         """Release a session, send an idle heartbeat, and close the bus."""
@@ -116,14 +107,9 @@ class CanNetwork(PlantNetwork):
         self.follow_session()
         self._bus.close()
 
-    def _log(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
-        """Log an event; on the bus there is no place for its text, and none for the vehicle's name."""
-        log_event(Event(role="node", kind=kind, text=text, session=session, tick=tick), None)
-
     def _begin(self, peer: Heartbeat) -> None:
         if peer.fingerprint != self._fingerprint:
-            if self._throttle.let_pass("fingerprint") is not None:
-                self._log("refused", "the controller's side has another wire spec, so it is not followed")
+            self._warn("fingerprint", "refused", "the controller's side has another wire spec, so it is not followed")
             return
         self._number = peer.number
         self._bus.take()  # drop a frame from before the session
@@ -137,3 +123,11 @@ class CanNetwork(PlantNetwork):
                 wire=self._endpoint.wire,
             )
         )
+
+    def _log(self, kind: EventKind, text: str, session: str | None = None, tick: int | None = None) -> None:
+        """Log an event; on the bus there is no place for its text, and none for the vehicle's name."""
+        log_event(Event(role="node", kind=kind, text=text, session=session, tick=tick), None)
+
+    def _warn(self, about: str, kind: EventKind, text: str) -> None:
+        if self._throttle.let_pass(about) is not None:
+            self._log(kind, text)

@@ -35,7 +35,7 @@ class PlantNetwork(ABC):
     Attributes:
         timing: Timing of the driver's loop; None in lockstep.
         skipped: Ticks of sessions that the driver missed.
-        notes: Real-time settings that the machine refused.
+        notes: What a status says of the machine, such as real-time settings that it refused.
     """
 
     def __init__(self) -> None:
@@ -61,22 +61,18 @@ class PlantNetwork(ABC):
         """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
 
     @abstractmethod
-    def follow_session(self) -> None:
-        """Publish events, and close the link of a session that ended."""
-
-    @abstractmethod
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """After the measurement was sent: write the tick's trace row, publish events and a status that is due.
+        """After the measurement was sent: write the tick's trace row, then as `follow_session`.
 
         Args:
             measurement: The endpoint's frame; SILENCE if it is not to be sent, None if there is none.
             arrival: The command received since the last tick, before any injected fault; None for none.
-            sent_ns: When the measurement was sent, on `time.monotonic_ns()`.
+            sent_ns: When the measurement was sent, on the monotonic clock [ns].
         """
 
     @abstractmethod
-    def publish_when_due(self) -> None:
-        """Publish the status if it is due."""
+    def follow_session(self) -> None:
+        """Publish events and a status that is due, and close the link of a session that ended."""
 
     @abstractmethod
     def publish_status(self) -> None:
@@ -92,9 +88,6 @@ class Driver:
 
     Raises:
         ValueError: The wire commands another number of actuators than the plant has.
-
-    Attributes:
-        endpoint: The plant's endpoint.
     """
 
     def __init__(
@@ -112,7 +105,6 @@ class Driver:
         self._settings = settings
         self._stop = stop
         self._counter = 0  # of the measurement sent last
-        self._command_bytes = wire.command.size
         self._malformed = bytes(wire.command.size + 1)  # stands for every command of a wrong length
         self.endpoint = Endpoint(
             plant,
@@ -147,22 +139,23 @@ class Driver:
                 network.leave()
 
     def _run_real_time(self) -> None:
-        network = self._network
+        """Wait for a tick, receive, tick and send, account; a plant that paces the loop waits in `advance`."""
+        network, endpoint = self._network, self.endpoint
         network.notes = prepare_process(self._loop)
         timing = network.timing = LoopTiming(clock=self._clock)
         grid = None if self._plant.paces else TickGrid(self._loop.period_ns, clock=self._clock)
         while not self._stop.is_set():
             skipped = grid.skipped if grid else 0
-            k = grid.wait() if grid else self.endpoint.ticked + self._plant.passed
+            k = grid.wait() if grid else endpoint.ticked + self._plant.passed
             woke_ns = self._clock.monotonic_ns()
             due_ns = grid.due_ns if grid else woke_ns
-            before = self.endpoint.session
+            before = endpoint.session
             network.take_inbox()
-            if grid and self.endpoint.session not in (None, before):
+            if grid and endpoint.session not in (None, before):
                 # Granting took time, and the controller takes its grid from the session's first measurement.
                 k, skipped = grid.wait(), grid.skipped
             self._tick(self._command(), k)
-            if self.endpoint.session:
+            if endpoint.session:
                 network.skipped += grid.skipped - skipped if grid else self._plant.passed - 1
             collect_garbage()
             timing.woke(due_ns, woke_ns)
@@ -176,43 +169,16 @@ class Driver:
         return link.wait(ANSWER_SHARE * self._loop.period) if self._plant.paces else link.take()
 
     def _run_lockstep(self) -> None:
+        """Tick and send, then wait for the answer, which is the next tick's command."""
         arrival = None
         while not self._stop.is_set():
             self._network.take_inbox()
             if self._network.link is None or not self._may_step():
                 self._clock.sleep(IDLE_WAIT_S if self._network.link is None else 0)
-                self._network.publish_when_due()
+                self._network.follow_session()
                 continue
             echo = self._tick(arrival, self.endpoint.ticked + 1)
             arrival = None if echo is None else self._await_answer(echo)
-
-    def tick(self, frame: bytes | None, k: int) -> bytes | None:
-        """Tick the plant end without the network: `Endpoint.tick`, with the hook for commands before it."""
-        if frame and len(frame) != self._command_bytes:
-            frame = self._malformed
-        passed = self._incoming(frame)
-        measurement = self.endpoint.tick(passed, k)
-        if passed is None and frame is not None:
-            self.endpoint.outcome = Outcome.WITHHELD
-        return measurement
-
-    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
-        network = self._network
-        measurement = self.tick(arrival.frame if arrival is not None else None, k)
-        sent_ns = self._clock.monotonic_ns()
-        echo = None
-        for sent in self._outgoing(measurement):
-            network.send(sent)
-            if self._loop.lockstep:
-                # The controller takes a frame without a counter for the tick after its last.
-                measured = self.endpoint.wire.measurement
-                echo = measured.counter(sent)
-                self._counter = (self._counter + 1) % measured.counters if echo is None else echo
-                if sent == SILENCE:
-                    echo = self._counter
-        network.after_tick(measurement, arrival, sent_ns)
-        return echo
 
     def _await_answer(self, echo: int) -> Arrival | None:
         """Wait for the command that echoes a counter. Returns None if the session ends first."""
@@ -225,8 +191,34 @@ class Driver:
             if self._clock.monotonic() > deadline:
                 self.endpoint.expire(TripCause.NO_ANSWER, f"no answer for {self._settings.answer_timeout_s:g} s")
             self._network.follow_session()
-            self._network.publish_when_due()
         return None
+
+    def _tick(self, arrival: Arrival | None, k: int) -> int | None:
+        """Tick on the network. Returns the counter that the answer to its measurement echoes, or None without one."""
+        network, measured = self._network, self.endpoint.wire.measurement
+        measurement = self.tick(arrival.frame if arrival is not None else None, k)
+        sent_ns = self._clock.monotonic_ns()
+        echo = None
+        for sent in self._outgoing(measurement):
+            network.send(sent)
+            if self._loop.lockstep:
+                # The controller takes a frame without a counter for the tick after its last.
+                echo = measured.counter(sent)
+                self._counter = (self._counter + 1) % measured.counters if echo is None else echo
+                if sent == SILENCE:
+                    echo = self._counter
+        network.after_tick(measurement, arrival, sent_ns)
+        return echo
+
+    def tick(self, frame: bytes | None, k: int) -> bytes | None:
+        """Tick the plant end without the network: `Endpoint.tick`, with the hook for commands before it."""
+        if frame and len(frame) != self.endpoint.wire.command.size:
+            frame = self._malformed
+        passed = self._incoming(frame)
+        measurement = self.endpoint.tick(passed, k)
+        if passed is None and frame is not None:
+            self.endpoint.outcome = Outcome.WITHHELD
+        return measurement
 
     # ── hooks of subclasses ──
 

@@ -58,11 +58,11 @@ class LatchFile:
         self.path = folder / f"{vehicle}.json"
         self.found = self._read()
         self._changed = threading.Condition()
-        self._wanted = self._tried = self._kept = self.found
+        self._wanted = self._kept = self.found
         self._wanted_at = time.monotonic()
-        self._error: str | None = None
+        self._error: str | None = None  # of the last attempt for `_wanted`
         self._closing = False
-        self._attempt(self.found)
+        self._attempt(self.found)  # shows from the start whether the directory can be written
         self._thread = threading.Thread(target=self._run, daemon=True)  # no hanging disk keeps the process alive
         self._thread.start()
 
@@ -97,6 +97,30 @@ class LatchFile:
             self._changed.notify_all()
         self._thread.join(KEPT_S)
 
+    def _run(self) -> None:
+        closing = False
+        while not closing:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._closing or (self._wanted != self._kept and self._error is None),
+                    RETRY_S if self._error else None,
+                )
+                latch, closing = self._wanted, self._closing
+            self._attempt(latch)
+
+    def _attempt(self, latch: Latch | None) -> None:
+        error = None
+        try:
+            self._store(latch)
+        except OSError as failure:
+            error = f"{self.path} cannot be written ({failure.strerror}); plant.state_directory names another folder"
+        with self._changed:
+            if error is None:
+                self._kept = latch
+            if latch == self._wanted:
+                self._error = error
+            self._changed.notify_all()
+
     def _read(self) -> Latch | None:
         try:
             return Latch.model_validate_json(self.path.read_bytes())
@@ -106,27 +130,6 @@ class LatchFile:
             why = error.strerror if isinstance(error, OSError) else "it is damaged"
             text = f"{self.path} cannot be read ({why}), so the plant may have been stopped: 0 V"
             return Latch(cause=TripCause.OPERATOR, text=text, operator_only=True, since=datetime.now(UTC))
-
-    def _run(self) -> None:
-        last = False
-        while not last:
-            with self._changed:
-                retry_s = RETRY_S if self._error else None
-                self._changed.wait_for(lambda: self._closing or self._wanted != self._tried, retry_s)
-                latch, last = self._wanted, self._closing
-            self._attempt(latch)
-
-    def _attempt(self, latch: Latch | None) -> None:
-        error, self._tried = None, latch
-        try:
-            self._store(latch)
-        except OSError as failure:
-            error = f"{self.path} cannot be written ({failure.strerror}); plant.state_directory names another folder"
-        with self._changed:
-            self._error = error
-            if error is None:
-                self._kept = latch
-            self._changed.notify_all()
 
     def _store(self, latch: Latch | None) -> None:
         """Bring the directory to this state. Raises OSError."""

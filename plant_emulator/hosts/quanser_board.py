@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from math import isnan, pi
 from typing import Any, Final
@@ -28,7 +28,6 @@ from aeroloop.plant_emulator.settings import PlantSettings, QuanserSettings
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.attitude import Vector
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 
@@ -47,6 +46,7 @@ COLOURS: Final[Mapping[PlantState, tuple[float, float, float]]] = {
     PlantState.TRIPPED: (1.0, 0.0, 0.0),
 }
 """Blue, yellow, green, red."""
+DARK: Final = (0.0, 0.0, 0.0)
 
 _SAMPLES_IN_BUFFER: Final = 1  # a read returns the newest sample, and the board counts those it overwrote
 _UNLIMITED: Final = 2**32 - 1  # samples; as in Quanser's own class for this board
@@ -69,9 +69,13 @@ class BoardDriver(Driver):
         super().__init__(self._board, loop, wire, settings, stop)
 
     def _tick(self, arrival: Arrival | None, k: int) -> int | None:
-        self._board.follow(self.endpoint.state)  # after a claim or a release since the last tick
+        board, network = self._board, self._network
+        board.follow(self.endpoint.state)  # after a claim or a release since the last tick
         echo = super()._tick(arrival, k)
-        self._board.follow(self.endpoint.state)  # after a trip or a first command in the tick
+        board.follow(self.endpoint.state)  # after a trip or a first command in the tick
+        if board.failures:
+            note = f"the board: {board.failures} failed calls, the last: {board.failure}"
+            network.notes = [*(note for note in network.notes if not note.startswith("the board: ")), note]
         return echo
 
 
@@ -85,14 +89,12 @@ class QuanserPlant(Plant):
     that passed; the next `passed` − 1 calls return at once and measure NaN. A caller that raises its tick index by
     `passed` stays on the board's clock. `period` is the time between samples [s].
 
-    Raises:
-        QuanserError: The interface is missing, or the board cannot be opened and prepared.
+    `failures` counts failed calls, reads without a sample and expiries of the watchdog; `failure` is the last one's
+    message.
 
-    Attributes:
-        overrun: Samples lost so far because they were not read in time.
-        failures: Failed calls of the interface so far, including reads without a sample.
-        failure: Message of the last failure, or None.
-        expiries: Expiries of the board's watchdog so far.
+    Raises:
+        QuanserError: The interface is missing, or the board cannot be opened and prepared; or, at the first `actuate`
+            or `advance`, it cannot be started.
     """
 
     actuators = 2
@@ -111,30 +113,27 @@ class QuanserPlant(Plant):
             ) from error
         self._error: type[Exception] = self._hardware.HILError
         self._board: Any = self._hardware.HIL()
-        self.overrun = self.failures = self.expiries = 0
+        self.failures = 0
         self.failure: str | None = None
 
         self._steps = [
             sign * 2 * pi / counts for sign, counts in zip(settings.encoder_signs, settings.counts, strict=True)
         ]
-        self._filters: list[FilteredDerivative] | None = None
+        self._filters: list[FilteredDerivative] | None = None  # made anew after an invalid sample
         self._counts = np.zeros(2, dtype=np.int32)
         self._gyro = np.zeros(3) if settings.rate == "gyro" else None
         self._measurement = NO_MEASUREMENT
 
-        self._volts = np.zeros(2)
-        self._no_volts = np.zeros(2)
-        self._colours = {state: np.array(colour) for state, colour in COLOURS.items()}
-        self._state: PlantState | None = None
-        self._lit: PlantState | None = None
         self._held: tuple[float, ...] = (0.0, 0.0)
-        self._driven = self._amplified = False
+        self._state = PlantState.IDLE
+        self._lit: PlantState | None = None
+        self._amplified = False
 
         self._task: object = None
         self._running = self._closed = self._expired = False
         self._written = True  # whether every write since the last sample succeeded
-        self._counts_overflows = True
-        self._samples_read = self._index = self._owed = 0  # index: of the last sample, on the board's clock
+        self._read_samples = self._lost_samples = 0
+        self._index = self._owed = 0  # index: of the last sample, on the board's clock
         self._advanced_ns = 0
         self._open()
 
@@ -144,9 +143,6 @@ class QuanserPlant(Plant):
         """Hold voltages [V], clipped to the limit; NaN is 0 V. Shape (2,).
 
         An expired board watchdog is cleared by 0 V only; until then nothing is written.
-
-        Raises:
-            QuanserError: The board cannot be started.
         """
         limit = self._settings.voltage_limit
         self._held = tuple(0.0 if isnan(v) else max(-limit, min(limit, v)) for v in voltages)
@@ -156,11 +152,7 @@ class QuanserPlant(Plant):
         self._write_outputs()
 
     def advance(self) -> None:
-        """Wait for the board's next sample; a failed read takes a period, too.
-
-        Raises:
-            QuanserError: The board cannot be started.
-        """
+        """Wait for the board's next sample; a failed read takes a period, too."""
         if self._owed:
             self._owed -= 1
             self._measurement = NO_MEASUREMENT
@@ -175,12 +167,10 @@ class QuanserPlant(Plant):
             self._measurement, self._filters = NO_MEASUREMENT, None
         if not passed:
             ahead = self._advanced_ns + self._period * 1e9 - time.monotonic_ns()
-            if ahead > 0:  # sleep to the end of the period, so that the loop does not spin
-                time.sleep(ahead * 1e-9)
+            time.sleep(max(0.0, ahead * 1e-9))  # to the end of the period, so that the loop does not spin
             self._index += 1
         self.passed = max(1, passed)
         self._owed = self.passed - 1
-        self.overrun += self._owed
         self._advanced_ns = time.monotonic_ns()
 
     def measure(self) -> Measurement:
@@ -196,9 +186,9 @@ class QuanserPlant(Plant):
             return
         self._closed = True
         board = self._board
-        still = self._try(board.write_analog, MOTORS, len(MOTORS), self._no_volts)
+        still = self._write_motors((0.0, 0.0))
         off = self._amplify(False)
-        self._try(board.write_other, LEDS, len(LEDS), np.zeros(3))
+        self._light(DARK)
         if still or off:
             self._try(board.watchdog_stop)
         if self._running:
@@ -212,42 +202,43 @@ class QuanserPlant(Plant):
 
         While its watchdog is expired, the board shows red by itself.
         """
-        self._state = state
-        driven = state in (PlantState.GRANTED, PlantState.DRIVEN)
-        if driven is not self._driven:
-            self._driven = driven
+        was_driven, self._state = self._driven, state
+        if self._driven is not was_driven:
             self._start()
             if not self._expired:
                 self._write_outputs()
         if state is not self._lit and not self._expired:
             self._lit = state
-            self._try(self._board.write_other, LEDS, len(LEDS), self._colours[state])
+            self._light(COLOURS[state])
+
+    @property
+    def _driven(self) -> bool:
+        return self._state in (PlantState.GRANTED, PlantState.DRIVEN)
 
     # ── starting ──
 
     def _open(self) -> None:
-        card, which = self._settings.card_type, self._settings.card_identifier
+        settings = self._settings
+        card = f"{settings.card_type} '{settings.card_identifier}'"
+        with self._required(f"cannot open {card}", "; is it plugged in, switched on, and free?"):
+            self._board.open(settings.card_type, settings.card_identifier)
         try:
-            self._board.open(card, which)
-        except self._error as error:
-            raise QuanserError(
-                f"cannot open {card} '{which}': {_text(error)}; is it plugged in, switched on, and free?"
-            ) from error
-        try:
-            self._prepare()
-        except self._error as error:
+            with self._required(f"cannot make {card} ready"):
+                self._prepare()
+        except QuanserError:
             self.close()
-            raise QuanserError(f"cannot make {card} '{which}' ready: {_text(error)}") from error
+            raise
 
     def _prepare(self) -> None:
         board, n = self._board, len(MOTORS)
         self._unlock()
-        board.write_analog(MOTORS, n, self._no_volts)
+        board.write_analog(MOTORS, n, np.zeros(n))
         board.write_digital(MOTORS, n, np.zeros(n, dtype=np.int8))
-        board.watchdog_set_analog_expiration_state(MOTORS, n, self._no_volts)
+        board.watchdog_set_analog_expiration_state(MOTORS, n, np.zeros(n))
         board.watchdog_set_digital_expiration_state(MOTORS, n, np.zeros(n, dtype=np.int32))
         with suppress(self._error):  # lights are not safety-relevant; the motors' states above are
-            board.watchdog_set_other_expiration_state(LEDS, len(LEDS), self._colours[PlantState.TRIPPED])
+            red = np.array(COLOURS[PlantState.TRIPPED])
+            board.watchdog_set_other_expiration_state(LEDS, len(LEDS), red)
         board.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(2, dtype=np.int32))
 
         gyro = None if self._gyro is None else GYRO
@@ -263,18 +254,18 @@ class QuanserPlant(Plant):
         """Start the watchdog and the sampling task, once."""
         if self._running or self._closed:
             return
-        board = self._board
-        try:
-            board.watchdog_start(self._settings.board_watchdog_s)
-            board.task_start(self._task, self._hardware.Clock.HARDWARE_CLOCK_0, 1 / self._period, _UNLIMITED)
-        except self._error as error:
-            raise QuanserError(f"cannot start {self._settings.card_type}: {_text(error)}") from error
+        with self._required(f"cannot start {self._settings.card_type}"):
+            self._board.watchdog_start(self._settings.board_watchdog_s)
+            self._board.task_start(self._task, self._hardware.Clock.HARDWARE_CLOCK_0, 1 / self._period, _UNLIMITED)
         self._running = True
         self._advanced_ns = time.monotonic_ns()
+
+    @contextmanager
+    def _required(self, what_fails: str, hint: str = "") -> Iterator[None]:
         try:
-            board.task_get_buffer_overflows(self._task)
-        except self._error:  # some boards may not count them
-            self._counts_overflows = False
+            yield
+        except self._error as error:
+            raise QuanserError(f"{what_fails}: {_text(error)}{hint}") from error
 
     # ── samples ──
 
@@ -283,15 +274,16 @@ class QuanserPlant(Plant):
         board = self._board
         try:
             read = board.task_read(self._task, 1, None, self._counts, None, self._gyro)
-            lost = board.task_get_buffer_overflows(self._task) if self._counts_overflows else 0
         except self._error as error:
             self._failed(_text(error))
             return 0
         if read != 1:
             self._failed("the board's task gave no sample")
             return 0
-        self._samples_read += 1
-        before, self._index = self._index, self._samples_read + lost
+        with suppress(self._error):  # not every board may count them
+            self._lost_samples = board.task_get_buffer_overflows(self._task)
+        self._read_samples += 1
+        before, self._index = self._index, self._read_samples + self._lost_samples
         return max(1, self._index - before)  # a failed read counted as a period, even if its sample followed
 
     def _seen(self, passed: int) -> Measurement:
@@ -310,53 +302,57 @@ class QuanserPlant(Plant):
         of_pitch, of_yaw = self._filters
         for _ in range(passed):
             pitch_rate, yaw_rate = of_pitch.update(pitch), of_yaw.update(yaw)
-        rate: Vector = rate_of(pitch, pitch_rate, yaw_rate)
-        return Measurement(attitude, rate)
+        return Measurement(attitude, rate_of(pitch, pitch_rate, yaw_rate))
 
     # ── outputs and watchdog ──
 
     def _write_outputs(self) -> None:
         if self._amplified is not self._driven:
             self._amplify(self._driven)
-        volts = self._held if self._driven else (0.0, 0.0)
-        settings = self._settings
-        for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, volts, strict=True):
-            self._volts[channel] = sign * voltage
-        self._written &= self._try(self._board.write_analog, MOTORS, len(MOTORS), self._volts)
+        self._write_motors(self._held if self._driven else (0.0, 0.0))
+
+    def _write_motors(self, voltages: Sequence[float]) -> bool:
+        settings, volts = self._settings, np.zeros(2)
+        for channel, sign, voltage in zip(settings.motor_channels, settings.motor_signs, voltages, strict=True):
+            volts[channel] = sign * voltage
+        done = self._try(self._board.write_analog, MOTORS, len(MOTORS), volts)
+        self._written &= done
+        return done
 
     def _amplify(self, on: bool) -> bool:
         done = self._try(self._board.write_digital, MOTORS, len(MOTORS), np.full(len(MOTORS), on, dtype=np.int8))
-        if done:
-            self._amplified = on
+        self._amplified = on if done else self._amplified
         self._written &= done
         return done
+
+    def _light(self, colour: tuple[float, float, float]) -> None:
+        self._try(self._board.write_other, LEDS, len(LEDS), np.array(colour))
 
     def _keep_alive(self, *, reload: bool) -> bool:
         """Reload the watchdog or read its state. False if it has expired or cannot be read."""
         if self._expired:
             return False
         try:
-            alive = self._board.watchdog_reload() if reload else not self._board.watchdog_is_expired()
+            alive: bool = self._board.watchdog_reload() if reload else not self._board.watchdog_is_expired()
         except self._error as error:
             self._failed(_text(error))
             return False
         if not alive:
+            self._failed("the board's watchdog expired")
             self._expired = True
             self._amplified = False
             self._lit = None
-            self.expiries += 1
         return alive
 
     def _clear(self) -> bool:
         """Clear the expired watchdog and restart it with outputs at 0 V. False if a step failed."""
-        board, n = self._board, len(MOTORS)
         self._unlock()
         # Clearing may restore the outputs of before the expiry, so a failed step must not prevent the next.
-        armed = self._try(board.watchdog_start, self._settings.board_watchdog_s)
-        still = self._try(board.write_analog, MOTORS, n, self._no_volts)
+        armed = self._try(self._board.watchdog_start, self._settings.board_watchdog_s)
+        still = self._write_motors((0.0, 0.0))
         done = self._amplify(False) and still and armed
         self._expired = not done
-        if done and self._state is not None:
+        if done:
             self.follow(self._state)
         return done
 

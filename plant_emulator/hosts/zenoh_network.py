@@ -84,16 +84,16 @@ class ZenohNetwork(PlantNetwork):
         if (found := self._latch_file.found) is not None:
             endpoint.start_tripped(found.cause, found.text, operator_only=found.operator_only)
             self._since = found.since
-        self._published_state = endpoint.state
-        self._status_tick = -1
+        self._published = endpoint.state, -1, time.monotonic()  # by the last status: state and tick, and when
         self._status_due = self._others_due = 0
-        self._status_time = time.monotonic()
-        self._forget_holder: Callable[[], None] | None = None
+        self._forget_holder: Callable[[], None] = lambda: None
 
     @property
     def link(self) -> ZenohLink | None:
         """Link of the session's frames; None without a session."""
         return self._link
+
+    # ── the loop's calls, in their order ──
 
     def serve(self) -> None:
         """Declare the topics, and answer claims and operator commands from now on."""
@@ -126,13 +126,13 @@ class ZenohNetwork(PlantNetwork):
             self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        """Send a measurement frame; SILENCE only in lockstep."""
         if self._link is not None and (frame or self._loop.lockstep):
             self._link.send(frame)
             self._sent += frame != SILENCE
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
-        """After the measurement was sent: write the trace row, measure latency, publish events and a due status."""
+        """Write the trace row, measure the latency, publish events and a due status."""
         endpoint = self._endpoint
         self._trace.row(endpoint, measurement, arrival, sent_ns)
         if endpoint.outcome is Outcome.ACTED:
@@ -144,42 +144,62 @@ class ZenohNetwork(PlantNetwork):
             text = "commands answer measurements older than the watchdog's time: refused"
             self._role.warn("stale", "fault", text, endpoint.session, endpoint.event_tick)
         if measurement:
-            self._sent_at[endpoint.session_tick % self._counters] = endpoint.session_tick, sent_ns
-        if arrival is not None:
-            self._received += arrival.frame != SILENCE
+            self._sent_at[endpoint.counter] = endpoint.session_tick, sent_ns
+        self._received += arrival is not None and arrival.frame != SILENCE
         self.follow_session()
-        self.publish_when_due()
 
     def follow_session(self) -> None:
-        """Publish events, and close the link of a session that ended."""
-        self._trace.follow(self._endpoint)
+        """Publish events and a due status, keep a new latch, and close the link of a session that ended."""
         endpoint = self._endpoint
-        if endpoint.state is not self._published_state:
-            self._published_state = endpoint.state
-            self._status_due = 0
+        self._trace.follow(endpoint)
         if endpoint.session is None and self._link is not None:
             self._link.close()
             self._refused += self._link.refused
             self._link = None
-            if self._forget_holder is not None:
-                self._forget_holder()
-        if not endpoint.notices:
-            return
-        if endpoint.cause is None:
-            self._since = None
-        elif any(notice.kind == "tripped" for notice in endpoint.notices):
-            self._published_state = endpoint.state
-            self._since = datetime.now(UTC)
-        self._keep_latch()
-        for notice in endpoint.notices:
-            self._role.event(*notice)
-        endpoint.notices.clear()
-        self._status_due = 0
-
-    def publish_when_due(self) -> None:
-        """Publish the status once a second, and at once after an event or a change of state."""
-        if time.monotonic_ns() >= self._status_due:
+            self._forget_holder()
+        if endpoint.notices:
+            self._keep_latch()
+            for notice in endpoint.notices:
+                self._role.event(*notice)
+            endpoint.notices.clear()
+            self._status_due = 0
+        if time.monotonic_ns() >= self._status_due or endpoint.state is not self._published[0]:
             self.publish_status()
+
+    def publish_status(self) -> None:
+        """Publish the status: once a second, and after every event and change of state."""
+        endpoint, role = self._endpoint, self._role
+        now = time.monotonic()
+        _, tick, then = self._published
+        self._latency.turn_when_due()
+        role.status(
+            Status(
+                role=role.role,
+                state=endpoint.state,
+                session=endpoint.session,
+                cause=endpoint.cause,
+                since=self._since,
+                unkept=self._latch_file.problem,
+                datagrams=role.datagrams.endpoint,
+                uptime_s=role.uptime_s,
+                ticks=endpoint.ticked + 1,
+                rate_hz=max(0.0, (endpoint.ticked - tick) / (now - then)),
+                skipped=self.skipped,
+                received=self._received,
+                sent=self._sent,
+                refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
+                stale=endpoint.stale,
+                saturated=endpoint.saturated,
+                latency_us=summary(self._latency.total),
+                recent_latency_us=summary(self._latency.recent()),
+                timing=report(self.timing) if self.timing else None,
+                notes=self.notes,
+                lacks_recorder="gone" if self._recorder.gone else None,
+                faults=self._faults(),
+            )
+        )
+        self._published = endpoint.state, endpoint.ticked, now
+        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
 
     def leave(self) -> None:
         """Publish the end of the trace, the stop and a last status."""
@@ -189,47 +209,31 @@ class ZenohNetwork(PlantNetwork):
         self._role.event("stopped", f"{self._role.vehicle} stopped at 0 V")
         self.publish_status()
 
-    # ── queries and tokens from other threads, processed between ticks ──
-
-    def _watch(self, holder: str) -> None:
-        def seen(appeared: bool) -> None:
-            if not appeared:
-                self._role.enqueue(lambda: self._endpoint.lost(holder))
-
-        self._forget_holder = self._role.watch_token(holder, seen)
-
-    def _read_others(self) -> None:
-        """Another plant end publishes under this one's name, as after a network was cut and healed."""
-        self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
-        if (sample := self._others.try_recv()) is not None:
-            with suppress(intake.IntakeError):
-                self._contest(intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).process)
-                self.follow_session()
-
-    def _contest(self, other: str) -> None:
-        if self._endpoint.trip is not TripCause.DUPLICATE:
-            plants = f"this one ({self._role.process}) and another ({other})"
-            text = f"two plants are named {self._role.vehicle}, {plants}; end one of them, then `aeroloop op arm`"
-            self._endpoint.stop(TripCause.DUPLICATE, text)
+    # ── claims ──
 
     def _claim(self, claim: Claim) -> Grant | Refusal:
+        role = self._role
         answer = self._endpoint.claim(claim)
         if isinstance(answer, Refusal):
             text = f"{claim.controller} refused: {answer.reason}"
-            self._role.warn(text, "refused", text, claim.session)
+            role.warn(text, "refused", text, claim.session)
             return answer
-        vehicle = self._role.vehicle
         self._sent_at = [(-1, 0)] * self._counters
         self._link = ZenohLink(  # before the grant is sent, so that the first command is not lost
-            self._role.zenoh,
-            send_key=topics.key("measurement", vehicle, session=claim.session),
-            receive_key=topics.key("command", vehicle, session=claim.session),
+            role.zenoh,
+            send_key=topics.key("measurement", role.vehicle, session=claim.session),
+            receive_key=topics.key("command", role.vehicle, session=claim.session),
             lengths=self._endpoint.wire.lengths("command", lockstep=self._loop.lockstep),
             lossless=self._loop.lockstep,
             changed=self._changed,
             also=self._role.datagrams.session,
         )
-        self._watch(claim.controller)
+
+        def seen(appeared: bool) -> None:
+            if not appeared:
+                role.enqueue(lambda: self._endpoint.lost(claim.controller))
+
+        self._forget_holder = role.watch_token(claim.controller, seen)
         return answer
 
     def _release(self, release: Release) -> Answer:
@@ -238,16 +242,34 @@ class ZenohNetwork(PlantNetwork):
 
     def _read_record(self, record: SessionRecord) -> Callable[[], Answer]:
         changes = record_json(record.in_force)  # of many points it takes milliseconds
-        return lambda: self._keep(record, changes)
 
-    def _keep(self, record: SessionRecord, changes: bytes) -> Answer:
-        done = self._endpoint.keep(record)
-        if done:
-            self._trace.record(changes)
-        return Answer(done=done, text="kept" if done else f"no session {record.session} of {record.controller} runs")
+        def keep() -> Answer:
+            done = self._endpoint.keep(record)
+            if done:
+                self._trace.record(changes)
+            text = "kept" if done else f"no session {record.session} of {record.controller} runs"
+            return Answer(done=done, text=text)
+
+        return keep
 
     def _show(self) -> SessionRecord | Answer:
         return self._endpoint.last or Answer(done=False, text=f"{self._role.vehicle} has no record of a session")
+
+    def _read_others(self) -> None:
+        """Trip if another plant end publishes under this one's name, as after a network was cut and healed."""
+        self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
+        if (sample := self._others.try_recv()) is not None:
+            with suppress(intake.IntakeError):
+                other = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).process
+                if self._endpoint.trip is not TripCause.DUPLICATE:
+                    which = f"this one ({self._role.process}) and another ({other})"
+                    text = (
+                        f"two plants are named {self._role.vehicle}, {which}; end one of them, then `aeroloop op arm`"
+                    )
+                    self._endpoint.stop(TripCause.DUPLICATE, text)
+                self.follow_session()
+
+    # ── operator commands and the latch ──
 
     def _arm(self) -> Answer:
         vehicle = self._role.vehicle
@@ -272,9 +294,8 @@ class ZenohNetwork(PlantNetwork):
         def answer() -> Answer:
             if not (unkept := self._latch_file.unkept):
                 return answers[0]
-            return answers[0].model_copy(
-                update={"text": f"{answers[0].text}; but a restart of the plant would forget it: {unkept}"}
-            )
+            text = f"{answers[0].text}; but a restart of the plant would forget it: {unkept}"
+            return answers[0].model_copy(update={"text": text})
 
         self._role.enqueue(apply)
         changed.wait(KEPT_S)
@@ -282,54 +303,25 @@ class ZenohNetwork(PlantNetwork):
         return answer
 
     def _keep_latch(self) -> None:
+        """Have the latch of a tripped plant on disk, and none of one that is not."""
         endpoint, latch = self._endpoint, None
+        if endpoint.cause is None:
+            self._since = None
+        elif any(notice.kind == "tripped" for notice in endpoint.notices):
+            self._since = datetime.now(UTC)
         if endpoint.trip is not None and endpoint.cause is not None and self._since is not None:
             latch = Latch(
                 cause=endpoint.trip, text=endpoint.cause, operator_only=endpoint.operator_only, since=self._since
             )
         self._latch_file.keep(latch)
 
-    def publish_status(self) -> None:
-        """Publish the status."""
-        now = time.monotonic()
-        endpoint = self._endpoint
-        self._latency.turn_when_due()
-        self._role.status(
-            Status(
-                role=self._role.role,
-                state=endpoint.state,
-                session=endpoint.session,
-                cause=endpoint.cause,
-                since=self._since,
-                unkept=self._latch_file.problem,
-                datagrams=self._role.datagrams.endpoint,
-                uptime_s=self._role.uptime_s,
-                ticks=endpoint.ticked + 1,
-                rate_hz=max(0.0, (endpoint.ticked - self._status_tick) / (now - self._status_time)),
-                skipped=self.skipped,
-                received=self._received,
-                sent=self._sent,
-                refused=endpoint.refused + self._refused + (self._link.refused if self._link else 0),
-                stale=endpoint.stale,
-                saturated=endpoint.saturated,
-                latency_us=summary(self._latency.total),
-                recent_latency_us=summary(self._latency.recent()),
-                timing=report(self.timing) if self.timing else None,
-                notes=self.notes,
-                lacks_recorder="gone" if self._recorder.gone else None,
-                faults=self._faults(),
-            )
-        )
-        self._status_tick, self._status_time = endpoint.ticked, now
-        self._status_due = time.monotonic_ns() + STATUS_PERIOD_NS
-
 
 class PlantTrace:
-    """Trace of the plant end: a row for every tick of a session, and the operations between ticks.
+    """Trace of the plant end: a row for every tick of a session, and the changes between ticks.
 
     The owner adds a row after each measurement was sent, and calls `follow` whenever a session may have begun or ended.
-    All waiting rows are published when a session ends; operations outside of sessions at once, without rows. `publish`
-    is called with every batch; `run` is the random number that identifies this process, drawn if None.
+    All waiting rows are published when a session ends; changes outside of sessions at once, without rows. `publish` is
+    called with every batch; `run` is the random number that identifies this process, drawn if None.
     """
 
     def __init__(
@@ -348,18 +340,16 @@ class PlantTrace:
         writer = self._writer
         if not writer.session:
             return
-        if arrival is None:
-            command, received_ns, received_as = b"", 0, 0
-        else:
-            command, received_ns = arrival
-            if len(command) == self._command_bytes:
-                received_as = 1
-            else:
-                received_as, command = (Sent.SILENT if command == SILENCE else Sent.MALFORMED), b""
+        command, received_ns = arrival or (b"", 0)
+        received_as = Sent.NONE
+        if arrival is not None:
+            received_as = Sent.SILENT if command == SILENCE else Sent.FRAME
+            if command and len(command) != self._command_bytes:
+                received_as, command = Sent.MALFORMED, b""
         writer.plant_row(
             end.ticked,
             end.session_tick,
-            1 if measurement else 0 if measurement is None else 2,
+            Sent.NONE if measurement is None else Sent.FRAME if measurement else Sent.SILENT,
             received_as,
             end.outcome,
             0 if end.session or end.trip is None else end.trip.number,
@@ -374,25 +364,22 @@ class PlantTrace:
             self._publish_batch(final=False)
 
     def follow(self, end: VehicleClaim) -> None:
-        """Move the end's operations into the trace; publish everything waiting if its session ended or none runs."""
+        """Move the end's changes into the trace; publish everything waiting if its session ended or none runs."""
         writer = self._writer
-        if end.changes:
-            writer.operations += end.changes
-            end.changes.clear()
+        writer.operations += end.changes
+        end.changes.clear()
         session = end.session or ""
+        if session != writer.session or not session:
+            self.finish()
         if session != writer.session:
-            if writer.session or not writer.empty:  # the last batch is marked final, with or without rows
-                self._publish_batch(final=bool(writer.session))
             writer.session, writer.record = session, b""
-        elif not session and not writer.empty:
-            self._publish_batch(final=False)
 
     def record(self, changes: bytes) -> None:
         """Take over the running session's gains and reference, as `record_json` has them, for later batches."""
         self._writer.record = changes
 
     def finish(self) -> None:
-        """Publish everything waiting, before the process ends."""
+        """Publish everything waiting; the last batch of a session is marked final, with or without rows."""
         if self._writer.session or not self._writer.empty:
             self._publish_batch(final=bool(self._writer.session))
 

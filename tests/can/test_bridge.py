@@ -16,19 +16,17 @@ import zenoh
 from aeroloop.plant_emulator.hosts.can_bridge import Bridge
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Release, Status
-from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.messages.models import Event, Grant, Release
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.can_in_process import virtual
+from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
-WIRE = WireSpec()
 LOOP = LoopSettings(realtime="off")
 OURS = fingerprint(WIRE, LOOP.period_ns, lockstep=False)
 SLACK_S = 0.3
@@ -46,9 +44,8 @@ class Ends:
         self.node = CanLink(bus, WIRE, "plant")
         self.events: list[Event] = []
         self._session = gathering.join()
+        self.asker = Asker(self._session, LOOP.period_ns)
         self._session.declare_subscriber(topics.key("event", "aero"), self._on_event)
-        self.statuses: list[Status] = []
-        self._session.declare_subscriber(topics.key("status", "aero", role="plant"), self._on_status)
         self.batches: list[Batch] = []
         self._session.declare_subscriber(topics.key("trace", "aero", role="plant"), self._trace)
         self.measured: list[bytes] = []
@@ -57,7 +54,6 @@ class Ends:
         alive = threading.Event()
         token = topics.key("alive", "aero", role="plant")
         self._session.liveliness().declare_subscriber(token, lambda _: alive.set(), history=True)
-        self._sessions = 0
         self._says = Heartbeat(PlantState.IDLE, 0, OURS)
         self._over = threading.Event()
         self._threads = [threading.Thread(target=run) for run in (self._bridge.run, self._beat)]
@@ -84,39 +80,16 @@ class Ends:
         self._over.set()
         self._threads[1].join()
 
-    def claim(self) -> Grant | Refusal:
-        """Ask for the plant."""
-        self._sessions += 1
-        claim = Claim(
-            controller="a",
-            session=f"of-a-{self._sessions}",
-            period_ns=LOOP.period_ns,
-            lockstep=False,
-            auto_arm=True,
-            wire=WIRE,
-        )
-        payload = self._ask("claim", claim.encode())
-        return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
-
     def hold(self) -> None:
         """Have the plant, and let the node say so."""
-        eventually("the grant", lambda: isinstance(self.claim(), Grant))
+        eventually("the grant", lambda: isinstance(self.asker.claim(), Grant))
         eventually("granted on the bus", lambda: self.received_state() is PlantState.GRANTED)
         self.say(PlantState.GRANTED)
         time.sleep(0.15)  # what a node says in the first 0.1 s may be of before the session
 
     def release(self) -> bool:
         """Give the plant back."""
-        release = Release(session=f"of-a-{self._sessions}")
-        return Answer.model_validate_json(self._ask("release", release.encode())).done
-
-    def stop(self) -> Answer:
-        """As `aeroloop op stop`."""
-        return Answer.model_validate_json(self._ask("stop", Request().encode()))
-
-    def arm(self) -> Answer:
-        """As `aeroloop op arm`."""
-        return Answer.model_validate_json(self._ask("arm", Request().encode()))
+        return self.asker.ask("release", Release(session=self.asker.session)).done
 
     def received_state(self) -> PlantState | None:
         """The state that the node last received from the bridge."""
@@ -128,23 +101,12 @@ class Ends:
         eventually("idle on the bus", lambda: self.received_state() is PlantState.IDLE)
         return next(event.text for event in self.events if event.kind == "tripped")
 
-    def _ask(self, topic: str, payload: bytes) -> bytes:
-        for _ in range(20):
-            for reply in self._session.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-            time.sleep(2 / topics.QUERIES_PER_S)  # it came too soon after the last, and was dropped
-        raise AssertionError(f"no reply to {topic!r}")
-
     def _on_event(self, sample: zenoh.Sample) -> None:
         self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
 
-    def _on_status(self, sample: zenoh.Sample) -> None:
-        self.statuses.append(Status.model_validate_json(sample.payload.to_bytes()))
-
     def command(self, echo: int) -> None:
         """Answer a measurement."""
-        key = topics.key("command", "aero", session=f"of-a-{self._sessions}")
+        key = topics.key("command", "aero", session=self.asker.session)
         self._session.put(key, WIRE.command.pack(echo, (3, -3)))
 
     def _trace(self, sample: zenoh.Sample) -> None:
@@ -204,26 +166,22 @@ def test_it_writes_the_plants_trace_with_a_row_for_every_measurement_that_passed
 
 def test_an_operators_stop_puts_the_node_at_rest(ends: Ends) -> None:
     ends.hold()
-    assert ends.stop().done
+    assert ends.asker.ask("stop").done
     assert ends.trip() == "stopped by an operator: 0 V"
-    refusal = ends.claim()
-    assert isinstance(refusal, Refusal)
-    assert "stopped by an operator" in refusal.reason
+    assert "stopped by an operator" in ends.asker.refusal()
 
 
 def test_a_stop_of_the_bridge_holds_in_its_next_process_until_arm() -> None:
     with Gathering() as gathering:
         ends = Ends(gathering)
-        assert ends.stop().done
+        assert ends.asker.ask("stop").done
         ends.close()
     with Gathering() as gathering:
         ends = Ends(gathering)
         try:
             ends.say(PlantState.IDLE)
-            refusal = ends.claim()
-            assert isinstance(refusal, Refusal)
-            assert "stopped by an operator: 0 V; `aeroloop op arm` clears it" in refusal.reason
-            ends.arm()
+            assert "stopped by an operator: 0 V; `aeroloop op arm` clears it" in ends.asker.refusal()
+            ends.asker.ask("arm")
             ends.hold()
         finally:
             ends.close()
@@ -248,7 +206,7 @@ def test_it_trips_when_another_node_stands_there_and_refuses_claims_for_it(ends:
     ends.hold()
     ends.say(PlantState.GRANTED, mark=bytes(7))
     assert ends.trip() == "node 1 has another wire spec now: 0 V"
-    assert ends.claim() == Refusal(reason="node 1 has another wire spec, period or lockstep setting than the bridge")
+    assert ends.asker.refusal() == "node 1 has another wire spec, period or lockstep setting than the bridge"
 
 
 def test_it_trips_when_the_node_falls_silent_and_refuses_claims_for_it(ends: Ends) -> None:
@@ -257,4 +215,4 @@ def test_it_trips_when_the_node_falls_silent_and_refuses_claims_for_it(ends: End
     silent_since = time.monotonic()
     assert ends.trip().startswith("node 1 has been silent for ")
     assert time.monotonic() - silent_since < 0.5 + SLACK_S
-    assert ends.claim() == Refusal(reason="node 1 is silent on the bus")
+    assert ends.asker.refusal() == "node 1 is silent on the bus"

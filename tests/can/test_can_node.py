@@ -11,13 +11,13 @@ import pytest
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import Claim
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.transport.can_format import PLANT_HEARTBEAT_ID
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from tests.support.can_in_process import Flaws, Stranger, virtual
-from tests.support.can_stage import COUNTERS, OFF, WIRE, Bus, command
+from tests.support.can_stage import Bus
+from tests.support.plant_end import COUNTERS, OFF, WIRE, claim_of, command, volts
 
 SLACK_S = 0.3
 """For a test that other work on the machine keeps waiting: it must run to notice anything."""
@@ -60,7 +60,7 @@ def test_a_command_drives_it_none_from_before_the_session_and_the_heartbeat_repo
     assert bus.plant.voltages == OFF
     bus.drive(code=5)
     bus.turn()
-    assert bus.plant.voltages == (5 * 48 / 63, -5 * 48 / 63)
+    assert bus.plant.voltages == volts(5)
     bus.await_heartbeat(PlantState.DRIVEN)
 
 
@@ -152,16 +152,6 @@ def test_another_number_is_another_session(bus: Bus) -> None:
     assert seen[start:] == [k % COUNTERS for k in range(len(seen) - start)]
 
 
-def test_a_session_begins_afresh_with_counter_0_whatever_the_last_one_came_to(bus: Bus) -> None:
-    for number in range(1, 6):
-        bus.begin(number)
-        assert bus.counters(1)[0] == 0
-        bus.turn_for(0.01 * number)
-        bus.send_heartbeat(PlantState.IDLE)
-        bus.until("the release", lambda: bus.endpoint.session is None)
-        bus.stranger.everything()
-
-
 def test_a_trip_stands_until_there_is_another_session_and_reports_its_cause(bus: Bus) -> None:
     bus.begin(number=1)
     bus.drive()
@@ -240,9 +230,7 @@ def test_an_emulated_node_logs_when_its_faults_begin_and_end_and_the_bus_carries
     node = Emulator(loop, WIRE, PlantSettings(faults=["rate:bias=0.1@0.01..0.02"], watchdog_s=10), Event())
     front = CanNetwork(bus, loop, node.endpoint)
     with Stranger(bus) as stranger:
-        node.endpoint.claim(
-            Claim(controller="a", session="s", period_ns=loop.period_ns, lockstep=False, auto_arm=True, wire=WIRE)
-        )
+        node.endpoint.claim(claim_of())
         for k in range(20):
             front.after_tick(node.tick(None, k), None, 0)
         front.leave()

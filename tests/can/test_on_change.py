@@ -8,32 +8,26 @@ from pathlib import Path
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
-from aeroloop.plant_emulator.hosts.can_bridge import Relay
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
-from aeroloop.protocol.messages.models import Claim, Grant
-from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
+from aeroloop.protocol.wire.transmit import SILENCE, Policy
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil
-from tests.can.test_relay import FIRST_MEASUREMENT_NS, NOW, WATCHDOG_NS
 from tests.support.can_closed_loop import PATIENCE_S, run_on_bus
 from tests.support.can_in_process import Stranger, virtual
-from tests.support.can_stage import PERIOD_NS, Still, command, measurement
+from tests.support.can_stage import measurement
+from tests.support.plant_end import PERIOD_NS, RecordingPlant
+from tests.support.simulated_link import wire_of
 
 POLICIES: list[tuple[Policy, Policy]] = [
     ("on_change", "on_change"),
     ("on_change", "periodic"),
     ("periodic", "on_change"),
 ]
-
-
-def wire_of(measurement: Policy, command: Policy) -> WireSpec:
-    return WireSpec(transmit=Transmit(measurement=measurement, command=command))
 
 
 BOTH = wire_of("on_change", "on_change")
@@ -85,7 +79,7 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
 def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanNetwork, Stranger, bool]]:
     """A node's front, a stranger that receives what it sends, and whether it is in lockstep."""
     bus = virtual()
-    endpoint = Endpoint(Still(), BOTH, PERIOD_NS, lockstep=request.param)
+    endpoint = Endpoint(RecordingPlant(), BOTH, PERIOD_NS, lockstep=request.param)
     front = CanNetwork(bus, LoopSettings(lockstep=request.param), endpoint)
     with Stranger(bus) as stranger:
         yield front, stranger, request.param
@@ -99,59 +93,6 @@ def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[Ca
     said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
     silence = [SILENCE, SILENCE] if lockstep else []
     assert said == [measurement(0), *silence, measurement(3)]
-
-
-# The bridge's relay
-
-
-def relay(wire: WireSpec = BOTH, *, lockstep: bool = True) -> Relay:
-    """A relay in a session, which has looked at the clock at NOW."""
-    it = Relay(wire, PERIOD_NS, lockstep=lockstep, watchdog_s=0.1, armed=True)
-    claim = Claim(controller="a", session="s", period_ns=PERIOD_NS, lockstep=lockstep, auto_arm=False, wire=wire)
-    assert isinstance(it.claim(claim), Grant)
-    it.watch(NOW)
-    return it
-
-
-def test_silence_passes_in_lockstep_and_has_the_counter_after_the_last() -> None:
-    it = relay()
-    assert it.measurement(measurement(0)) is not None
-    for k in range(1, 15):
-        assert it.measurement(SILENCE) == SILENCE
-        assert it.counter == k
-    assert it.command(command(0), NOW) is not None
-    assert it.command(SILENCE, NOW) == SILENCE
-    assert it.refused == 0
-
-
-def test_silence_does_not_pass_before_a_sessions_first_frame() -> None:
-    it = relay()
-    assert it.measurement(SILENCE) is None
-    assert it.command(SILENCE, NOW + FIRST_MEASUREMENT_NS) is None
-    it.watch(NOW + FIRST_MEASUREMENT_NS + 1)
-    assert it.state is PlantState.TRIPPED  # it was no first command either
-
-
-@pytest.mark.parametrize(("wire", "lockstep"), [(BOTH, False), (WireSpec(), True), (WireSpec(), False)])
-def test_an_empty_frame_is_refused_elsewhere_and_feeds_no_watchdog(wire: WireSpec, lockstep: bool) -> None:
-    it = relay(wire, lockstep=lockstep)
-    it.measurement(measurement(0))
-    it.command(command(0), NOW)
-    assert it.measurement(SILENCE) is None
-    assert it.command(SILENCE, NOW + WATCHDOG_NS) is None
-    assert it.refused == 2
-    it.watch(NOW + WATCHDOG_NS + 1)
-    assert (it.state is PlantState.TRIPPED) == (not lockstep)
-
-
-def test_commands_that_stop_trip_the_bridge_though_the_last_is_held() -> None:
-    it = relay(lockstep=False)
-    it.measurement(measurement(0))
-    it.command(command(0), NOW)
-    it.watch(NOW + WATCHDOG_NS)
-    assert it.trip is None
-    it.watch(NOW + WATCHDOG_NS + 1)
-    assert it.state is PlantState.TRIPPED
 
 
 # On real processes

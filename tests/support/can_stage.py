@@ -1,4 +1,4 @@
-"""The plant's side of a CAN bus: frames as both ends make them, a plant that stands still, and a node step by step.
+"""The plant's side of a CAN bus: a node, step by step.
 
 The node has a real endpoint and a bus inside this process; the test turns its loop while it waits for something.
 """
@@ -10,20 +10,14 @@ from collections.abc import Callable, Sequence
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.hosts.can_node import CanNetwork
-from aeroloop.plant_emulator.plant import Measurement, Plant
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.can_in_process import Stranger
+from tests.support.plant_end import COUNTERS, PERIOD_NS, WIRE, RecordingPlant, command
 from tests.support.zenoh_network import PATIENCE_S
 
-WIRE = WireSpec()
-PERIOD_NS = 2_000_000
-COUNTERS = WIRE.measurement.counters
-OFF = (0.0, 0.0)
 OURS = fingerprint(WIRE, PERIOD_NS, lockstep=False)
 
 
@@ -32,37 +26,11 @@ def measurement(counter: int, codes: Sequence[int] = (1, -2, 3, -4, 5, -6)) -> b
     return WIRE.measurement.pack(counter % COUNTERS, codes)
 
 
-def command(echo: int, code: int = 5) -> bytes:
-    """A command frame."""
-    return WIRE.command.pack(echo % COUNTERS, (code, -code))
-
-
-class Still(Plant):
-    """A plant that stands still and knows its voltages."""
-
-    actuators = 2
-
-    def __init__(self) -> None:
-        self.voltages: tuple[float, ...] = ()
-
-    def actuate(self, voltages: Sequence[float]) -> None:
-        self.voltages = tuple(voltages)
-
-    def advance(self) -> None:
-        pass
-
-    def measure(self) -> Measurement:
-        return Measurement(IDENTITY, (0.0, 0.0, 0.0))
-
-    def close(self) -> None:
-        self.voltages = (0.0, 0.0)
-
-
 class Bus:
     """A node, whose loop turns while the test waits for something, and the controller's side of its bus."""
 
     def __init__(self, settings: CanSettings) -> None:
-        self.plant = Still()
+        self.plant = RecordingPlant()
         # Ticks are as fast as this test goes, so the endpoint's own watchdog, which counts them, is out of the way.
         self.endpoint = Endpoint(self.plant, WIRE, PERIOD_NS, watchdog_s=3600)
         self.front = CanNetwork(settings, LoopSettings(), self.endpoint)

@@ -17,12 +17,13 @@ from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.hosts.emulator import Emulator
 from aeroloop.plant_emulator.hosts.zenoh_network import PlantTrace
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import Claim, Grant, Refusal
+from aeroloop.protocol.messages.models import Grant, Refusal
 from aeroloop.protocol.messages.trace import Batch, read_batch
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from aeroloop.protocol.wire.transmit import SILENCE
+from tests.support.plant_end import claim_of
 
 RUN = 0x0123_4567_89AB_CDEF
 
@@ -144,13 +145,13 @@ class Stage(PlantNetwork):
         """Claim the plant for a controller `c`."""
         self._claims += 1
         return self.endpoint.claim(
-            Claim(
-                controller="c",
-                session=f"s{self._claims}",
+            claim_of(
+                "c",
+                wire=self.wire,
                 period_ns=self.loop.period_ns,
                 lockstep=self.loop.lockstep,
                 auto_arm=auto_arm,
-                wire=self.wire,
+                session=f"s{self._claims}",
             )
         )
 
@@ -186,9 +187,6 @@ class Stage(PlantNetwork):
         self.trace.follow(self.endpoint)
         if self.endpoint.session is None:
             self.wires.close()
-
-    def publish_when_due(self) -> None:
-        """Nothing to publish."""
 
     def publish_status(self) -> None:
         """Nothing to publish."""

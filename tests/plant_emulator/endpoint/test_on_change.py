@@ -11,104 +11,56 @@ import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
 from aeroloop.plant_emulator.plant import Measurement
-from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState, TripCause
-from aeroloop.protocol.wire.attitude import IDENTITY, Vector
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
-from tests.plant_emulator.endpoint.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, RecordingPlant
+from aeroloop.protocol.wire.attitude import IDENTITY
+from aeroloop.protocol.wire.transmit import SILENCE, Policy
+from tests.support.plant_end import COUNTERS, OFF, RecordingPlant, claim_of, claimed, command, state_of, volts
+from tests.support.simulated_link import wire_of
 
 HEARTBEAT = 15
 """Ticks: 30 ms of 2 ms."""
+WATCHDOG_TICKS = 50
+BOTH = wire_of("on_change", "on_change")
 
 
-def wire_of(measurement: Policy = "on_change", command: Policy = "on_change") -> WireSpec:
-    return WireSpec(transmit=Transmit(measurement=measurement, command=command))
-
-
-BOTH = wire_of()
-
-
-def claimed(wire: WireSpec = BOTH, *, lockstep: bool = False) -> tuple[Endpoint, RecordingPlant]:
-    """An endpoint at tick 0 that has sent a session's first measurement."""
-    plant = RecordingPlant(wire.actuators)
-    endpoint = Endpoint(plant, wire, PERIOD_NS, lockstep=lockstep)
-    claim(endpoint, "first")
-    assert endpoint.tick(None, 0)
-    return endpoint, plant
-
-
-def claim(endpoint: Endpoint, session: str) -> None:
-    answer = endpoint.claim(
-        Claim(
-            controller="a",
-            session=session,
-            period_ns=PERIOD_NS,
-            lockstep=endpoint.lockstep,
-            auto_arm=True,
-            wire=endpoint.wire,
-        )
-    )
+def claim_again(endpoint: Endpoint) -> None:
+    endpoint.release("of-a")
+    answer = endpoint.claim(claim_of("b", wire=endpoint.wire, lockstep=endpoint.lockstep))
     assert isinstance(answer, Grant)
-
-
-def command(echo: int, code: int = 5) -> bytes:
-    return BOTH.command.pack(echo % COUNTERS, [code, -code])
 
 
 def invalid(echo: int) -> bytes:
     return BOTH.command.pack(echo % COUNTERS, [BOTH.voltage.quantizer().invalid] * 2)
 
 
-def volts(code: int = 5) -> tuple[float, float]:
-    return code * 48 / 63, -code * 48 / 63
-
-
 def turning(rate: float) -> Measurement:
-    vector: Vector = (rate, 0.0, 0.0)
-    return Measurement(IDENTITY, vector)
+    return Measurement(IDENTITY, (rate, 0.0, 0.0))
 
 
-def state(endpoint: Endpoint) -> PlantState:
-    return endpoint.state
-
-
-# What it sends
+# ── what it sends ──
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
 def test_a_plant_at_rest_sends_heartbeats_only_and_a_change_at_once(lockstep: bool) -> None:
-    endpoint, plant = claimed(lockstep=lockstep)
+    endpoint, plant = claimed(BOTH, lockstep=lockstep)
     sent = {}
     for k in range(1, 60):
         plant.now = turning(0.5 if k >= 40 else 0.001)  # which is less than half a step
-        if frame := endpoint.tick(command(k - 1), k):
+        frame = endpoint.tick(command(k - 1), k)
+        assert frame is not None  # silence is distinguished from no session
+        if frame != SILENCE:
             sent[k] = BOTH.measurement.unpack(frame)
-    assert sent == {
-        15: (15, (0,) * 6),
-        30: (30, (0,) * 6),
-        40: (40, (0, 0, 0, 64, 0, 0)),
-        55: (55, (0, 0, 0, 64, 0, 0)),
-    }
-
-
-def test_silence_is_distinguished_from_no_session() -> None:
-    endpoint, _ = claimed()
-    assert endpoint.tick(command(0), 1) == SILENCE
-    endpoint.release("first")
-    assert endpoint.tick(None, 2) is None
-
-
-def test_a_new_session_starts_with_a_frame_though_nothing_has_changed() -> None:
-    endpoint, _ = claimed()
-    assert endpoint.tick(command(0), 1) == SILENCE
-    endpoint.release("first")
-    claim(endpoint, "second")
-    assert endpoint.tick(None, 2) == BOTH.measurement.pack(0, (0,) * 6)
+    changed = (0, 0, 0, 64, 0, 0)
+    assert sent == {15: (15, (0,) * 6), 30: (30, (0,) * 6), 40: (40, changed), 55: (55, changed)}
+    claim_again(endpoint)  # a session starts with a frame though nothing has changed
+    assert endpoint.tick(None, 60) == BOTH.measurement.pack(0, changed)
+    endpoint.release("of-b")
+    assert endpoint.tick(None, 61) is None
 
 
 def test_no_valid_value_is_said_once_held_and_ended_by_the_next_frame() -> None:
-    endpoint, plant = claimed()
+    endpoint, plant = claimed(BOTH)
     said = {}
     for k in range(1, 40):
         plant.now = turning(nan if 10 <= k < 30 else 0.0)
@@ -116,72 +68,51 @@ def test_no_valid_value_is_said_once_held_and_ended_by_the_next_frame() -> None:
     no_value = [quantizer.invalid for quantizer in (BOTH.attitude.quantizer(), BOTH.rate.quantizer()) for _ in range(3)]
     assert {k: frame for k, frame in said.items() if frame} == {
         10: BOTH.measurement.pack(10, no_value),
-        25: BOTH.measurement.pack(25 % COUNTERS, no_value),
-        30: BOTH.measurement.pack(30 % COUNTERS, (0,) * 6),
+        25: BOTH.measurement.pack(25, no_value),
+        30: BOTH.measurement.pack(30, (0,) * 6),
     }
     assert plant.held[9:12] == [volts(), OFF, OFF]
     assert plant.held[30:] == [volts()] * 9
-    assert state(endpoint) is PlantState.DRIVEN
+    assert state_of(endpoint) is PlantState.DRIVEN
 
 
-# What it holds
-
-
-def test_silence_in_real_time_holds_the_last_command_until_the_watchdogs_time_is_over() -> None:
-    endpoint, plant = claimed()
-    for k in range(1, 31):
-        endpoint.tick(command(k - 1) if k in (1, 16) else None, k)
-    for k in range(31, 100):
-        endpoint.tick(None, k)
-    assert plant.held[: 15 + WATCHDOG_TICKS] == [volts()] * (15 + WATCHDOG_TICKS)
-    assert plant.held[15 + WATCHDOG_TICKS :] == [OFF] * (99 - 15 - WATCHDOG_TICKS)
-    assert endpoint.trip is TripCause.COMMAND_TIMEOUT
+# ── what it holds ──
 
 
 @pytest.mark.parametrize("policy", ["on_change", "periodic"])
-def test_an_empty_command_in_real_time_is_refused_and_feeds_no_watchdog(policy: Policy) -> None:
-    endpoint, plant = claimed(wire_of(command=policy))
-    endpoint.tick(command(0), 1)
-    for k in range(2, 80):
-        endpoint.tick(SILENCE, k)
-    assert plant.held.index(OFF) == WATCHDOG_TICKS
-    assert endpoint.refused == WATCHDOG_TICKS
-    assert endpoint.accepted == 1
+def test_in_real_time_no_frame_holds_for_the_watchdogs_time_and_an_empty_one_is_refused(policy: Policy) -> None:
+    for frame in (None, SILENCE):
+        endpoint, plant = claimed(wire_of("on_change", policy))
+        for k in range(1, 80):
+            endpoint.tick(command(k - 1) if k in (1, 16) else frame, k)
+        assert plant.held == [volts()] * (15 + WATCHDOG_TICKS) + [OFF] * (79 - 15 - WATCHDOG_TICKS)
+        assert endpoint.trip is TripCause.COMMAND_TIMEOUT
+        assert (endpoint.accepted, endpoint.refused) == (2, 0 if frame is None else 14 + WATCHDOG_TICKS)
 
 
 def test_an_empty_command_in_lockstep_is_refused_where_commands_are_periodic() -> None:
-    endpoint, _ = claimed(wire_of(command="periodic"), lockstep=True)
+    endpoint, _ = claimed(wire_of("on_change", "periodic"), lockstep=True)
     endpoint.tick(command(0), 1)
     endpoint.tick(SILENCE, 2)
     assert (endpoint.refused, endpoint.accepted) == (1, 1)
 
 
-def test_an_empty_command_in_lockstep_answers_the_last_measurement_with_the_last_commands_voltages() -> None:
-    endpoint, plant = claimed(lockstep=True)
+def test_an_empty_command_in_lockstep_repeats_the_last_commands_voltages_but_none_of_the_last_session() -> None:
+    endpoint, plant = claimed(BOTH, lockstep=True)
     endpoint.tick(command(0, 7), 1)
-    for k in range(2, 3 * WATCHDOG_TICKS):
+    for k in range(2, 300):
         endpoint.tick(SILENCE, k)
-    assert plant.held == [volts(7)] * (3 * WATCHDOG_TICKS - 1)
-    assert endpoint.accepted == 3 * WATCHDOG_TICKS - 1
-    assert endpoint.refused == 0
-    assert state(endpoint) is PlantState.DRIVEN
-
-
-def test_an_empty_command_before_a_sessions_first_is_refused_and_holds_nothing_of_the_last_session() -> None:
-    endpoint, plant = claimed(lockstep=True)
-    endpoint.tick(command(0, 7), 1)
-    endpoint.release("first")
-    endpoint.tick(None, 2)
-    claim(endpoint, "second")
-    endpoint.tick(None, 3)
-    endpoint.tick(SILENCE, 4)
-    assert plant.held == [volts(7), OFF, OFF, OFF]
-    assert endpoint.refused == 1
-    assert state(endpoint) is PlantState.GRANTED
+    assert plant.held == [volts(7)] * 299
+    assert (endpoint.accepted, endpoint.refused, state_of(endpoint)) == (299, 0, PlantState.DRIVEN)
+    claim_again(endpoint)
+    endpoint.tick(None, 300)
+    endpoint.tick(SILENCE, 301)
+    assert plant.held[299:] == [OFF, OFF]
+    assert (endpoint.refused, state_of(endpoint)) == (1, PlantState.GRANTED)
 
 
 def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_the_right_answer() -> None:
-    endpoint, plant = claimed(lockstep=True)
+    endpoint, plant = claimed(BOTH, lockstep=True)
     endpoint.tick(command(0), 1)
     plant.now = turning(nan)
     endpoint.tick(SILENCE, 2)
@@ -190,17 +121,17 @@ def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_th
     plant.now = turning(0.0)
     endpoint.tick(SILENCE, 5)
     assert plant.held == [volts(), volts(), OFF, OFF, OFF]
-    assert state(endpoint) is PlantState.DRIVEN
+    assert state_of(endpoint) is PlantState.DRIVEN
     endpoint.tick(SILENCE, 6)  # answers a valid measurement
     assert endpoint.trip is TripCause.INVALID_COMMAND
 
 
-# In real time, the end of silence may show late that values are valid again
+# ── in real time, the end of silence may show late that values are valid again ──
 
 
 def after_a_failure(policy: Policy, *, lockstep: bool = False) -> tuple[Endpoint, RecordingPlant, int]:
     """An endpoint whose measurements had no valid value until tick 9."""
-    endpoint, plant = claimed(wire_of(measurement=policy), lockstep=lockstep)
+    endpoint, plant = claimed(wire_of(policy, "on_change"), lockstep=lockstep)
     for k in range(1, 11):
         plant.now = turning(nan if 5 <= k < 10 else 0.0)
         endpoint.tick(invalid(k - 1) if 5 <= k - 1 < 10 else command(k - 1), k)
@@ -211,7 +142,7 @@ def test_a_heartbeat_without_a_valid_value_is_forgiven_as_long_as_a_measurement_
     endpoint, plant, k = after_a_failure("on_change")
     for later in range(HEARTBEAT):
         endpoint.tick(invalid(k + later), k + later + 1)
-        assert state(endpoint) is PlantState.DRIVEN
+        assert state_of(endpoint) is PlantState.DRIVEN
         assert plant.held[-1] == OFF
     endpoint.tick(invalid(k + HEARTBEAT), k + HEARTBEAT + 1)
     assert endpoint.trip is TripCause.INVALID_COMMAND
@@ -226,8 +157,7 @@ def test_it_trips_at_once_where_every_measurement_is_there(policy: Policy, locks
 
 def test_nothing_is_forgiven_for_what_the_last_session_did_not_measure() -> None:
     endpoint, _, k = after_a_failure("on_change")
-    endpoint.release("first")
-    claim(endpoint, "second")
+    claim_again(endpoint)
     endpoint.tick(None, k + 1)
     endpoint.tick(invalid(0), k + 2)
     assert endpoint.trip is TripCause.INVALID_COMMAND

@@ -11,12 +11,13 @@ import pytest
 from aeroloop.plant_emulator.hosts import driver
 from aeroloop.plant_emulator.hosts.driver import Driver, PlantNetwork
 from aeroloop.plant_emulator.settings import PlantSettings
-from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.transport.link import Arrival, Link
 from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.protocol.wire.spec import WireSpec
 from tests.support.own_laws import Node, cycle
 from tests.support.own_plants import Turntable, TurntableSettings
+from tests.support.plant_end import claim_of
 
 LOOP = LoopSettings(realtime="off")
 CLAIMED_AT, HELD_UP, ENDS = 3, 5, 20
@@ -58,10 +59,7 @@ class Granting(PlantNetwork):
 
     def take_inbox(self) -> None:
         if self._grid.tick == CLAIMED_AT:
-            claim = Claim(
-                controller="c", session="s", period_ns=LOOP.period_ns, lockstep=False, auto_arm=True, wire=self._wire
-            )
-            assert isinstance(self.driver.endpoint.claim(claim), Grant)
+            assert isinstance(self.driver.endpoint.claim(claim_of(wire=self._wire)), Grant)
             self._grid.held_up = HELD_UP
 
     def send(self, frame: bytes) -> None:
@@ -73,8 +71,6 @@ class Granting(PlantNetwork):
         del measurement, arrival, sent_ns
         if self._grid.tick >= self._ends:
             self._stop.set()
-
-    def publish_when_due(self) -> None: ...
 
     def publish_status(self) -> None: ...
 

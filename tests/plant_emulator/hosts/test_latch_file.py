@@ -18,15 +18,15 @@ from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 from aeroloop.plant_emulator.hosts.latch_file import Latch, LatchFile, state_directory
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Status
+from aeroloop.protocol.messages.models import Event, Grant, Status
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.runtime.node import Node
 from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
-LOOP, WIRE = LoopSettings(realtime="off", rate_hz=100), WireSpec()
+LOOP = LoopSettings(realtime="off", rate_hz=100)
 STOP = Latch(
     cause=TripCause.OPERATOR, text="stopped: 0 V", operator_only=True, since=datetime(2026, 11, 23, tzinfo=UTC)
 )
@@ -114,18 +114,18 @@ class Plant:
         self._role = Node("plant", "aero", self._gathering.settings, {})
         settings = PlantSettings(state_directory=folder, armed_at_start=True)
         self.emulator = EmulatorOnZenoh(self._role, LOOP, WIRE, settings)
-        self._session = self._gathering.join()
+        session = self._gathering.join()
+        self.asker = Asker(session, LOOP.period_ns)
         self.events: list[Event] = []
         key = topics.key("event", "aero", role="plant")
-        self._session.declare_subscriber(
+        session.declare_subscriber(
             key, lambda sample: self.events.append(Event.model_validate_json(sample.payload.to_bytes()))
         )
-        self._claims = 0
         self._thread = threading.Thread(target=self.emulator.run)
 
     def __enter__(self) -> Plant:
         self._thread.start()
-        eventually("a status", lambda: b"uptime_s" in self._ask("status", b""))
+        eventually("a status", lambda: b"uptime_s" in self.asker.query("status"))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -136,56 +136,25 @@ class Plant:
 
     def status(self) -> Status:
         """Its status."""
-        return Status.model_validate_json(self._ask("status", b""))
+        return Status.model_validate_json(self.asker.query("status"))
 
     def stop(self) -> Answer:
         """As `aeroloop op stop` does."""
-        return Answer.model_validate_json(self._ask("stop", Request(by="alice@bench").encode()))
+        return self.asker.ask("stop", Request(by="alice@bench"))
 
     def arm(self) -> Answer:
         """As `aeroloop op arm` does."""
-        return Answer.model_validate_json(self._ask("arm", Request().encode()))
+        return self.asker.ask("arm")
 
-    def claim(self, *, auto_arm: bool) -> Grant | Refusal:
-        """As a controller does."""
-        self._claims += 1
-        claim = Claim(
-            controller="c",
-            session=f"s{self._claims}",
-            period_ns=LOOP.period_ns,
-            lockstep=False,
-            auto_arm=auto_arm,
-            wire=WIRE,
-        )
-        payload = self._ask("claim", claim.encode())
-        return (Refusal if b"reason" in payload else Grant).model_validate_json(payload)
+    def grants(self, *, auto_arm: bool = False) -> bool:
+        """Whether a claim is granted."""
+        return isinstance(self.asker.claim(auto_arm=auto_arm), Grant)
 
     def trip(self) -> None:
         """Trip it in a session; not by an operator."""
-        assert isinstance(self.claim(auto_arm=False), Grant)
+        assert self.grants()
         self._role.enqueue(lambda: self.emulator.endpoint.expire(TripCause.ENVELOPE, "tilted by 80°"))
         eventually("the trip", lambda: self.emulator.endpoint.trip is not None)
-
-    def _ask(self, topic: str, payload: bytes) -> bytes:
-        answers: list[bytes] = []
-
-        def answered() -> bool:
-            for reply in self._session.get(topics.key(topic, "aero", role="plant"), payload=payload):
-                if reply.ok is not None:
-                    answers.append(reply.ok.payload.to_bytes())
-            return bool(answers)
-
-        eventually(f"an answer to {topic}", answered)
-        return answers[0]
-
-
-def assert_stopped_until_armed(plant: Plant) -> None:
-    for auto_arm in (True, False):
-        refusal = plant.claim(auto_arm=auto_arm)
-        assert isinstance(refusal, Refusal)
-        assert refusal.reason == "stopped by an operator (alice@bench): 0 V; `aeroloop op arm` clears it"
-    assert plant.arm().done
-    assert isinstance(plant.claim(auto_arm=False), Grant)
 
 
 def test_a_stop_holds_in_the_next_process_until_arm_whether_the_plant_was_killed_or_terminated(tmp_path: Path) -> None:
@@ -194,37 +163,36 @@ def test_a_stop_holds_in_the_next_process_until_arm_whether_the_plant_was_killed
         shutil.copytree(tmp_path / "terminated", tmp_path / "killed")  # all that is left if it is killed now
         since = plant.status().since
         assert since is not None
+    why = "stopped by an operator (alice@bench): 0 V"
     for how in ("killed", "terminated"):
         with Plant(tmp_path / how) as plant:
             status = plant.status()
             assert (status.state, status.since) == (PlantState.TRIPPED, since)
-            text = (
-                f"stopped by an operator (alice@bench): 0 V ({since:%Y-%m-%d %H:%M:%S} UTC); `aeroloop op arm` clears"
-            )
+            text = f"{why} ({since:%Y-%m-%d %H:%M:%S} UTC); `aeroloop op arm` clears"
             eventually("its event", lambda: any(text in event.text for event in plant.events))  # noqa: B023
-            assert_stopped_until_armed(plant)
+            for auto_arm in (True, False):
+                assert plant.asker.refusal(auto_arm=auto_arm) == f"{why}; `aeroloop op arm` clears it"
+            assert plant.arm().done
+            assert plant.grants()
         with Plant(tmp_path / how) as plant:
-            assert isinstance(plant.claim(auto_arm=False), Grant)
+            assert plant.grants()
 
 
 def test_a_trip_holds_in_the_next_process_until_arm_or_a_claim_with_auto_arm(tmp_path: Path) -> None:
     with Plant(tmp_path) as plant:
         plant.trip()
     with Plant(tmp_path) as plant:
-        refusal = plant.claim(auto_arm=False)
-        assert isinstance(refusal, Refusal)
-        assert "tilted by 80°: 0 V" in refusal.reason
-        assert isinstance(plant.claim(auto_arm=True), Grant)
+        assert "tilted by 80°: 0 V" in plant.asker.refusal(auto_arm=False)
+        assert plant.grants(auto_arm=True)
     with Plant(tmp_path) as plant:
         plant.trip()
         assert plant.stop().done
     with Plant(tmp_path) as plant:
-        refusal = plant.claim(auto_arm=True)
-        assert isinstance(refusal, Refusal)
-        assert "tilted by 80°: 0 V; then stopped by an operator (alice@bench)" in refusal.reason
+        refusal = plant.asker.refusal(auto_arm=True)
+        assert "tilted by 80°: 0 V; then stopped by an operator (alice@bench)" in refusal
         assert plant.arm().done
     with Plant(tmp_path) as plant:
-        assert isinstance(plant.claim(auto_arm=False), Grant)
+        assert plant.grants()
 
 
 def test_the_answer_to_a_stop_waits_for_the_disk_and_0_v_does_not(
@@ -256,14 +224,9 @@ def test_the_answer_to_a_stop_waits_for_the_disk_and_0_v_does_not(
         assert on_disk == [True]
 
 
-def unwritable(folder: Path) -> Path:
-    """A folder that even root cannot make."""
-    (folder / "file").touch()
-    return folder / "file" / "state"
-
-
 def test_a_plant_that_cannot_keep_a_stop_stops_and_says_so_in_its_answer_and_its_status(tmp_path: Path) -> None:
-    with Plant(unwritable(tmp_path)) as plant:
+    (tmp_path / "file").touch()
+    with Plant(tmp_path / "file" / "state") as plant:  # which even root cannot make
         why = f"{tmp_path}/file/state/aero.json cannot be written (Not a directory)"
         eventually("the status", lambda: why in str(plant.status().unkept))
         answer = plant.stop()

@@ -12,7 +12,7 @@ from aeroloop.plant_emulator.hosts.emulator import EmulatorOnZenoh
 from aeroloop.plant_emulator.hosts.replay import PlantReplay, PlantReplayed
 from aeroloop.plant_emulator.settings import PlantSettings
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.models import Claim, Grant, Release
+from aeroloop.protocol.messages.models import Grant, Release
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.node import Node, OccupiedError
@@ -20,10 +20,9 @@ from aeroloop.protocol.transport.history import RecoveringSubscriber
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from tests.support.plant_end import WIRE, Asker
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
-WIRE = WireSpec()
 LOOP = LoopSettings(realtime="off", rate_hz=100)  # slow, so that a busy machine keeps up
 PLANT = PlantSettings(watchdog_s=1.0, faults=["rate:noise=0.01", "command:drop=0.1"])
 ANSWERED = 60
@@ -36,30 +35,21 @@ def test_a_subscriber_that_joins_after_a_session_recovers_its_trace_and_the_plan
         thread.start()
         try:
             zenoh = gathering.join()
+            asker = Asker(zenoh, LOOP.period_ns)
+            eventually("the grant", lambda: isinstance(asker.claim(), Grant))
             link = ZenohLink(
                 zenoh,
-                send_key=topics.key("command", "aero", session="s"),
-                receive_key=topics.key("measurement", "aero", session="s"),
+                send_key=topics.key("command", "aero", session=asker.session),
+                receive_key=topics.key("measurement", "aero", session=asker.session),
                 lengths=WIRE.lengths("measurement", lockstep=False),
             )
-            claim = Claim(
-                controller="c", session="s", period_ns=LOOP.period_ns, lockstep=False, auto_arm=True, wire=WIRE
-            )
-
-            def ask(topic: str, payload: bytes) -> bytes:
-                for reply in zenoh.get(topics.key(topic, "aero"), payload=payload, timeout=PATIENCE_S):
-                    if reply.ok is not None:
-                        return reply.ok.payload.to_bytes()
-                return b""
-
-            eventually("the grant", lambda: ask("claim", claim.encode()) == Grant(session="s").encode())
             for _ in range(ANSWERED):
                 arrival = link.wait(PATIENCE_S)
                 assert arrival is not None
                 counter = WIRE.measurement.counter(arrival.frame)
                 assert counter is not None
                 link.send(WIRE.command.pack(counter, (2, -2)))
-            ask("release", Release(session="s").encode())
+            asker.ask("release", Release(session=asker.session))
             late = RecoveringSubscriber(zenoh, topics.key("trace", "aero", role="plant"))
             batches: list[Batch] = []
 
@@ -117,8 +107,7 @@ def test_two_plants_of_a_vehicle_that_meet_both_trip_until_one_has_ended_and_the
             for emulator in (first, second):
                 eventually("the trip", lambda e=emulator: e.endpoint.trip is TripCause.DUPLICATE)  # type: ignore[misc]
                 assert "two plants are named aero" in str(emulator.endpoint.cause)
-        claim = Claim(controller="c", session="s", period_ns=LOOP.period_ns, lockstep=False, auto_arm=True, wire=WIRE)
-        replies = [reply.ok for reply in zenoh.get(topics.key("claim", "aero"), payload=claim.encode())]
-        assert [b"two plants are named aero" in reply.payload.to_bytes() for reply in replies if reply] == [True]
-        list(zenoh.get(topics.key("arm", "aero")))
+        asker = Asker(zenoh, LOOP.period_ns)
+        assert "two plants are named aero" in asker.refusal()
+        assert asker.ask("arm").done
         assert first.endpoint.cause is None

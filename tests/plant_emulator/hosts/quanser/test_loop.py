@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from math import isnan
+from threading import Event
 
 import pytest
 
 from aeroloop.plant_emulator.endpoint.endpoint import Endpoint
+from aeroloop.plant_emulator.hosts.quanser_board import BoardDriver
 from aeroloop.plant_emulator.model.wind import WindSettings
 from aeroloop.plant_emulator.plant import Plant
-from aeroloop.protocol.messages.models import Claim, Grant
+from aeroloop.protocol.messages.models import Grant
 from aeroloop.protocol.messages.states import PlantState
+from aeroloop.protocol.wire.loop import LoopSettings
 from aeroloop.service.config import Settings, with_bits
 from aeroloop.service.control.controller import Controller
+from tests.support.plant_end import claim_of
+from tests.support.plant_stage import Stage
 from tests.support.quanser_board import AERO, PERIOD, emulated_aero, plant_on_board
 
 
@@ -23,8 +28,7 @@ class Loop:
         wire, period_ns = settings.wire, settings.loop.period_ns
         guard = settings.plant.limit_monitor(period_ns, wire.voltage.quantizer().outermost)
         self.endpoint = Endpoint(plant, wire, period_ns, lockstep=True, limits=guard)
-        claim = Claim(controller="a", session="a", period_ns=period_ns, lockstep=True, auto_arm=True, wire=wire)
-        assert isinstance(self.endpoint.claim(claim), Grant)
+        assert isinstance(self.endpoint.claim(claim_of(wire=wire, period_ns=period_ns, lockstep=True)), Grant)
         self.controller = Controller(wire, settings.law, settings.reference, PERIOD)
         self.measurement = self.endpoint.tick(None, 0)
         self.k = 0
@@ -47,7 +51,7 @@ def test_the_loop_on_the_board_is_the_loop_on_the_emulator_to_the_last_bit(bits:
     for _ in range(1000):
         assert on_board.tick() == emulated.tick()
     assert on_board.endpoint.state is PlantState.DRIVEN
-    assert (plant.failures, plant.overrun, plant.expiries, board.time) == (0, 0, 0, 1000)
+    assert (plant.failures, board.time) == (0, 1000)
 
 
 def test_an_owner_that_ticks_by_what_has_passed_stays_in_the_boards_time() -> None:
@@ -64,7 +68,6 @@ def test_an_owner_that_ticks_by_what_has_passed_stays_in_the_boards_time() -> No
         assert read is not None
         assert not isnan(wire.attitude.quantizer().decode(read[1][0]))
         assert board.time == k + plant.passed - 1
-    assert plant.overrun == (3 - 1) + (1 - 1) + (7 - 1)
 
 
 def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_trips_in_the_time_of_its_guard() -> (
@@ -87,3 +90,18 @@ def test_one_lost_sample_does_not_end_the_session_and_a_board_that_is_unplugged_
     assert "no valid value" in loop.endpoint.notices[-1].text
     assert board.analog == [0.0, 0.0]  # no write reaches it any more: the board's watchdog did
     assert board.expired
+
+
+def test_failed_calls_of_the_board_are_notes_of_the_status() -> None:
+    plant, board = plant_on_board(session=False)
+    plant.close()  # the driver opens it again
+    loop, wire, stop = LoopSettings(realtime="off"), Settings().wire, Event()
+
+    def fail(stage: Stage) -> None:
+        if stage.endpoint.ticked in (20, 30):
+            board.fail_next("task_read")
+
+    stage = Stage(loop, wire, AERO, driver=BoardDriver(loop, wire, AERO, stop), between=fail)
+    stage.stop = stop
+    stage.run(50)
+    assert stage.notes == ["the board: 2 failed calls, the last: task_read was made to fail"]
