@@ -14,8 +14,7 @@ from aeroloop.plant_emulator.settings import IDEAL_AERO
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.service.config import Settings, as_overrides, load_over, with_law_settings
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
-from aeroloop.service.control.laws.nonadaptive import NonadaptiveSettings
-from aeroloop.service.control.laws.tracking import TrackingSettings
+from aeroloop.service.control.laws.baselines import NonadaptiveSettings, TrackingSettings
 from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
 from aeroloop.service.lab.burden_grid import SENSORS
 from aeroloop.service.sweep.axes import Axis, Configuration, digest_of

@@ -12,22 +12,24 @@ from aeroloop.protocol.messages.operator import Gains
 from aeroloop.protocol.plugins import PluginError, exception_line, find, source_of
 from aeroloop.protocol.wording import problems
 from aeroloop.service.control.laws.adaptive import AdaptiveSettings
+from aeroloop.service.control.laws.baselines import (
+    LQRSettings,
+    NonadaptiveSettings,
+    PDSettings,
+    PIDSettings,
+    SlidingSettings,
+)
 from aeroloop.service.control.laws.interface import Law, LawSettings
-from aeroloop.service.control.laws.lqr import LQRSettings
-from aeroloop.service.control.laws.nonadaptive import NonadaptiveSettings
-from aeroloop.service.control.laws.pd import PDSettings
-from aeroloop.service.control.laws.pid import PIDSettings
-from aeroloop.service.control.laws.sliding import SlidingSettings
 
 GROUP: Final = "aeroloop.laws"
 _LAWS: Final = "aeroloop.service.control.laws"
 BUILT_IN: Final = {
     "adaptive": f"{_LAWS}.adaptive:Adaptive",
-    "nonadaptive": f"{_LAWS}.nonadaptive:Nonadaptive",
-    "pd": f"{_LAWS}.pd:PD",
-    "pid": f"{_LAWS}.pid:PID",
-    "sliding": f"{_LAWS}.sliding:Sliding",
-    "lqr": f"{_LAWS}.lqr:LQR",
+    "nonadaptive": f"{_LAWS}.baselines:Nonadaptive",
+    "pd": f"{_LAWS}.baselines:PD",
+    "pid": f"{_LAWS}.baselines:PID",
+    "sliding": f"{_LAWS}.baselines:Sliding",
+    "lqr": f"{_LAWS}.baselines:LQR",
 }
 _OWN: Final = "package.module:Class"
 

@@ -16,11 +16,10 @@ from scipy.linalg import solve_discrete_are
 
 from aeroloop.protocol.wire.attitude import IDENTITY
 from aeroloop.service.config import Settings, load, load_over
+from aeroloop.service.control.laws.baselines import nearer, optimal_gains, riccati
 from aeroloop.service.control.laws.evaluation import configured_gains, initial_state, law_function
 from aeroloop.service.control.laws.interface import LawSettings
-from aeroloop.service.control.laws.lqr import optimal_gains, riccati
 from aeroloop.service.control.laws.registry import OwnLawSettings, law_of, own_settings
-from aeroloop.service.control.laws.tracking import nearer
 from aeroloop.service.control.laws.tuning import RULES, Response, response_of, tuned
 from aeroloop.service.lab.experiment import experiment
 from tests.support import numpy_twin as twin

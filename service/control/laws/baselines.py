@@ -1,0 +1,327 @@
+"""Baselines beside the paper's law: one feedforward of the model, and a feedback each.
+
+    symbol   name in code     meaning                                       unit        shape
+    e^Q      attitude_error   tracking error [η̃, ε̃], (C.16)                 1           4
+    ω_e^Q    rate_error       angular velocity error, (C.18)                rad/s       3
+    ±        sign             which of ±e is approached                     1           1
+    J θ̂ g    J, theta, g      inertia, estimate of damping, gravity         see body    3
+    τ        torque           B u                                           N·m         3
+
+With the feedforward of (C.22), the body (C.2) becomes J ω̇_e = τ, so each law is its feedback τ. The estimate of the
+damping is the paper's first one, and stays. All default gains come from one rule (`tuning`).
+
+    pd       −k_p (±ε̃) − k_d ω_e                              Wen and Kreutz-Delgado 1991; Paden and Panja 1988
+    pid      the same − k_i e_I                               Goodarzi, Lee and Lee 2013; Åström and Hägglund 1995
+    sliding  −J (±λ/2)(η̃I + S(ε̃)) ω_e − K tanh(σ/Φ)           Crassidis, Vadali and Markley 2000; Slotine and Li 1991
+    lqr      −K [±2ε̃, ω_e]                                    Anderson and Moore 1990
+
+`nonadaptive` is no feedback of its own: it is the paper's law with θ̂ as first estimated.
+
+q and −q are one attitude, so the feedback approaches e = [1, 0] or [−1, 0]. Which one is chosen at the first tick; it
+changes where the other has become nearer by more than the hysteresis, so that a body that was turned by hand does not
+turn back all the way (unwinding), and noise at half a turn does not make it hesitate: Mayhew, Sanfelice and Teel,
+Quaternion-Based Hybrid Control for Robust Global Attitude Tracking, IEEE Transactions on Automatic Control 56(11),
+2011.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from math import hypot
+from typing import ClassVar, Final, Literal, TypeVar
+
+import casadi as ca
+import numpy as np
+from pydantic import Field, NonNegativeFloat
+
+from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.service.control.laws.adaptive import Adaptive, AdaptiveSettings, MatrixGain
+from aeroloop.service.control.laws.body import check_allocation, gravity_torque, voltages_for
+from aeroloop.service.control.laws.interface import Diagonal, ExpressionLaw, Floats, Gains3, LawSettings, Now, Vector
+from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, VOLTAGE_LIMIT, tuned
+
+_PD, _PID, _SLIDING, _LQR = (tuned(kind, PAPER_BODY, PAPER) for kind in ("pd", "pid", "sliding", "lqr"))
+
+
+class TrackingSettings(LawSettings):
+    """Model of the plant, a damping estimate that stays, and when the nearer of two equilibria is chosen anew."""
+
+    damping_estimate: Vector = Field(
+        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
+    )
+    hysteresis: float = Field(
+        default=0.4, ge=0, lt=1, description="the other equilibrium is approached from |η̃| beyond this on [1]"
+    )
+
+
+T = TypeVar("T", bound=TrackingSettings)
+
+
+class TrackingLaw(ExpressionLaw[T]):
+    """Feedforward of the model, and a feedback."""
+
+    def initial(self) -> Mapping[str, Sequence[float]]:
+        """The sign, not yet chosen."""
+        return {"sign": [0.0]}
+
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """The voltages of feedforward and feedback."""
+        sign = nearer(now.attitude_error[0], now.state["sign"], self.settings.hysteresis)
+        torque, state = self.feedback(now, sign)
+        u = voltages_for(self.settings, feedforward(self.settings, now) + torque, self.actuators)
+        return u, {"sign": sign, **state}
+
+    @abstractmethod
+    def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """The torque of the feedback [N·m], shape (3,), and the rest of the state after this tick."""
+
+
+def nearer(eta_e: ca.SX, before: ca.SX, hysteresis: float) -> ca.SX:
+    """±1, the equilibrium to approach: as before, until the other is nearer by the hysteresis. Shape (1,).
+
+    Args:
+        eta_e: η̃ [1].
+        before: ±1 at the last tick; 0 before the first.
+        hysteresis: |η̃| from which the other is approached [1].
+    """
+    kept = before * (1 - 2 * (before * eta_e < -hysteresis))
+    return ca.if_else(before == 0, 2 * (eta_e >= 0) - 1, kept)
+
+
+def feedforward(p: TrackingSettings, now: Now[ca.SX]) -> ca.SX:
+    """The torque with which J ω̇_e = 0 if the model is exact: −Φθ̂ − Ψ − J(S(ω)Rω_d − Rω̇_d) of (C.22). Shape (3,)."""
+    omega, J, theta = now.rate, ca.SX(p.inertia), ca.SX(p.damping_estimate)
+    desired = now.rate - now.rate_error  # R ω_d in the body frame, (C.18)
+    R_ib = R(now.attitude).T  # (C.48)
+    cancelled = S(omega) @ (J * omega) - gravity_torque(p, now.attitude) + omega * theta  # −Ψ − Φθ̂, (C.43), (C.44)
+    return cancelled - J * (S(omega) @ desired - R_ib @ now.desired_acceleration)
+
+
+# ── PD+ ──
+
+
+class PDSettings(TrackingSettings):
+    """Model of the plant and gains. The default gains are those of the tuning rule."""
+
+    kind: Literal["pd"] = Field(default="pd", description="which law")
+    kp: Gains3 = Field(default=_PD["kp"], description="gain of the attitude error ε̃ [N·m]")
+    kd: Gains3 = Field(default=_PD["kd"], description="gain of the rate error [N·m·s/rad]")
+
+
+class PD(TrackingLaw[PDSettings]):
+    """PD+: with V = 2 Σ k_p (1 − ±η̃) + ½ ω_eᵀJω_e for equal k_p, V̇ = −ω_eᵀk_d ω_e.
+
+    J. T.-Y. Wen and K. Kreutz-Delgado, The Attitude Control Problem, IEEE Transactions on Automatic Control 36(10),
+    1991; the feedforward of a PD+ law: B. Paden and R. Panja, Globally Asymptotically Stable 'PD+' Controller for Robot
+    Manipulators, International Journal of Control 47(6), 1988.
+    """
+
+    Settings = PDSettings
+    gains = ("kp", "kd")
+
+    def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """Proportional to both errors."""
+        return -now.gains["kp"] * sign * now.attitude_error[1:4] - now.gains["kd"] * now.rate_error, {}
+
+
+# ── PID with anti-windup ──
+
+
+class PIDSettings(TrackingSettings):
+    """Model of the plant, gains and anti-windup. The defaults are those of the tuning rule."""
+
+    kind: Literal["pid"] = Field(default="pid", description="which law")
+    kp: Gains3 = Field(default=_PID["kp"], description="gain of the attitude error ε̃ [N·m]")
+    kd: Gains3 = Field(default=_PID["kd"], description="gain of the rate error [N·m·s/rad]")
+    ki: Gains3 = Field(default=_PID["ki"], description="gain of the integral [N·m/rad]")
+    attitude_share: Diagonal = Field(
+        default=_PID["attitude_share"], description="c, of ε̃ beside the rate error in the integral [1/s]"
+    )
+    reset_time: Diagonal = Field(
+        default=_PID["reset_time"], description="T_t, time in which the integral gives way to a saturated motor [s]"
+    )
+    voltage_limit: float = Field(default=VOLTAGE_LIMIT, gt=0, description="at which a motor saturates [V]")
+
+
+class PID(TrackingLaw[PIDSettings]):
+    """PID: the PD+ law with an integral e_I [rad], whose windup a back-calculation ends.
+
+        ė_I = ω_e ± c ε̃ + B(u − sat u)/(k_i T_t)
+
+    Integral and its Lyapunov function: F. Goodarzi, D. Lee and T. Lee, Geometric Nonlinear PID Control of a Quadrotor
+    UAV on SE(3), European Control Conference, 2013, with ε̃ in place of their error in SO(3). Back-calculation: K. J.
+    Åström and T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd edition, 1995, section on integrator
+    windup.
+    """
+
+    Settings = PIDSettings
+    gains = ("kp", "kd", "ki")
+    units: ClassVar = {"integral": "rad"}
+
+    def initial(self) -> Mapping[str, Sequence[float]]:
+        """Nothing integrated yet."""
+        return {**super().initial(), "integral": [0.0] * 3}
+
+    def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """Proportional to both errors and to their integral."""
+        eps_e = sign * now.attitude_error[1:4]
+        e_I = now.state["integral"]
+        torque = -now.gains["kp"] * eps_e - now.gains["kd"] * now.rate_error - now.gains["ki"] * e_I
+        return torque, {"integral": e_I + self.period * (now.rate_error + ca.SX(self.settings.attitude_share) * eps_e)}
+
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """The voltages, and the integral less what they exceed the limit by."""
+        u, state = super().expressions(now)
+        p = self.settings
+        B = ca.SX(check_allocation(p, self.actuators)[:, -self.actuators :])
+        excess = B @ (u - ca.fmax(-p.voltage_limit, ca.fmin(p.voltage_limit, u)))
+        ki = ca.fmax(now.gains["ki"], 1e-9)  # a gain of 0 is no integral
+        share = ca.fmin(1, self.period / ca.SX(p.reset_time))
+        return u, {**state, "integral": state["integral"] + share * excess / ki}
+
+
+# ── sliding mode ──
+
+
+class SlidingSettings(TrackingSettings):
+    """Model of the plant, surface and layer. The defaults are those of the tuning rule."""
+
+    kind: Literal["sliding"] = Field(default="sliding", description="which law")
+    slope: Gains3 = Field(default=_SLIDING["slope"], description="λ, slope of the surface [1/s]")
+    strength: Gains3 = Field(default=_SLIDING["strength"], description="K, largest torque towards the surface [N·m]")
+    layer: Diagonal = Field(default=_SLIDING["layer"], description="Φ, thickness of the boundary layer [rad/s]")
+
+
+class Sliding(TrackingLaw[SlidingSettings]):
+    """Smooth sliding mode: with σ = ω_e ± λ ε̃, J σ̇ = −K tanh(σ/Φ), so ½σᵀJσ falls.
+
+    On the surface σ = 0, ε̃ decays with the time constant 2/λ. Surface: J. L. Crassidis, S. R. Vadali and F. L. Markley,
+    Optimal Variable-Structure Control Tracking of Spacecraft Maneuvers, Journal of Guidance, Control, and Dynamics
+    23(3), 2000; boundary layer against chatter: J.-J. E. Slotine and W. Li, Applied Nonlinear Control, 1991, chapter 7;
+    S.-C. Lo and Y.-P. Chen, Smooth Sliding-Mode Control for Spacecraft Attitude Tracking Maneuvers, Journal of
+    Guidance, Control, and Dynamics 18(6), 1995. The layer is tanh's.
+    """
+
+    Settings = SlidingSettings
+    gains = ("slope", "strength")
+
+    def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """Along the surface, and towards it."""
+        p, slope = self.settings, sign * now.gains["slope"]
+        eta_e, eps_e, omega_e = now.attitude_error[0], now.attitude_error[1:4], now.rate_error
+        sigma = omega_e + slope * eps_e
+        along = ca.SX(p.inertia) * slope / 2 * ((eta_e * ca.SX.eye(3) + S(eps_e)) @ omega_e)  # ε̃ moves by (C.17)
+        return -along - now.gains["strength"] * ca.tanh(sigma / ca.SX(p.layer)), {}
+
+
+# ── LQR ──
+
+
+class LQRSettings(TrackingSettings):
+    """Model of the plant and weights. The default weights are those of the tuning rule."""
+
+    kind: Literal["lqr"] = Field(default="lqr", description="which law")
+    attitude_weight: Diagonal = Field(
+        default=_LQR["attitude_weight"], description="q_φ, of the angle's square against the torque's [(N·m/rad)²]"
+    )
+    rate_weight: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
+        default=_LQR["rate_weight"], description="q_ω, of the rate's square against the torque's [(N·m·s/rad)²]"
+    )
+
+
+class LQR(TrackingLaw[LQRSettings]):
+    """The discrete-time optimal regulator of the errors. Its gains follow from weights and period, so none may change.
+
+    With the feedforward an axis is a double integrator, J φ̈ = τ with φ = ±2ε̃ to first order, held for a period. K is
+    computed when the law is built; it holds near the reference only. B. D. O. Anderson and J. B. Moore, Optimal
+    Control: Linear Quadratic Methods, 1990.
+    """
+
+    Settings = LQRSettings
+
+    def feedback(self, now: Now[ca.SX], sign: ca.SX) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """Optimal for small errors."""
+        p = self.settings
+        K = ca.SX(optimal_gains(p.inertia, p.attitude_weight, p.rate_weight, self.period))
+        return -K[:, 0] * 2 * sign * now.attitude_error[1:4] - K[:, 1] * now.rate_error, {}
+
+
+def optimal_gains(inertia: Vector, attitude_weight: Vector, rate_weight: Vector, period: float) -> Floats:
+    """Gains of angle [N·m/rad] and rate [N·m·s/rad], a row an axis. Shape (3, 2)."""
+    axes = zip(inertia, attitude_weight, rate_weight, strict=True)
+    found: Floats = np.array([_gain(J, np.diag([angle, rate]), period) for J, angle, rate in axes])
+    return found
+
+
+def _gain(J: float, Q: Floats, T: float) -> Floats:
+    """K of x⁺ = A x + B τ and the cost Σ xᵀQx + τ². Shape (2,)."""
+    A = np.array([[1.0, T], [0.0, 1.0]])
+    B = np.array([[T * T / 2], [T]]) / J
+    X = riccati(A, B @ B.T, Q)
+    gain: Floats = (B.T @ X @ A / (1 + B.T @ X @ B))[0]
+    return gain
+
+
+_DOUBLINGS: Final = 60
+"""Each doubles the horizon in ticks; a loop that slow has ended before."""
+
+
+def riccati(A: Floats, G: Floats, Q: Floats) -> Floats:
+    """The stabilising X = AᵀX(I + GX)⁻¹A + Q. Shapes (n, n).
+
+    By doubling: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang, Structure-Preserving Algorithms for Periodic
+    Discrete-Time Algebraic Riccati Equations, International Journal of Control 77(8), 2004. SciPy, whose
+    `solve_discrete_are` would do, is no dependency of the core.
+
+    Raises:
+        ValueError: The doubling does not end.
+    """
+    X = Q
+    for _ in range(_DOUBLINGS):
+        W = np.linalg.inv(np.eye(len(A)) + G @ X)
+        A, G, X, last = A @ W @ A, G + A @ W @ G @ A.T, X + A.T @ X @ W @ A, X
+        if np.abs(X - last).max() <= 1e-14 * np.abs(X).max():
+            return X
+    raise ValueError("law: these weights and this period have no optimal gains")
+
+
+# ── the paper's law without adaptation ──
+
+
+class NonadaptiveSettings(LawSettings):
+    """Model of the plant, known damping included, and gains of the law. The default is Table C.1."""
+
+    kind: Literal["nonadaptive"] = Field(default="nonadaptive", description="which law")
+    C1: MatrixGain = Field(default=(0.3, 0.3, 0.3), description="gain of the attitude error [1/s]")
+    C2: MatrixGain = Field(default=(0.15, 0.15, 0.15), description="gain of the rate error [N·m·s/rad]")
+    damping_estimate: Vector = Field(
+        default=(0.0, 0.0070, 0.0095), description="θ̂(t0), first estimate of the damping [N·m·s/rad]"
+    )
+
+
+class Nonadaptive(ExpressionLaw[NonadaptiveSettings]):
+    """(C.37) with a constant θ̂, so Γ = 0 in (C.38): what it does worse than `adaptive` is what adaptation is for.
+
+    State: sign, 0 before the first tick, which chooses that of η̃ (Assumption 3).
+    """
+
+    Settings = NonadaptiveSettings
+    gains = ("C1", "C2")
+
+    def __init__(self, settings: NonadaptiveSettings, period: float, actuators: int) -> None:
+        super().__init__(settings, period, actuators)
+        same = settings.model_dump(exclude={"kind"})
+        bound = 2 * hypot(*settings.damping_estimate) or 1.0  # anything above: nothing is projected
+        self._adaptive = Adaptive(AdaptiveSettings(**same, damping_bound=bound), period, actuators)
+
+    def initial(self) -> Mapping[str, Sequence[float]]:
+        """No sign yet."""
+        return {"sign": (0.0,)}
+
+    def expressions(self, now: Now[ca.SX]) -> tuple[ca.SX, Mapping[str, ca.SX]]:
+        """(C.37)."""
+        theta = ca.SX(self.settings.damping_estimate)
+        gains = {**now.gains, "Gamma": ca.SX.zeros(3)}
+        u, state = self._adaptive.expressions(now._replace(gains=gains, state={**now.state, "damping_estimate": theta}))
+        return u, {"sign": state["sign"]}
