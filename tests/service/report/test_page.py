@@ -18,7 +18,7 @@ from aeroloop.service.cli.compare import write_html
 from aeroloop.service.logs.outputs import OutputError
 from aeroloop.service.report.page.data import packed, page_data
 from aeroloop.service.report.page.markup import tag
-from aeroloop.service.report.page.page import page
+from aeroloop.service.report.page import page
 from aeroloop.service.report.rows import figure_rows, micros, percent
 from aeroloop.service.review.report import Check, Line, Panel, Report
 from tests.support.made_report import HELD, HOSTILE, made_report, made_theorem

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
-from aeroloop.service.report.page.page import page
+from aeroloop.service.report.page import page
 from aeroloop.service.review.report import Band, Check, Line, Mark, Panel, Report
 from tests.support.made_report import HELD, HOSTILE, MARKS, made_report
 
