@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from html import escape
-from math import ceil, floor, log10
+from math import ceil, floor, log2, log10
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -58,7 +58,10 @@ Json = dict[str, Any]
 
 
 class Stroke(NamedTuple):
-    """How a line is drawn, and its entry in the key: that of a run (`run`) hides and shows the run's lines."""
+    """How a line is drawn, and its entry in the key: that of a run (`run`) hides and shows the run's lines.
+
+    `hover` is its name beside values, if not the same.
+    """
 
     text: str
     colour: str
@@ -66,6 +69,7 @@ class Stroke(NamedTuple):
     dash: str = "solid"
     swatch: str = ""
     run: int | None = None
+    hover: str = ""
 
 
 class Drawing(NamedTuple):
@@ -84,14 +88,13 @@ def page_data(reports: Sequence[Report], drawn: Sequence[Drawing]) -> str:
     from plotly.io.json import to_json_plotly
 
     times, figures = typed([report.time for report in reports]), {drawing.name: drawing.figure for drawing in drawn}
-    return str(to_json_plotly({"span": _span(reports), "times": times, "drawings": figures}, engine="json"))
+    data = to_json_plotly({"span": _span(reports), "times": times, "drawings": figures}, engine="json")
+    return str(data).replace("\\u002f", "/")  # which numbers are full of; without a `<` it ends nothing
 
 
 def drawings(reports: Sequence[Report]) -> Iterator[Drawing]:
     """Every drawing: distributions of durations, then the groups of panels in order."""
-    for name in spread_names(reports):
-        if any(name in timing and timing[name].bins for timing in (report.findings.timing for report in reports)):
-            yield _spread(name, reports)
+    yield from (_spread(name, reports) for name in spread_names(reports))
     over_time = _shapes(reports), _band_labels(reports)
     for group in dict.fromkeys(panel.group for report in reports for panel in report.panels):
         yield _group(group, reports, *over_time)
@@ -152,12 +155,11 @@ def _group(group: str, reports: Sequence[Report], shapes: list[Json], labels: li
         for run, nth, line in _lines(alike, reports, shared):
             stroke = _stroke(line, nth, run, reports, shared)
             key[stroke.text if stroke.run is None else stroke.run] = line.desired, stroke
-            own = len(reports) > 1 and stroke.run is None and stroke.colour != "var(--quiet)"
-            name = f"{reports[run].name}, {stroke.text}" if own else stroke.text
+            name = f"{label} {stroke.hover or stroke.text}" if rows > 1 else stroke.hover or stroke.text
             values.append(line.values.astype(np.float32))
             traces.append(_trace(stroke, "hv" if line.held and reports[run].thinned <= 2 else "linear") | {
                 "times": run, "run": None if shared and line.desired else run, "yaxis": f"y{axis}",
-                "name": _plain(f"{label} {name}" if rows > 1 else name), "hovertemplate": _plain(f"%{{y:.4~g}} {unit}"),
+                "name": _plain(name), "hovertemplate": _plain(f"%{{y:.4~g}} {unit}"),
                 # A line that is published less often than every tick has no gaps between its values.
                 "connectgaps": bool(2 * np.isfinite(line.values).sum() < len(line.values)),
             })  # fmt: skip
@@ -194,7 +196,7 @@ def _stroke(line: Line, nth: int, run: int, reports: Sequence[Report], shared: b
         return Stroke(line.label, "var(--quiet)", 2.5)
     if line.desired or nth:
         dash, swatch = ("1px,3px", "dot") if line.desired else ("5px,5px", "dash")
-        return Stroke(line.label, f"var(--run-{run % 8})", 1, dash, swatch)
+        return Stroke(line.label, f"var(--run-{run % 8})", 1, dash, swatch, hover=f"{reports[run].name}, {line.label}")
     return _run_stroke(run, reports)
 
 
@@ -301,33 +303,32 @@ def _plain(text: str) -> str:
 def _spread(name: str, reports: Sequence[Report]) -> Drawing:
     """Histograms of a duration, with percentiles; bins without a count go down to the axis."""
     several = len(reports) > 1
-    outlines, key, shapes, annotations = list[Array](), list[Stroke](), list[Json](), list[Json]()
-    for run, report in enumerate(reports):
-        spread = report.findings.timing.get(name)
-        if spread is None or not spread.bins:
-            continue
-        edges, found = np.array(spread.bins).T
-        nth = np.rint(16 * np.log2(edges)).astype(int)  # bins are 2^(1/16) wide
-        counts = np.full(np.ptp(nth) + 3, NO_COUNT)
-        counts[nth - nth[0] + 1] = found
-        outlines += [2 ** (np.arange(nth[0] - 1, nth[-1] + 2) / 16), counts]
-        key.append(_run_stroke(run, reports) if several else Stroke(report.name, "var(--run-0)", 1))
+    spreads = {
+        run: report.findings.timing[name] for run, report in enumerate(reports) if name in report.findings.timing
+    }
+    bins = [edge_and_count for spread in spreads.values() for edge_and_count in spread.bins] or [(1.0, 1)]
+    least, most, top = min(bins)[0], max(bins)[0] * 2 ** (1 / 16), max(count for _, count in bins)
+    data, key, shapes, annotations = list[Json](), list[Stroke](), list[Json](), list[Json]()
+    for run, spread in spreads.items():
+        nth = np.rint([16 * log2(edge) for edge, _ in spread.bins]).astype(int)  # bins are 2^(1/16) wide
+        edges = np.arange(nth.min(initial=0) - 1, nth.max(initial=0) + 2)
+        counts = np.full(len(edges), NO_COUNT)
+        counts[nth - edges[0]] = [count for _, count in spread.bins]
+        stroke = _run_stroke(run, reports) if several else Stroke("", "var(--run-0)", 1)
+        fill = {} if several else {"fill": "toself", "fillcolor": "var(--area)"}
+        data.append(
+            _trace(stroke, "hv") | fill | {"run": run, "x": 2 ** (edges / 16), "y": counts, "hoverinfo": "skip"}
+        )
+        key.append(stroke)
         for row, (percentile, at) in enumerate({"p50": spread.p50, "p99": spread.p99, "p99.9": spread.p999}.items()):
-            line = {"color": key[-1].colour if several else "var(--ink)", "width": 1, "dash": "dot"}
-            shapes.append({"run": run, "type": "line", "x0": at, "x1": at, "yref": "paper", "line": line})
+            line = {"color": stroke.colour if several else "var(--ink)", "width": 1, "dash": "dot"}
+            shapes.append(
+                {"run": run, "type": "line", "x0": at, "x1": at, "y0": 0, "y1": 1, "yref": "paper", "line": line}
+            )
             annotations.append({
                 "text": f"{percentile} {micros(at)}", "x": log10(at), "xanchor": "left", "xshift": 3, "font": INK,
                 "y": 1 - 0.1 * row, "yref": "paper", "yanchor": "top", "bgcolor": "var(--paper)", "showarrow": False,
             })  # fmt: skip
-    least, most = min(x[1] for x in outlines[::2]), max(x[-1] for x in outlines[::2])
-    top = max(float(y.max()) for y in outlines[1::2])
-    arrays = typed(outlines)
-    data = [
-        _trace(stroke, "hv") | {"x": x, "y": y, "run": stroke.run, "name": _plain(stroke.text), "hoverinfo": "skip"}
-        for stroke, x, y in zip(key, arrays[::2], arrays[1::2], strict=True)
-    ]
-    if not several:
-        data[0] |= {"fill": "toself", "fillcolor": "var(--area)"}
     layout = LAYOUT | {
         "margin": {"l": 54, "r": 10, "t": 8, "b": 36}, "hovermode": False, "dragmode": False,
         "xaxis": GRID | _logarithmic(least, most) | {"range": [log10(least) - 0.05, log10(most) + 0.3]},
@@ -335,8 +336,8 @@ def _spread(name: str, reports: Sequence[Report]) -> Drawing:
                          "range": [log10(NO_COUNT), log10(top) + 0.15]},
         "shapes": shapes, "annotations": [] if several else annotations,
     }  # fmt: skip
-    figure = {"data": data, "layout": layout}
-    return Drawing(f"spread-{name}", SPREADS.get(name, name), "timing", key if several else [], figure)
+    figure, title = {"data": data, "layout": layout}, SPREADS.get(name, name)
+    return Drawing(f"spread-{name}", title, "timing", key if several else [], figure)
 
 
 def _trace(stroke: Stroke, shape: str) -> Json:

@@ -11,9 +11,11 @@ let jumpedTo = null; // time of an event [s]
 let frame = null;
 
 /** Numbers of one of Plotly's typed arrays; of none, a plain array. */
-function numbers({ dtype, bdata }) {
-  const Type = { f4: Float32Array, f8: Float64Array }[dtype];
-  return Type ? new Type(Uint8Array.from(atob(bdata), (letter) => letter.charCodeAt(0)).buffer) : [];
+function numbers({ dtype, bdata = "" }) {
+  const letters = atob(bdata);
+  const bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
+  return dtype === "f4" ? new Float32Array(bytes.buffer) : new Float64Array(bytes.buffer);
 }
 
 const runTimes = times.map(numbers);

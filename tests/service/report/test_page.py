@@ -16,8 +16,7 @@ import pytest
 
 from aeroloop.service.cli.compare import write_html
 from aeroloop.service.logs.outputs import OutputError
-from aeroloop.service.report.page.data import packed, page_data
-from aeroloop.service.report.page.markup import tag
+from aeroloop.service.report.drawings import drawings, page_data
 from aeroloop.service.report.page import page
 from aeroloop.service.report.rows import figure_rows, micros, percent
 from aeroloop.service.review.report import Check, Line, Panel, Report
@@ -197,7 +196,7 @@ def test_a_missing_figure_states_why() -> None:
 
 def test_data_cannot_end_its_script_and_comes_back_as_it_was() -> None:
     report = made_report(HOSTILE)
-    data = page_data([report])
+    data = data_of(report)
     assert not set("<>&") & set(data)
     assert loads(data)["runs"][0]["name"] == HOSTILE
 
@@ -208,7 +207,7 @@ def shortened(panel: Panel, n: int) -> Panel:
 
 def test_a_desired_line_that_runs_share_is_drawn_once() -> None:
     def desired(*reports: Report) -> list[dict[str, Any]]:
-        (group,) = [group for group in loads(page_data(reports))["groups"] if group["id"] == "attitude"]
+        (group,) = [group for group in loads(data_of(*reports))["groups"] if group["id"] == "attitude"]
         return [line for line in group["panels"][0]["lines"] if line["desired"]]
 
     one, later = made_report("a"), made_report("b", phase=0.3)
