@@ -10,7 +10,7 @@ let shown = [...span]; // by every time axis [s]
 let jumpedTo = null; // time of an event [s]
 let frame = null;
 
-/** Numbers of one of Plotly's typed arrays; of none, a plain array. */
+/** Numbers of one of Plotly's typed arrays, [f4] or [f8]; empty where there are none. */
 function numbers({ dtype, bdata = "" }) {
   const letters = atob(bdata);
   const bytes = new Uint8Array(letters.length);
@@ -33,11 +33,11 @@ function themed(part) {
 }
 
 /** Index of the first time that is not before another. */
-function firstAt(times, time) {
-  let [low, high] = [0, times.length];
+function firstAt(instants, time) {
+  let [low, high] = [0, instants.length];
   while (low < high) {
     const middle = (low + high) >> 1;
-    if (times[middle] < time) low = middle + 1;
+    if (instants[middle] < time) low = middle + 1;
     else high = middle;
   }
   return low;
