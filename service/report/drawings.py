@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from html import escape
-from math import ceil, floor, log2, log10
+from math import ceil, floor, log2, log10, nan
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -226,15 +226,13 @@ def _logarithmic(least: float, most: float) -> Json:
 def _desired_agree(alike: Sequence[tuple[int, Panel]], reports: Sequence[Report]) -> bool:
     """Whether the desired values of all runs are nowhere visibly apart, so that one line can stand for all."""
     desired = [(reports[run].time, line.values) for run, panel in alike for line in panel.lines if line.desired]
-    if not desired:
-        return True
-    (time, values), visible = desired[0], 0.02 * max(map(abs, _extent(alike)))
-    for other_time, other_values in desired[1:]:
-        both = np.isfinite(values) & (time >= other_time[:1]) & (time <= other_time[-1:])
-        apart = np.abs(np.interp(time[both], other_time, other_values) - values[both])
-        if not np.nanmax(apart, initial=-1) <= visible or not np.isfinite(apart).any():
+    visible = 0.02 * max(map(abs, _extent(alike)))
+    for time, values in desired[1:]:
+        expected = np.interp(time, *desired[0], left=nan, right=nan) if len(desired[0][0]) else np.full(len(time), nan)
+        apart = np.abs(values - expected)
+        if not np.isfinite(apart).any() or np.nanmax(apart) > visible:
             return False
-    return len(desired) == len(alike) == len(reports)
+    return not desired or len(desired) == len(alike) == len(reports)
 
 
 def _extent(alike: Sequence[tuple[int, Panel]]) -> tuple[float, float]:
@@ -289,8 +287,8 @@ def _band_labels(reports: Sequence[Report]) -> list[Json]:
 
 def _bands(report: Report) -> list[tuple[float, float, str]]:
     """Shaded spans of time; one that did not end lasts to the end of its run's lines."""
-    ended = ((band, report.time[-1:].tolist() if band.end_s is None else [band.end_s]) for band in report.bands)
-    return [(band.start_s, end[0], band.label) for band, end in ended if end]
+    last_s = float(report.time[-1]) if len(report.time) else 0.0
+    return [(band.start_s, last_s if band.end_s is None else band.end_s, band.label) for band in report.bands]
 
 
 def _plain(text: str) -> str:
