@@ -64,7 +64,7 @@ def check_page(out: Path, logs: Sequence[Path], force: bool) -> None:
 def write_html(reports: Sequence[Report], out: Path, logs: Sequence[Path], force: bool) -> None:
     """Write the page of some runs and log its path. Raises AeroloopError if it cannot be written."""
     from aeroloop.service.logs.outputs import writing
-    from aeroloop.service.report.page.page import page
+    from aeroloop.service.report.page import page
 
     with writing(out, logs, force=force) as part:
         part.write_text(page(reports), encoding="utf-8")

@@ -35,6 +35,7 @@ _EXTRAS: Final = {
     "cantools": ("cantools", "can"),
     "distributed": ("distributed", "dask"),
     "foxglove": ("foxglove-sdk", "foxglove"),
+    "jinja2": ("Jinja2", "review"),
     "matplotlib": ("matplotlib", "review"),
     "plotly": ("plotly", "review"),
     "pyarrow": ("pyarrow", "export"),

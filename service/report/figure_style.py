@@ -56,7 +56,6 @@ _STYLE: Final[dict[str, Any]] = {
     "ytick.major.size": 2.5,
     "pdf.fonttype": 42,  # TrueType, which journals ask for
     "svg.hashsalt": "aeroloop",
-    "path.simplify": True,
 }
 
 
@@ -97,9 +96,9 @@ def save_as(figure: Figure, path: Path) -> None:
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Save a figure in every format, and return the paths. Raises OSError if it cannot be written."""
-    paths = [folder / f"{name}.{suffix}" for suffix in FORMATS]
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # laid out once, not for each format
-    for path, options in zip(paths, FORMATS.values(), strict=True):
+    paths = {folder / f"{name}.{suffix}": options for suffix, options in FORMATS.items()}
+    for path, options in paths.items():
         figure.savefig(path, **options)
-    return paths
+    return list(paths)

@@ -5,7 +5,6 @@ All quantities are drawn in every case; `NUMBERS` of review/panels.py has the pa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +17,7 @@ from aeroloop.service.report.figure_style import DESIRED, MEASURED, TRUE, figure
 from aeroloop.service.review.panels import NUMBERS, case_of
 from aeroloop.service.review.report import Panel, Report
 
-FIGURES: Final[dict[str, Sequence[str]]] = {
+FIGURES: Final = {
     "angles": ["angles"],
     "attitude": ["attitude"],
     "rate": ["rate"],
@@ -29,12 +28,13 @@ FIGURES: Final[dict[str, Sequence[str]]] = {
 }
 """Figures by name, with the groups of panels in each."""
 
-_LETTERS: Final = {
+LETTERS: Final = {
     "η": r"\eta", "ε": r"\epsilon_{}", "ε̃": r"\tilde{{\epsilon}}_{}", "ω": r"\omega_{}", "ω_e": r"\omega_{{e,{}}}",
     "u": "u_{}",
 }  # fmt: skip
-_NORMS: Final = {"‖z‖": r"$\|z\|$", "V": "$V$"}
-_AXES: Final = {"₁": "1", "₂": "2", "₃": "3", "1": "1", "2": "2", "3": "3"}
+"""Quantized signals, in mathematics; with the index of the axis."""
+
+DIGITS: Final = str.maketrans("₁₂₃", "123")
 
 
 def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]:
@@ -54,8 +54,12 @@ def draw_figures(report: Report, settings: Settings, folder: Path) -> list[Path]
             figure, axes = stacked(len(panels))
             for axis, panel in zip(axes, panels, strict=True):
                 _draw(axis, panel, report)
-                axis.set_ylabel(_label(panel, quantized=case != "continuous"))
-            _shade(axes, report)
+                axis.set_ylabel(_label(panel, "^Q" if case != "continuous" else ""))
+            for band in report.bands:
+                axes[0].annotate(
+                    band.label, (band.start_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
+                    textcoords="offset points", va="top", fontsize=6,
+                )  # fmt: skip
             labels = [[line.get_label() for line in axis.get_lines()] for axis in axes]
             if any(each != labels[0] for each in labels):
                 for axis in axes:
@@ -74,27 +78,15 @@ def _draw(axis: Axes, panel: Panel, report: Report) -> None:
         stroke = DESIRED if line.desired else MEASURED if line.held else TRUE
         label = line.label.replace("θ̃", r"$\tilde{\theta}$")
         axis.plot(report.time[known], line.values[known], label=label, drawstyle=steps, **stroke)
-
-
-def _label(panel: Panel, *, quantized: bool) -> str:
-    """An axis label: the panel's letter in mathematics, and the unit if it has one."""
-    axis = _AXES.get(panel.label[-1], "")
-    letter, text = panel.label[:-1] if axis else panel.label, panel.label
-    if letter in _LETTERS:
-        above = "^Q" if quantized else ""
-        text = f"${_LETTERS[letter].format(axis)}{above}$"
-    elif letter in _NORMS:
-        text = _NORMS[letter]
-    return text if panel.unit == "1" else f"{text} [{panel.unit}]"
-
-
-def _shade(axes: Sequence[Axes], report: Report) -> None:
-    """Shade the report's bands on every panel, and label them on the first."""
     for band in report.bands:
-        end_s = float(report.time[-1]) if band.end_s is None else band.end_s
-        for axis in axes:
-            axis.axvspan(band.start_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
-        axes[0].annotate(
-            band.label, (band.start_s, 1), xycoords=("data", "axes fraction"), xytext=(2, -2),
-            textcoords="offset points", va="top", fontsize=6,
-        )  # fmt: skip
+        end_s = report.time[-1] if band.end_s is None else band.end_s
+        axis.axvspan(band.start_s, end_s, facecolor="0.91", edgecolor="0.75", linewidth=0.4, zorder=0)
+
+
+def _label(panel: Panel, quantized: str) -> str:
+    """An axis label: the panel's letter in mathematics, and the unit if it has one."""
+    letter, axis = panel.label.rstrip("₁₂₃123"), panel.label[-1].translate(DIGITS)
+    text = {"‖z‖": r"$\|z\|$", "V": "$V$"}.get(panel.label, panel.label)
+    if letter in LETTERS:
+        text = f"${LETTERS[letter].format(axis)}{quantized}$"
+    return text if panel.unit == "1" else f"{text} [{panel.unit}]"

@@ -6,14 +6,15 @@ The page and the terminal show the same rows, so that a figure reads the same in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from json import dumps
+from typing import Any, Final, Literal, NamedTuple
 
-from aeroloop.service.review.report import Findings
+from aeroloop.service.review.report import Findings, Mark
 from aeroloop.service.review.requirements import value_of
 
 
 class Value(NamedTuple):
-    """A figure of one run: its digits, or the reason why there are none; and the number."""
+    """A figure of one run: its digits, or a dash and the reason why there are none; and the number."""
 
     text: str
     why: str | None = None
@@ -21,30 +22,39 @@ class Value(NamedTuple):
 
 
 class Delta(NamedTuple):
-    """How a figure of one run differs from the same figure of the first run."""
+    """Difference of a figure of one run to that of the first; `word` is None where neither is better."""
 
     text: str
-    word: str | None
-    """`better`, `worse` or `same`; None where neither can be said."""
+    word: Literal["better", "worse", "same"] | None
+
+
+class Figure(NamedTuple):
+    """Form of a figure of merit.
+
+    `path` leads to it in the findings, `what` says in a few words what it is, `main` figures are always shown, and
+    those that add up over time (`sums_up`) are comparable only between runs of the same duration.
+    """
+
+    path: str
+    name: str
+    unit: str
+    text: Callable[[float], str]
+    main: bool = False
+    what: str = ""
+    less_is_better: bool = True
+    sums_up: bool = False
+
+    @property
+    def key(self) -> str:
+        """Its name in `--json`."""
+        return self.path if self.path.startswith(THEOREM) else self.path.partition(".")[0]
 
 
 class Row(NamedTuple):
-    """A figure of several runs.
+    """A figure of several runs: a value per run, and whether less is better, run by run."""
 
-    Attributes:
-        key: Its name in `--json`.
-        name: Its name for display.
-        unit: Empty if it has none.
-        values: One per run.
-        figure: Its form.
-        comparable: Whether less is better, run by run: sums are not comparable if runs last differently long.
-    """
-
-    key: str
-    name: str
-    unit: str
+    figure: Figure
     values: list[Value]
-    figure: _Figure
     comparable: list[bool]
 
     def delta(self, run: int) -> Delta | None:
@@ -57,22 +67,8 @@ class Row(NamedTuple):
         apart = value - first
         sign = "+" if apart > 0 else "−"
         share = f" ({sign}{percent(abs(apart / first))} %)" if first else ""
-        word = "better" if apart < 0 else "worse"
+        word: Literal["better", "worse"] = "better" if apart < 0 else "worse"
         return Delta(f"{sign}{self.figure.text(abs(apart))}{share}", word if self.comparable[run] else None)
-
-
-class _Figure(NamedTuple):
-    path: str
-    """In the findings."""
-    name: str
-    unit: str
-    text: Callable[[float], str]
-    main: bool = False
-    what: str = ""
-    """What it is, in a few words."""
-    less_is_better: bool = True
-    sums_up: bool = False
-    """Whether it grows with the run's duration."""
 
 
 def micros(value: float) -> str:
@@ -101,44 +97,44 @@ THEOREM: Final = "theorem."
 """Prefix of the theorem's keys."""
 
 FIGURES: Final = (
-    _Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
+    Figure("z_track", "tracking error z_track", "×10⁻⁴ s", lambda z: _hundredth(z * 1e4), True,
             "∫ ε̃ᵀε̃ dt, ε̃ the attitude error as measured", sums_up=True),
-    _Figure("u_total", "control effort u_total", "V²·s", _tenth, True,
+    Figure("u_total", "control effort u_total", "V²·s", _tenth, True,
             "∫ uᵀu dt, u the voltages as sent", sums_up=True),
-    _Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
+    Figure("max_error_deg", "largest attitude error", "°", _hundredth, True,
             "angle from measured to desired attitude"),
-    _Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
-    _Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
-    _Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
-    _Figure("latency_us.p99", "loop latency p99", "µs", _whole),
-    _Figure("latency_us.max", "loop latency, longest", "µs", _whole),
-    _Figure("age_us.p50", "age of measurements at the controller, p50", "µs", _whole),
-    _Figure("age_us.p99", "age of measurements at the controller, p99", "µs", _whole),
-    _Figure("measurement.frames_per_s", "measurements", "frames/s", _tenth, less_is_better=False),
-    _Figure("measurement.bits_per_s", "measurements", "bit/s", _whole, True, "payload from plant to controller", False),
-    _Figure("command.frames_per_s", "commands", "frames/s", _tenth, less_is_better=False),
-    _Figure("command.bits_per_s", "commands", "bit/s", _whole, True, "payload from controller to plant", False),
-    _Figure("gap_count", "gaps", "", _whole, sums_up=True),
-    _Figure("saturated.attitude", "attitude at the quantizer's limit", "%", percent),
-    _Figure("saturated.rate", "rate at the quantizer's limit", "%", percent),
-    _Figure("saturated.voltage", "voltage at the quantizer's limit", "%", percent),
-    _Figure("invalid", "frames without a valid value", "", _whole, sums_up=True),
-    _Figure("missing_ticks", "ticks that were not recorded", "", _whole, sums_up=True),
-    _Figure("lapses", "late, missed, malformed, stale, refused", "", _whole, sums_up=True),
-    _Figure("losses", "messages the recorder lost", "", _whole, sums_up=True),
-    _Figure("trips", "trips", "", _whole, sums_up=True),
-    _Figure("theorem.held", "kept to all that could be judged: 1, or 0", "", _whole, less_is_better=False),
-    _Figure("theorem.mean_square_share", "∫k‖z‖² of its bound V(t₀) + ∫δ_Q, at most", "%", percent),
-    _Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent),
-    _Figure("theorem.radius", "bound of ‖z‖ in the long run, root mean square", "", _fourth, less_is_better=False),
-    _Figure("theorem.pointwise_radius", "bound of ‖z‖ at every instant, in the end", "", _fourth, less_is_better=False),
-    _Figure("theorem.pointwise_deg", "attitude error within that bound", "°", _hundredth, less_is_better=False),
-    _Figure("theorem.z_norm", "largest ‖z‖ after the transient", "", _fourth),
-    _Figure("theorem.true_z_norm", "… of the true state", "", _fourth),
-    _Figure("theorem.error_deg", "largest attitude error after the transient", "°", _hundredth),
-    _Figure("theorem.true_error_deg", "… of the true state", "°", _hundredth),
-    _Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _whole, sums_up=True),
-    _Figure("duration_s", "duration", "s", seconds, less_is_better=False),
+    Figure("final_error_deg", "final attitude error", "°", _hundredth, True, "at the last tick"),
+    Figure("skipped_ticks", "skipped ticks", "", _whole, True, "ticks without a command", sums_up=True),
+    Figure("latency_us.p50", "loop latency p50", "µs", _whole, True, "measurement sent to command received, median"),
+    Figure("latency_us.p99", "loop latency p99", "µs", _whole),
+    Figure("latency_us.max", "loop latency, longest", "µs", _whole),
+    Figure("age_us.p50", "age of measurements at the controller, p50", "µs", _whole),
+    Figure("age_us.p99", "age of measurements at the controller, p99", "µs", _whole),
+    Figure("measurement.frames_per_s", "measurements", "frames/s", _tenth, less_is_better=False),
+    Figure("measurement.bits_per_s", "measurements", "bit/s", _whole, True, "payload from plant to controller", False),
+    Figure("command.frames_per_s", "commands", "frames/s", _tenth, less_is_better=False),
+    Figure("command.bits_per_s", "commands", "bit/s", _whole, True, "payload from controller to plant", False),
+    Figure("gap_count", "gaps", "", _whole, sums_up=True),
+    Figure("saturated.attitude", "attitude at the quantizer's limit", "%", percent),
+    Figure("saturated.rate", "rate at the quantizer's limit", "%", percent),
+    Figure("saturated.voltage", "voltage at the quantizer's limit", "%", percent),
+    Figure("invalid", "frames without a valid value", "", _whole, sums_up=True),
+    Figure("missing_ticks", "ticks that were not recorded", "", _whole, sums_up=True),
+    Figure("lapses", "late, missed, malformed, stale, refused", "", _whole, sums_up=True),
+    Figure("losses", "messages the recorder lost", "", _whole, sums_up=True),
+    Figure("trips", "trips", "", _whole, sums_up=True),
+    Figure("theorem.held", "kept to all that could be judged: 1, or 0", "", _whole, less_is_better=False),
+    Figure("theorem.mean_square_share", "∫k‖z‖² of its bound V(t₀) + ∫δ_Q, at most", "%", percent),
+    Figure("theorem.pointwise_share", "true ‖z‖ of its bound at every instant, at most", "%", percent),
+    Figure("theorem.radius", "bound of ‖z‖ in the long run, root mean square", "", _fourth, less_is_better=False),
+    Figure("theorem.pointwise_radius", "bound of ‖z‖ at every instant, in the end", "", _fourth, less_is_better=False),
+    Figure("theorem.pointwise_deg", "attitude error within that bound", "°", _hundredth, less_is_better=False),
+    Figure("theorem.z_norm", "largest ‖z‖ after the transient", "", _fourth),
+    Figure("theorem.true_z_norm", "largest true ‖z‖ after the transient", "", _fourth),
+    Figure("theorem.error_deg", "largest attitude error after the transient", "°", _hundredth),
+    Figure("theorem.true_error_deg", "largest true attitude error after the transient", "°", _hundredth),
+    Figure("theorem.broken", "inequalities of Lemma 1 broken", "", _whole, sums_up=True),
+    Figure("duration_s", "duration", "s", seconds, less_is_better=False),
 )  # fmt: skip
 
 
@@ -147,11 +143,24 @@ def figure_rows(runs: Sequence[Findings]) -> list[Row]:
     rows = []
     apart = [abs(run.duration_s - runs[0].duration_s) > 0.01 * runs[0].duration_s for run in runs]
     for figure in FIGURES:
-        path = figure.path
-        key = path if path.startswith(THEOREM) else path.partition(".")[0]
-        found = [(run, value_of(run, path)) for run in runs]
-        values = [Value("–", run.reasons.get(key)) if v is None else Value(figure.text(v), None, v) for run, v in found]
+        found = [(run, value_of(run, figure.path)) for run in runs]
+        values = [
+            Value("–", run.reasons.get(figure.key)) if number is None else Value(figure.text(number), None, number)
+            for run, number in found
+        ]
         if figure.main or any(value.text != "–" or value.why for value in values):
             comparable = [figure.less_is_better and not (figure.sums_up and differ) for differ in apart]
-            rows.append(Row(key, figure.name, figure.unit, values, figure, comparable))
+            rows.append(Row(figure, values, comparable))
     return rows
+
+
+def grave(mark: Mark) -> bool:
+    """Whether an event is highlighted."""
+    return mark.kind in {"tripped", "fault", "lost", "refused"}
+
+
+def shown(value: Any) -> str:
+    """A value as the configuration writes it: `true`, `[1, 2]`, a text without quotes; None is a dash."""
+    if value is None:
+        return "–"
+    return value if isinstance(value, str) else dumps(value, ensure_ascii=False, default=str)

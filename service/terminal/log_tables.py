@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from aeroloop.service.report.page.data import grave
+from aeroloop.service.report.rows import grave
 from aeroloop.service.review.report import FaultInterval, Findings, Mark, Spread, TheoremFindings
 from aeroloop.service.terminal.display import LABELS, figures_table, labelled
 

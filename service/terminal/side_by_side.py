@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from aeroloop.service.report.page.setup import shown
-from aeroloop.service.report.rows import figure_rows
+from aeroloop.service.report.rows import figure_rows, shown
 from aeroloop.service.review.report import Report, differences
 from aeroloop.service.terminal.log_tables import DAMAGES_SHOWN, timed
 
@@ -24,7 +23,7 @@ def comparison_tables(reports: Sequence[Report]) -> None:
         differing.add_column(escape(report.name), overflow="fold")
     figures.add_column("")
     for row in figure_rows([report.findings for report in reports]):
-        figures.add_row(row.name, *(value.text for value in row.values), row.unit)
+        figures.add_row(row.figure.name, *(value.text for value in row.values), row.figure.unit)
     for key, values in differences(reports):
         differing.add_row(key, *(escape(shown(value)) for value in values))
     console.print(figures)

@@ -137,7 +137,7 @@ class HilLog:
         events.write_text("\n".join(lines) + "\n", encoding="utf-8")
         yield f"{events}: {len(lines)} events"
         try:
-            from aeroloop.service.report.page.page import page
+            from aeroloop.service.report.page import page
 
             shown.write_text(page([report([self.path])]), encoding="utf-8")
         except Exception as error:  # the same; and without the extra `review` there is no page

@@ -16,7 +16,7 @@ from aeroloop.service.config import load
 from aeroloop.service.logs.export import export
 from aeroloop.service.logs.recover import recover
 from aeroloop.service.logs.replay import replay
-from aeroloop.service.report.page.page import page
+from aeroloop.service.report.page import page
 from aeroloop.service.review.compare import read_runs
 from aeroloop.service.review.report import Findings
 from aeroloop.service.review.review import read, report

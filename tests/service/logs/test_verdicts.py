@@ -13,7 +13,7 @@ import pytest
 from aeroloop.protocol.messages.trace import read_batch
 from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
-from aeroloop.service.report.page.page import page
+from aeroloop.service.report.page import page
 from aeroloop.service.review.requirements import Limit
 from aeroloop.service.review.review import read, report
 from tests.support.edited_log import Said, rewrite

@@ -46,17 +46,6 @@ def svg_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figure_style, "FORMATS", {"svg": FORMATS["svg"]})
 
 
-@pytest.fixture(scope="module")
-def drawn(quantized: Report, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Every figure of the quantized case, by name; one of them in every format."""
-    folder = tmp_path_factory.mktemp("figures")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figure_style, "FORMATS", {"svg": FORMATS["svg"]})
-        paths = draw_figures(quantized, load(), folder)
-    paths += draw_figures(only(quantized, "attitude_error"), load(), folder)
-    return {path.name: path for path in paths}
-
-
 def only(made: Report, *groups: str) -> Report:
     """A report with these groups alone: each figure takes a while to draw."""
     return replace(made, panels=[panel for panel in made.panels if panel.group in groups])
@@ -67,11 +56,27 @@ def texts(svg: Path) -> list[str]:
     return [line.partition("<!-- ")[2].partition(" -->")[0] for line in svg.read_text().splitlines() if "<!-- " in line]
 
 
-def test_every_figure_is_there_in_every_format_under_the_papers_number(drawn: dict[str, Path]) -> None:
+@pytest.mark.usefixtures("svg_only")
+def test_every_figure_has_the_papers_number_letters_and_units_and_no_title(quantized: Report, tmp_path: Path) -> None:
+    found = {path.stem: texts(path) for path in draw_figures(quantized, load(), tmp_path)}
     names = ["angles", "C.7-attitude", "C.8-rate", "C.9-error", "C.10-rate_error", "C.11-input", "theorem"]
-    assert list(drawn) == [f"{name}.svg" for name in names] + ["C.9-error.pdf", "C.9-error.png"]
-    begin = {".pdf": b"%PDF", ".svg": b"<?xml", ".png": b"\x89PNG"}
-    assert all(path.read_bytes().startswith(begin[path.suffix]) for path in drawn.values())
+    assert list(found) == names
+    assert all("time [s]" in text for text in found.values())
+    assert not any("[1]" in line or "quantiz" in line for text in found.values() for line in text)
+    assert {r"$\epsilon_1^Q$", "measured", "desired"} <= set(found["C.7-attitude"])
+    assert r"$\omega_{e,2}^Q$ [rad/s]" in found["C.10-rate_error"]
+    assert {"roll [°]", "pitch [°]", "yaw [°]", "true"} <= set(found["angles"])
+
+
+def test_a_figure_has_every_format_the_width_of_a_column_and_always_the_same_bytes(
+    quantized: Report, tmp_path: Path
+) -> None:
+    (tmp_path / "again").mkdir()
+    error = only(quantized, "attitude_error")
+    pdf, svg, png = (path.read_bytes() for path in draw_figures(error, load(), tmp_path))
+    assert (pdf[:4], svg[:5], png[1:4]) == (b"%PDF", b"<?xml", b"PNG")
+    assert struct.unpack(">I", png[16:20])[0] == pytest.approx(600 * 3.5, abs=1)
+    assert [pdf, svg, png] == [path.read_bytes() for path in draw_figures(error, load(), tmp_path / "again")]
 
 
 @pytest.mark.usefixtures("svg_only")
@@ -81,46 +86,24 @@ def test_the_number_is_that_of_the_case(logs: dict[str, Path], tmp_path: Path, c
     assert {path.stem for path in paths} == {name}
 
 
-def test_a_figure_is_as_wide_as_a_column_of_a_journal(drawn: dict[str, Path]) -> None:
-    (pixels,) = struct.unpack(">I", drawn["C.9-error.png"].read_bytes()[16:20])
-    assert pixels == pytest.approx(600 * 3.5, abs=1)
-
-
-def test_axes_have_letters_and_units_and_there_is_no_title_and_no_unit_of_1(drawn: dict[str, Path]) -> None:
-    found = {path.stem: texts(path) for path in drawn.values() if path.suffix == ".svg"}
-    assert all("time [s]" in text for text in found.values())
-    assert not any("[1]" in line or "quantiz" in line for text in found.values() for line in text)
-    assert {r"$\epsilon_1^Q$", "measured", "desired"} <= set(found["C.7-attitude"])
-    assert r"$\omega_{e,2}^Q$ [rad/s]" in found["C.10-rate_error"]
-    assert {"roll [°]", "pitch [°]", "yaw [°]", "true"} <= set(found["angles"])
-
-
-def test_the_same_session_gives_the_same_bytes(drawn: dict[str, Path], quantized: Report, tmp_path: Path) -> None:
-    for path in draw_figures(only(quantized, "attitude_error"), load(), tmp_path):
-        assert path.read_bytes() == drawn[path.name].read_bytes(), path.name
-
-
 @pytest.mark.usefixtures("svg_only")
 def test_bands_are_shaded_with_their_labels(quantized: Report, tmp_path: Path) -> None:
     draw_figures(replace(only(quantized, "input"), bands=[Band(0.1, None, "gyro off")]), load(), tmp_path)
     assert "gyro off" in texts(tmp_path / "C.11-input.svg")
 
 
-def test_without_ticks_there_is_nothing_to_draw_and_a_file_for_a_folder_is_one_line(
+def test_what_cannot_be_drawn_or_written_is_refused_in_one_line(
     logs: dict[str, Path], quantized: Report, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ReviewError, match="no answered measurement"):
         draw_figures(replace(quantized, time=quantized.time[:0]), load(), tmp_path)
     (tmp_path / "file").write_text("")
-    assert execute(["log", "review", str(logs["quantized"]), "--figures", str(tmp_path / "file")]) == 1
-    assert capfd.readouterr().err.splitlines() == [f"aeroloop: cannot write into {tmp_path / 'file'}: File exists"]
-
-
-def test_a_part_without_ticks_or_of_no_length_is_refused(
-    logs: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    log = str(logs["quantized"])
-    assert execute(["log", "review", log, "--figures", str(tmp_path / "none"), "--from", "7"]) == 1
-    assert capfd.readouterr().err.startswith("aeroloop: nothing to draw after 7 s: the session has 0.4 s")
-    assert execute(["log", "review", log, "--from", "2", "--to", "1"]) == 2
-    assert list(tmp_path.iterdir()) == []
+    for arguments, status, line in (
+        (["--figures", str(tmp_path / "file")], 1, f"cannot write into {tmp_path / 'file'}: File exists"),
+        (["--figures", str(tmp_path / "none"), "--from", "7"], 1, "nothing to draw after 7 s: the session has 0.4 s"),
+        (["--from", "2", "--to", "1"], 2, "--from 2 is not before --to 1"),
+    ):
+        assert execute(["log", "review", str(logs["quantized"]), *arguments]) == status
+        (found,) = capfd.readouterr().err.splitlines()
+        assert found.startswith(f"aeroloop: {line}")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -15,8 +15,7 @@ from aeroloop.service.cli.main import execute
 from aeroloop.service.config import load
 from aeroloop.service.lab.demo import DemoFigures
 from aeroloop.service.logs.runs import Block
-from aeroloop.service.report.page.page import page
-from aeroloop.service.report.page.verdict import judgement
+from aeroloop.service.report.page import judgement, page
 from aeroloop.service.review.faults import FaultLog
 from aeroloop.service.review.report import Band, FaultInterval, Findings
 from aeroloop.service.review.review import read

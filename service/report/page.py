@@ -1,0 +1,164 @@
+"""Page of a review: one HTML file of one or several runs that opens without a network.
+
+The template shows findings and configuration as HTML and escapes every text; drawings.py prepares what page.js draws.
+The content security policy lists the hashes of the page's scripts: a browser runs no other, whatever a log contains.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Sequence
+from hashlib import sha256
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from aeroloop.service.report.drawings import drawings, page_data, period_s, spread_names
+from aeroloop.service.report.rows import THEOREM, Row, figure_rows, grave, micros, percent, seconds, shown
+from aeroloop.service.review.report import Findings, Report, TheoremFindings, differences, flat
+
+UNMET: Final = {
+    "C.28": "the sensors of attitude err by more than the quantizer, against (C.28)",
+    "C.29": "the sensors of the rate err by more than the quantizer, against (C.29)",
+    "C.30": "the command is saturated or missing, against (C.30)",
+    "Assumption 3": "the attitude error is larger than the certificate assumes",
+}
+"""Premises of Lemma 1 that a true state may not satisfy, and what that means."""
+
+Json = dict[str, Any]
+
+
+def page(reports: Sequence[Report]) -> str:
+    """The page of one run, or of several overlaid. Raises ValueError if there is none."""
+    if not reports:
+        raise ValueError("a page needs a run")
+    from plotly.offline import get_plotlyjs
+
+    folder = Path(__file__).parent
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"seconds": seconds, "micros": micros, "percent": percent, "shown": shown, "count": count}
+    environment.tests |= {"grave": grave, "known": lambda row: any(value.number is not None for value in row.values)}
+    scripts = [get_plotlyjs(), (folder / "page.js").read_text(encoding="utf-8")]
+    hashes = [f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts]
+    rows = figure_rows([report.findings for report in reports])
+    drawn = list(drawings(reports))
+    return environment.get_template("page.html").render(
+        reports=reports,
+        runs=list(enumerate(reports)),
+        several=len(reports) > 1,
+        policy=f"default-src 'none'; script-src {' '.join(hashes)}; style-src 'unsafe-inline'; img-src data: blob:",
+        style=(folder / "page.css").read_text(encoding="utf-8"),
+        scripts=scripts,
+        data=page_data(reports, drawn),
+        drawings=drawn,
+        rows=[row for row in rows if not row.figure.key.startswith(THEOREM)],
+        theorem_rows=[row for row in rows if row.figure.key.startswith(THEOREM)],
+        differences=differences(reports),
+        configuration=keys_by_section([report.settings for report in reports]),
+        facts=keys_by_section([report.facts for report in reports]),
+        missing=[unread(report.findings) for report in reports],
+        judgement=judgement,
+        judged=judged,
+        largest_error=largest_error,
+        period_s=period_s,
+        thinned=max(reports, key=lambda report: report.thinned),
+        part=next((report.part for report in reports if report.part), None),
+        spreads=spread_names(reports),
+        unjudged=unjudged,
+    )
+
+
+# ── what the template shows ──
+
+
+class Judgement(NamedTuple):
+    """Verdict on a run in a word, and whether it is good; None without limits and without a failure."""
+
+    word: str
+    good: bool | None
+    because: str
+
+
+def judgement(run: Findings) -> Judgement:
+    """Verdict by the limits of `--require`; without any, by trips and missing figures. It says if there were faults."""
+    found = _judgement(run)
+    if not run.faults:
+        return found
+    changed: Counter[str] = Counter()
+    for fault in run.faults:
+        changed[fault.effect] += fault.changed
+    counts = ", ".join(f"{n:,} {effect}" for effect, n in changed.items())
+    because = f"{found.because} {count(len(run.faults), 'fault')} acted at the plant: {counts}."
+    return Judgement(f"{found.word}, with faults", found.good, because)
+
+
+def _judgement(run: Findings) -> Judgement:
+    if broken := sum(not check.holds for check in run.checks):
+        return Judgement("Not held", False, f"{broken} of {count(len(run.checks), 'limit')} broken.")
+    if run.checks:
+        return Judgement("Held", True, f"{count(len(run.checks), 'limit')} required, none broken.")
+    if run.z_track is None:
+        return Judgement("Nothing to judge", False, run.reasons.get("z_track", "no measurement was answered"))
+    if run.trips:
+        times = "once" if len(run.trips) == 1 else f"{len(run.trips)} times"
+        return Judgement("Tripped", False, f"The plant went to 0 V by itself {times}.")
+    return Judgement("Tracked", None, "The plant never went to 0 V by itself; no limit was required.")
+
+
+def largest_error(report: Report) -> tuple[float, float] | None:
+    """Time [s] and value [deg] of the largest attitude error that is drawn; None if none is."""
+    for panel in report.panels:
+        if panel.group == "error_angle":
+            most = int(np.nanargmax(panel.lines[0].values))
+            return float(report.time[most]), float(panel.lines[0].values[most])
+    return None
+
+
+def unread(run: Findings) -> list[str]:
+    """What of the log is damaged, was not recorded, is unknown, or was lost by the recorder."""
+    missing = [f"not recorded: {gap}" for gap in run.missing if gap.rows]
+    lost = [f"the recorder lost {count(n, 'message')} of {topic}" for topic, n in run.losses.items()]
+    return [*run.damages, *missing, *map(str, run.unknown), *lost]
+
+
+def judged(found: TheoremFindings) -> str:
+    """How many true states judge the inequalities, in a sentence or two."""
+    if not found.samples:
+        return ""
+    left_out = [f"At {n:,} {UNMET.get(name, name)}." for name, n in found.outside.items() if n]
+    by = f"the other {found.judged:,}" if left_out else "all of them"
+    return " ".join([f"{found.samples:,} true states belong to a tick.", *left_out, f"Lemma 1 is judged by {by}."])
+
+
+def unjudged(rows: Sequence[Row], run: int, verdict: str) -> dict[str, list[str]]:
+    """Figures that a run has not, by their reason; a reason that the verdict states already is left out."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        if (why := row.values[run].why) and why != verdict.rstrip("."):
+            found.setdefault(why, []).append(row.figure.name)
+    return found
+
+
+def keys_by_section(tables: Sequence[Json]) -> dict[str, list[tuple[str, list[Any]]]]:
+    """Every dotted key of each run's nested tables with its value in each run, by section."""
+    flattened = [flat(table) for table in tables]
+    sections: dict[str, list[tuple[str, list[Any]]]] = {}
+    for key in dict.fromkeys(chain(*flattened)):
+        section, dot, _ = key.partition(".")
+        sections.setdefault(section if dot else "", []).append((key, [table.get(key) for table in flattened]))
+    return dict(sorted(sections.items()))
+
+
+def count(n: int, what: str) -> str:
+    """A number of things: `1 tick`, `2,000 ticks`."""
+    return f"{n:,} {what}" + ("" if n == 1 else "s")
