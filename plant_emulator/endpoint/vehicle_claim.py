@@ -23,9 +23,8 @@ from typing import Any, Literal, NamedTuple
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim, EventKind, Grant, Refusal, SessionRecord
 from aeroloop.protocol.messages.states import PLANT_TABLE, Machine, PlantState, PlantTrigger, TripCause
 from aeroloop.protocol.messages.trace import Outcome, PlantChange, PlantChangeKind
-from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, WATCHDOG_S
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import FIRST_COMMAND_S, WATCHDOG_S, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 
 class Notice(NamedTuple):
@@ -229,7 +228,7 @@ class VehicleClaim:
 
     def _command(self, frame: bytes) -> Outcome:
         """Put a command's voltages in force if it is well-formed, fresh and valid."""
-        if frame == SILENCE and self._silent_commands and self._codes:
+        if frame == UNCHANGED and self._silent_commands and self._codes:
             read: tuple[int, tuple[float, ...]] | None = ((self._echo + 1) % self._counters, self._codes)
         else:
             read = self.wire.command.unpack(frame)

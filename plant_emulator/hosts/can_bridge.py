@@ -24,9 +24,8 @@ from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import FIRST_COMMAND_S, LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import FIRST_COMMAND_S, LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 WAIT_S: Final = 0.01
 SESSIONS: Final = 16
@@ -63,7 +62,7 @@ class Relay(VehicleClaim):
         """Take a frame from the bus. Returns it if it is to be forwarded, which makes a tick."""
         if self.session is None:
             return None
-        if frame == SILENCE and self._silent_measurements:
+        if frame == UNCHANGED and self._silent_measurements:
             if not self._begun:
                 return None
             self.counter = (self.counter + 1) % self._counters

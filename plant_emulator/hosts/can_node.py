@@ -19,7 +19,7 @@ from aeroloop.protocol.runtime.throttle import Throttle
 from aeroloop.protocol.transport.can_format import HEARTBEAT_S, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 MASTER: Final = "the controller's side"
 
@@ -78,7 +78,7 @@ class CanNetwork(PlantNetwork):
             self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        """Send a measurement frame; UNCHANGED only in lockstep, where the controller cannot detect it by time."""
         if frame or self._loop.lockstep:
             self._bus.send(frame)
 

@@ -21,9 +21,8 @@ from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import LoopTiming
 from aeroloop.protocol.transport.link import Arrival, Link
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 IDLE_WAIT_S: Final = 0.02
 ANSWER_SHARE: Final = 0.6
@@ -59,7 +58,7 @@ class PlantNetwork(ABC):
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        """Send a measurement frame; UNCHANGED only in lockstep, where the controller cannot detect it by time."""
 
     @abstractmethod
     def follow_session(self) -> None:
@@ -70,7 +69,7 @@ class PlantNetwork(ABC):
         """After the measurement was sent: write the tick's trace row, publish events and a status that is due.
 
         Args:
-            measurement: The endpoint's frame; SILENCE if it is not to be sent, None if there is none.
+            measurement: The endpoint's frame; UNCHANGED if it is not to be sent, None if there is none.
             arrival: The command received since the last tick, before any injected fault; None for none.
             sent_ns: When the measurement was sent, on `time.monotonic_ns()`.
         """
@@ -203,7 +202,7 @@ class Driver:
                 measured = self.endpoint.wire.measurement
                 echo = measured.counter(sent)
                 self._counter = (self._counter + 1) % measured.counters if echo is None else echo
-                if sent == SILENCE:
+                if sent == UNCHANGED:
                     echo = self._counter
         network.after_tick(measurement, arrival, sent_ns)
         return echo

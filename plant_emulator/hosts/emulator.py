@@ -22,9 +22,8 @@ from aeroloop.protocol.messages.models import FaultStatus, Truth
 from aeroloop.protocol.messages.operator import Advance, Answer, Inject
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.link import Arrival
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 
 class FaultError(AeroloopError):
@@ -135,8 +134,8 @@ class Emulator(Driver):
         return passed[-1] if passed else None
 
     def _outgoing(self, frame: bytes | None) -> list[bytes]:
-        if frame == SILENCE and not self._loop.lockstep:  # not a frame, so no fault acts on it
-            return self._measurements.passes(None, self._faulty.elapsed) or [SILENCE]
+        if frame == UNCHANGED and not self._loop.lockstep:  # not a frame, so no fault acts on it
+            return self._measurements.passes(None, self._faulty.elapsed) or [UNCHANGED]
         return self._measurements.passes(frame, self._faulty.elapsed)
 
 

@@ -23,9 +23,8 @@ from aeroloop.protocol.messages.models import Refusal
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import NEVER, Batch, PlantChange, Sent
 from aeroloop.protocol.plugins import PluginError
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 _FIELDS: Final = ("session", "session_tick", "sent_as", "outcome", "trip", "answered", "measurement", "voltages")
 """Compared columns of a row; the first that differs is reported."""
@@ -171,7 +170,7 @@ class PlantReplay:
             if received_as == Sent.FRAME:
                 frame: bytes | None = command
             elif received_as == Sent.SILENT:
-                frame = SILENCE
+                frame = UNCHANGED
             else:
                 frame = None if received_as == Sent.NONE else self._malformed
             yield tick, frame, (session, *logged)

@@ -40,9 +40,8 @@ from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches
 from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import Arrival, Mailbox, ZenohLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 OTHERS_PERIOD_NS: Final = 10_000_000
@@ -126,10 +125,10 @@ class ZenohNetwork(PlantNetwork):
             self.follow_session()
 
     def send(self, frame: bytes) -> None:
-        """Send a measurement frame; SILENCE is sent only in lockstep, where the controller cannot detect it by time."""
+        """Send a measurement frame; UNCHANGED only in lockstep, where the controller cannot detect it by time."""
         if self._link is not None and (frame or self._loop.lockstep):
             self._link.send(frame)
-            self._sent += frame != SILENCE
+            self._sent += frame != UNCHANGED
 
     def after_tick(self, measurement: bytes | None, arrival: Arrival | None, sent_ns: int) -> None:
         """After the measurement was sent: write the trace row, measure latency, publish events and a due status."""
@@ -146,7 +145,7 @@ class ZenohNetwork(PlantNetwork):
         if measurement:
             self._sent_at[endpoint.session_tick % self._counters] = endpoint.session_tick, sent_ns
         if arrival is not None:
-            self._received += arrival.frame != SILENCE
+            self._received += arrival.frame != UNCHANGED
         self.follow_session()
         self.publish_when_due()
 
@@ -355,7 +354,7 @@ class PlantTrace:
             if len(command) == self._command_bytes:
                 received_as = 1
             else:
-                received_as, command = (Sent.SILENT if command == SILENCE else Sent.MALFORMED), b""
+                received_as, command = (Sent.SILENT if command == UNCHANGED else Sent.MALFORMED), b""
         writer.plant_row(
             end.ticked,
             end.session_tick,

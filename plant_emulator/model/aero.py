@@ -20,8 +20,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
-from aeroloop.protocol.wire.attitude import Vector
-from aeroloop.protocol.wire.rotations import R, S, from_euler
+from aeroloop.protocol.wire.attitude import R, S, Vector, from_euler
 
 
 class AeroSettings(BaseModel, extra="forbid"):

@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from aeroloop.plant_emulator.model.mechanism import Inertia, Mechanism
-from aeroloop.protocol.wire.attitude import Quaternion, Vector
-from aeroloop.protocol.wire.rotations import R, S, T
+from aeroloop.protocol.wire.attitude import Quaternion, R, S, T, Vector
 
 
 class RigidBodySettings(BaseModel, extra="forbid"):

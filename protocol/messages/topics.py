@@ -66,7 +66,7 @@ class Topic:
     Attributes:
         name: Name in this program.
         key: Key below `aeroloop/<vehicle>/`; `{session}` and `{role}` are filled in.
-        carries: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
+        kind: `frame` (bits, see frames.py), `trace` (batches, see trace.py), `json` (a model), `query` (request and
             reply), `token` (liveliness, no payload).
         senders: Roles that publish it, hold it or query by it; under its own role where the key has one.
         receivers: Roles that subscribe to it, watch it or answer it.
@@ -79,7 +79,7 @@ class Topic:
 
     name: str
     key: str
-    carries: Literal["frame", "trace", "json", "query", "token"]
+    kind: Literal["frame", "trace", "json", "query", "token"]
     senders: _Roles
     receivers: _Roles
     model: type[Message] | None = None
@@ -90,16 +90,16 @@ class Topic:
     @property
     def recorded(self) -> bool:
         """Whether it is published from a cache and recorded: a subscriber that joins late recovers earlier messages."""
-        return self.carries in ("trace", "json")
+        return self.kind in ("trace", "json")
 
     @property
     def answered(self) -> bool:
         """Whether roles answer queries on it."""
-        return self.carries == "query" or self.name in ("description", "status")
+        return self.kind == "query" or self.name in ("description", "status")
 
     @property
     def title(self) -> str:
-        """Name of what it carries, for schemas."""
+        """Name of its schema."""
         return self.model.__name__ if self.model else self.name.capitalize()
 
 
@@ -135,7 +135,7 @@ TOPICS: Final = {
 RECORDED: Final = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
 """Topics published from a cache."""
 
-FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.carries == "frame")
+FRAMES: Final = tuple(topic.name for topic in TOPICS.values() if topic.kind == "frame")
 """Topics of frames."""
 
 _Actions = tuple[Action, ...]
@@ -147,7 +147,7 @@ ACTIONS: Final[dict[str, tuple[_Actions, _Actions]]] = {
     "query": (("query",), ("answer",)),
     "token": (("hold",), ("watch",)),
 }
-"""What senders and what receivers do, by what a topic carries. A cache answers queries."""
+"""What senders and what receivers do, by a topic's kind. A cache answers queries."""
 
 _CACHE: Final = "/@cache"
 _CHUNKS: Final = {"session": "(?P<session>[^/]+)", "role": "(?P<role>[^/]+)"}

@@ -24,8 +24,7 @@ from pydantic import Field, ValidationError
 from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Claim
 from aeroloop.protocol.messages.operator import Change, Message, in_force
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import MAX_ACTUATORS, WireSpec
+from aeroloop.protocol.wire.spec import MAX_ACTUATORS, LoopSettings, WireSpec
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -19,7 +19,7 @@ from typing import Final
 
 from aeroloop.protocol.errors import AeroloopError
 from aeroloop.protocol.messages.operator import build_messages
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 _PR_SET_TIMERSLACK: Final = 29
 _MCL_CURRENT: Final = 1

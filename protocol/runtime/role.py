@@ -35,8 +35,7 @@ from aeroloop.protocol.transport.network import VISIT_S, join, visit
 from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
 from aeroloop.protocol.transport.router import route
 from aeroloop.protocol.transport.security import Identity
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 
 M = TypeVar("M", bound=Message)
 _RECENT_S: Final = 10.0
@@ -257,13 +256,13 @@ class Role:
 
     def declare(self, topic: str, per_s: float, *, lossless: bool = False) -> None:
         """Declare a topic's publisher before its first message."""
-        carries = topics.TOPICS[topic].carries
+        kind = topics.TOPICS[topic].kind
         self._publishers[topic] = CachedPublisher(
             self.zenoh,
             topics.key(topic, self.vehicle, role=self.role),
             per_s,
             lossless=lossless,
-            encoding=zenoh.Encoding.APPLICATION_JSON if carries == "json" else zenoh.Encoding.ZENOH_BYTES,
+            encoding=zenoh.Encoding.APPLICATION_JSON if kind == "json" else zenoh.Encoding.ZENOH_BYTES,
         )
 
     def publish(self, topic: str, message: Message) -> None:

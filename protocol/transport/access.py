@@ -70,12 +70,12 @@ def access_control(*vehicles: str, loopback: bool = True) -> dict[str, Any]:
 def _rules(role: str, vehicle: str) -> list[dict[str, Any]]:
     """What a peer of a role may send (ingress) and is sent (egress): the other half of each topic."""
     rules = []
-    for carries, (sending, receiving) in ACTIONS.items():
-        rows = [topic for topic in topics.TOPICS.values() if topic.carries == carries]
+    for kind, (sending, receiving) in ACTIONS.items():
+        rows = [topic for topic in topics.TOPICS.values() if topic.kind == kind]
         sent = [topic for topic in rows if role in (ROUTER, *topic.senders)]
         received = [topic for topic in rows if role in (ROUTER, *topic.receivers)]
         of_role = "*" if role == ROUTER else role
-        readable = vehicle if carries == "query" else "*"
+        readable = vehicle if kind == "query" else "*"
         for flow, actions, keys in (
             ("ingress", sending, _keys(sent, vehicle, of_role)),
             ("egress", receiving, _keys(sent, readable)),
@@ -85,7 +85,7 @@ def _rules(role: str, vehicle: str) -> list[dict[str, Any]]:
             if keys:
                 rules.append(
                     {
-                        "id": f"{role} of {vehicle}, {carries}, {flow}: {', '.join(actions)}",
+                        "id": f"{role} of {vehicle}, {kind}, {flow}: {', '.join(actions)}",
                         "messages": [message for action in actions for message in _MESSAGES[action]],
                         "flows": [flow],
                         "permission": "allow",
@@ -103,6 +103,6 @@ def _keys(rows: list[Topic], vehicle: str, role: str = "*") -> list[str]:
         keys.append(key)
         if topic.recorded:
             keys.append(topics.cache_key(key))
-        elif topic.carries == "token" and role != "*":
+        elif topic.kind == "token" and role != "*":
             keys.append(f"{key}-$*")
     return keys

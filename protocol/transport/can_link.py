@@ -26,7 +26,7 @@ from aeroloop.protocol.transport.can_format import (
 )
 from aeroloop.protocol.transport.link import Link, Mailbox
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 
 _BUS_OFF: Final = 0x40  # of a SocketCAN error frame's id
 _RECEIVE_S: Final = 0.1
@@ -187,7 +187,7 @@ class CanLink(Link):
         now = time.monotonic_ns()
         if identifier == self._receive_id:
             size = self._receives.size
-            if data == SILENCE and len(SILENCE) in self._lengths:
+            if data == UNCHANGED and len(UNCHANGED) in self._lengths:
                 self.peer_ns = now
                 self._mailbox.put(data)
                 return

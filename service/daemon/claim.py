@@ -16,8 +16,7 @@ from aeroloop.protocol.messages.operator import Answer
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.link import Mailbox, ZenohLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon.tick_source import MAILBOX
 
 ANSWER_WAIT_S: Final = 1.0

@@ -24,7 +24,7 @@ from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import ZenohLink
-from aeroloop.protocol.wire.transmit import SILENCE
+from aeroloop.protocol.wire.transmit import UNCHANGED
 from aeroloop.service.config import Settings
 from aeroloop.service.control.controller import Controller
 from aeroloop.service.control.laws.interface import PythonLaw
@@ -228,13 +228,13 @@ class Daemon:
         assert session is not None
         self._ticks += 1
         self._read_plant()
-        if now.frame != SILENCE:
+        if now.frame != UNCHANGED:
             self._received += 1
         self._skipped += now.missed
         if now.missed >= STALL_TICKS:
             self._role.warn("stall", "fault", f"{now.missed} ticks missed at once", session, tick)
         if command is not None:
-            self._sent += command != SILENCE
+            self._sent += command != UNCHANGED
         if command is not None or self._too_slow is not None:
             self._advance_state(tick)
         if self._controller.tick_index == tick and tick % self._telemetry_every == 0:

@@ -24,7 +24,7 @@ from aeroloop.protocol.transport.certificate import SOON_DAYS, CertificateError,
 from aeroloop.protocol.transport.network_settings import NetworkSettings, protected
 from aeroloop.protocol.transport.refusal import PLAIN_S, refusal
 from aeroloop.protocol.transport.security import Identity
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 CHECK_S: Final = 5.0
 GOOD_CLOCKS: Final = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page")

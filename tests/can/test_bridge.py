@@ -23,8 +23,7 @@ from aeroloop.protocol.messages.trace import Batch, Outcome, read_batch
 from aeroloop.protocol.runtime.role import Role
 from aeroloop.protocol.transport.can_format import Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.can_in_process import virtual
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 

@@ -14,9 +14,8 @@ from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import COMMAND_ID, MEASUREMENT_ID
 from aeroloop.protocol.transport.can_link import CanLink
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from aeroloop.service.config import load
 from aeroloop.service.lab.experiment import run_experiment
 from aeroloop.service.testing.hil import Hil
@@ -68,12 +67,12 @@ def test_an_empty_frame_is_refused_and_displaces_nothing_where_it_is_not_what_si
             frame = bytes((wire.command if end == "plant" else wire.measurement).size)
             identifier = COMMAND_ID + 1 if end == "plant" else MEASUREMENT_ID + 1
             stranger.say(identifier, frame)
-            stranger.say(identifier, SILENCE)
+            stranger.say(identifier, UNCHANGED)
             stranger.settle(link)
             arrival = link.take()
             assert arrival is not None
             expected = lockstep and policy == "on_change"
-            assert (arrival.frame, link.refused) == ((SILENCE, 0) if expected else (frame, 1))
+            assert (arrival.frame, link.refused) == ((UNCHANGED, 0) if expected else (frame, 1))
     finally:
         link.close()
 
@@ -94,10 +93,10 @@ def node(request: pytest.FixtureRequest) -> Iterator[tuple[CanNetwork, Stranger,
 
 def test_a_node_sends_silence_where_it_could_not_be_received_only(node: tuple[CanNetwork, Stranger, bool]) -> None:
     front, stranger, lockstep = node
-    for frame in (measurement(0), SILENCE, SILENCE, measurement(3)):
+    for frame in (measurement(0), UNCHANGED, UNCHANGED, measurement(3)):
         front.send(frame)
     said = [bytes(m.data) for m in stranger.everything() if m.arbitration_id == MEASUREMENT_ID + 1]
-    silence = [SILENCE, SILENCE] if lockstep else []
+    silence = [UNCHANGED, UNCHANGED] if lockstep else []
     assert said == [measurement(0), *silence, measurement(3)]
 
 
@@ -117,17 +116,17 @@ def test_silence_passes_in_lockstep_and_has_the_counter_after_the_last() -> None
     it = relay()
     assert it.measurement(measurement(0)) is not None
     for k in range(1, 15):
-        assert it.measurement(SILENCE) == SILENCE
+        assert it.measurement(UNCHANGED) == UNCHANGED
         assert it.counter == k
     assert it.command(command(0), NOW) is not None
-    assert it.command(SILENCE, NOW) == SILENCE
+    assert it.command(UNCHANGED, NOW) == UNCHANGED
     assert it.refused == 0
 
 
 def test_silence_does_not_pass_before_a_sessions_first_frame() -> None:
     it = relay()
-    assert it.measurement(SILENCE) is None
-    assert it.command(SILENCE, NOW + FIRST_MEASUREMENT_NS) is None
+    assert it.measurement(UNCHANGED) is None
+    assert it.command(UNCHANGED, NOW + FIRST_MEASUREMENT_NS) is None
     it.watch(NOW + FIRST_MEASUREMENT_NS + 1)
     assert it.state is PlantState.TRIPPED  # it was no first command either
 
@@ -137,8 +136,8 @@ def test_an_empty_frame_is_refused_elsewhere_and_feeds_no_watchdog(wire: WireSpe
     it = relay(wire, lockstep=lockstep)
     it.measurement(measurement(0))
     it.command(command(0), NOW)
-    assert it.measurement(SILENCE) is None
-    assert it.command(SILENCE, NOW + WATCHDOG_NS) is None
+    assert it.measurement(UNCHANGED) is None
+    assert it.command(UNCHANGED, NOW + WATCHDOG_NS) is None
     assert it.refused == 2
     it.watch(NOW + WATCHDOG_NS + 1)
     assert (it.state is PlantState.TRIPPED) == (not lockstep)

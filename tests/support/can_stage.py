@@ -15,8 +15,7 @@ from aeroloop.protocol.messages.states import PlantState
 from aeroloop.protocol.transport.can_format import MEASUREMENT_ID, CanSettings, Heartbeat, fingerprint
 from aeroloop.protocol.transport.can_link import CanLink
 from aeroloop.protocol.wire.attitude import IDENTITY
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.can_in_process import Stranger
 from tests.support.zenoh_network import PATIENCE_S
 

@@ -23,7 +23,7 @@ from typing import Literal
 import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.wire.rotations import S
+from aeroloop.protocol.wire.attitude import S
 from aeroloop.service.control.laws.interface import Diagonal, Gains3, Now
 from aeroloop.service.control.laws.tracking import TrackingLaw, TrackingSettings
 from aeroloop.service.control.laws.tuning import PAPER, PAPER_BODY, tune_sliding

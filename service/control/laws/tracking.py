@@ -26,7 +26,7 @@ from typing import TypeVar
 import casadi as ca
 from pydantic import Field
 
-from aeroloop.protocol.wire.rotations import R, S
+from aeroloop.protocol.wire.attitude import R, S
 from aeroloop.service.control.laws.body import gravity_torque, voltages_for
 from aeroloop.service.control.laws.interface import ExpressionLaw, LawSettings, Now, Vector
 

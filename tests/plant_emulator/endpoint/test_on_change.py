@@ -15,7 +15,7 @@ from aeroloop.protocol.messages.models import Claim, Grant
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.wire.attitude import IDENTITY, Vector
 from aeroloop.protocol.wire.spec import WireSpec
-from aeroloop.protocol.wire.transmit import SILENCE, Policy, Transmit
+from aeroloop.protocol.wire.transmit import UNCHANGED, Policy, Transmit
 from tests.plant_emulator.endpoint.test_endpoint import COUNTERS, OFF, PERIOD_NS, WATCHDOG_TICKS, RecordingPlant
 
 HEARTBEAT = 15
@@ -94,14 +94,14 @@ def test_a_plant_at_rest_sends_heartbeats_only_and_a_change_at_once(lockstep: bo
 
 def test_silence_is_distinguished_from_no_session() -> None:
     endpoint, _ = claimed()
-    assert endpoint.tick(command(0), 1) == SILENCE
+    assert endpoint.tick(command(0), 1) == UNCHANGED
     endpoint.release("first")
     assert endpoint.tick(None, 2) is None
 
 
 def test_a_new_session_starts_with_a_frame_though_nothing_has_changed() -> None:
     endpoint, _ = claimed()
-    assert endpoint.tick(command(0), 1) == SILENCE
+    assert endpoint.tick(command(0), 1) == UNCHANGED
     endpoint.release("first")
     claim(endpoint, "second")
     assert endpoint.tick(None, 2) == BOTH.measurement.pack(0, (0,) * 6)
@@ -143,7 +143,7 @@ def test_an_empty_command_in_real_time_is_refused_and_feeds_no_watchdog(policy: 
     endpoint, plant = claimed(wire_of(command=policy))
     endpoint.tick(command(0), 1)
     for k in range(2, 80):
-        endpoint.tick(SILENCE, k)
+        endpoint.tick(UNCHANGED, k)
     assert plant.held.index(OFF) == WATCHDOG_TICKS
     assert endpoint.refused == WATCHDOG_TICKS
     assert endpoint.accepted == 1
@@ -152,7 +152,7 @@ def test_an_empty_command_in_real_time_is_refused_and_feeds_no_watchdog(policy: 
 def test_an_empty_command_in_lockstep_is_refused_where_commands_are_periodic() -> None:
     endpoint, _ = claimed(wire_of(command="periodic"), lockstep=True)
     endpoint.tick(command(0), 1)
-    endpoint.tick(SILENCE, 2)
+    endpoint.tick(UNCHANGED, 2)
     assert (endpoint.refused, endpoint.accepted) == (1, 1)
 
 
@@ -160,7 +160,7 @@ def test_an_empty_command_in_lockstep_answers_the_last_measurement_with_the_last
     endpoint, plant = claimed(lockstep=True)
     endpoint.tick(command(0, 7), 1)
     for k in range(2, 3 * WATCHDOG_TICKS):
-        endpoint.tick(SILENCE, k)
+        endpoint.tick(UNCHANGED, k)
     assert plant.held == [volts(7)] * (3 * WATCHDOG_TICKS - 1)
     assert endpoint.accepted == 3 * WATCHDOG_TICKS - 1
     assert endpoint.refused == 0
@@ -174,7 +174,7 @@ def test_an_empty_command_before_a_sessions_first_is_refused_and_holds_nothing_o
     endpoint.tick(None, 2)
     claim(endpoint, "second")
     endpoint.tick(None, 3)
-    endpoint.tick(SILENCE, 4)
+    endpoint.tick(UNCHANGED, 4)
     assert plant.held == [volts(7), OFF, OFF, OFF]
     assert endpoint.refused == 1
     assert state(endpoint) is PlantState.GRANTED
@@ -184,14 +184,14 @@ def test_in_lockstep_silence_goes_on_saying_no_valid_value_only_while_that_is_th
     endpoint, plant = claimed(lockstep=True)
     endpoint.tick(command(0), 1)
     plant.now = turning(nan)
-    endpoint.tick(SILENCE, 2)
+    endpoint.tick(UNCHANGED, 2)
     endpoint.tick(invalid(2), 3)
-    endpoint.tick(SILENCE, 4)
+    endpoint.tick(UNCHANGED, 4)
     plant.now = turning(0.0)
-    endpoint.tick(SILENCE, 5)
+    endpoint.tick(UNCHANGED, 5)
     assert plant.held == [volts(), volts(), OFF, OFF, OFF]
     assert state(endpoint) is PlantState.DRIVEN
-    endpoint.tick(SILENCE, 6)  # answers a valid measurement
+    endpoint.tick(UNCHANGED, 6)  # answers a valid measurement
     assert endpoint.trip is TripCause.INVALID_COMMAND
 
 

@@ -22,8 +22,7 @@ from aeroloop.protocol.messages.models import Claim, Event, Grant, Refusal, Stat
 from aeroloop.protocol.messages.operator import Answer, Request
 from aeroloop.protocol.messages.states import PlantState, TripCause
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 LOOP, WIRE = LoopSettings(realtime="off", rate_hz=100), WireSpec()

@@ -19,8 +19,7 @@ from aeroloop.protocol.runtime.role import OccupiedError, Role
 from aeroloop.protocol.transport.history import RecoveringSubscriber
 from aeroloop.protocol.transport.link import ZenohLink
 from aeroloop.protocol.transport.network_settings import NetworkSettings
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from tests.support.zenoh_network import PATIENCE_S, Gathering, eventually
 
 WIRE = WireSpec()

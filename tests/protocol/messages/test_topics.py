@@ -39,7 +39,7 @@ def test_what_is_left_out_of_a_key_is_a_wildcard(topic: Topic) -> None:
 
 
 def test_what_is_published_is_either_recorded_or_a_frame() -> None:
-    published = [topic.name for topic in TOPICS.values() if topic.carries not in ("query", "token")]
+    published = [topic.name for topic in TOPICS.values() if topic.kind not in ("query", "token")]
     assert sorted(RECORDED + FRAMES) == sorted(published)
     assert FRAMES == ("measurement", "command")
 
@@ -59,13 +59,13 @@ def test_every_topic_is_called_what_the_table_calls_it_and_has_a_key_of_its_own(
 @every_topic
 def test_what_several_roles_publish_has_the_role_in_its_key(topic: Topic) -> None:
     """Access rules compare keys, not payloads: on a shared key a recorder could publish an event of the plant's."""
-    assert topic.carries == "query" or ("{role}" in topic.key) == (len(topic.senders) > 1)
+    assert topic.kind == "query" or ("{role}" in topic.key) == (len(topic.senders) > 1)
 
 
 @every_topic
 def test_every_json_topic_has_a_model_and_no_frame_trace_or_token_has_one(topic: Topic) -> None:
-    if topic.carries != "query":
-        assert (topic.model is not None) == (topic.carries == "json")
+    if topic.kind != "query":
+        assert (topic.model is not None) == (topic.kind == "json")
 
 
 def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
@@ -78,7 +78,7 @@ def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
         | {"reference"},
         "observer": {"show"},
     }
-    queries = [topic for topic in TOPICS.values() if topic.carries == "query"]
+    queries = [topic for topic in TOPICS.values() if topic.kind == "query"]
     assert {role: {topic.name for topic in queries if role in topic.receivers} for role in ROLES} == {
         "plant": {"claim", "release", "record", "show", "arm", "stop", "inject", "advance"},
         "controller": {"show", "set_gains", "track", "stand_down", "recall"},
@@ -90,7 +90,7 @@ def test_each_role_sends_what_is_its_own_and_only_ends_answer() -> None:
 
 @every_topic
 def test_whatever_is_published_may_be_observed(topic: Topic) -> None:
-    assert ("observer" in topic.receivers) == (topic.carries != "query")
+    assert ("observer" in topic.receivers) == (topic.kind != "query")
 
 
 def test_an_unknown_topic_has_no_key() -> None:

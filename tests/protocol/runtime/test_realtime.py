@@ -18,7 +18,7 @@ from aeroloop.protocol.messages.operator import Message
 from aeroloop.protocol.messages.topics import TOPICS
 from aeroloop.protocol.runtime import realtime
 from aeroloop.protocol.runtime.realtime import RealtimeError, prepare_process
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 
 def derived(base: type[Message]) -> Iterator[type[Message]]:
@@ -41,7 +41,7 @@ def test_the_parser_of_every_message_is_built_before_the_first_tick() -> None:
 PREPARED = """
 import ctypes, gc, json, mmap, os
 from aeroloop.protocol.runtime.realtime import prepare_process
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 refused = prepare_process(LoopSettings())
 slack = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK [ns]
 

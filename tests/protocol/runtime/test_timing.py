@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from aeroloop.protocol.runtime import tick_grid, timing
 from aeroloop.protocol.runtime.tick_grid import TickGrid
 from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 
 START = 123_456_789_012_345
 PERIOD = 2_000_000

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from aeroloop.protocol.wire import attitude, rotations
+from aeroloop.protocol.wire import attitude
 from aeroloop.protocol.wire.attitude import IDENTITY, Quaternion, Vector, received_quaternion, sent_vector, to_euler
 from aeroloop.protocol.wire.quantizer import UniformQuantizer
 
@@ -57,17 +57,17 @@ def constant(values: tuple[float, ...]) -> ca.SX:
 
 def R(q: Quaternion) -> Array:  # noqa: N802  # the paper's letter
     """R(q) in numbers."""
-    return number(rotations.R(constant(q)))
+    return number(attitude.R(constant(q)))
 
 
 def T(q: Quaternion) -> Array:  # noqa: N802  # the paper's letter
     """T(q) in numbers."""
-    return number(rotations.T(constant(q)))
+    return number(attitude.T(constant(q)))
 
 
 def S(v: Vector) -> Array:  # noqa: N802  # the paper's letter
     """S(v) in numbers."""
-    return number(rotations.S(constant(v)))
+    return number(attitude.S(constant(v)))
 
 
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
@@ -106,12 +106,12 @@ def spin(q: Quaternion, omega: Vector, t: float) -> Quaternion:
 @pytest.mark.parametrize(
     ("function", "sizes"),
     [
-        (rotations.S, (3,)),
-        (rotations.T, (4,)),
-        (rotations.R, (4,)),
-        (rotations.conjugate, (4,)),
-        (rotations.product, (4, 4)),
-        (rotations.from_euler, (3,)),
+        (attitude.S, (3,)),
+        (attitude.T, (4,)),
+        (attitude.R, (4,)),
+        (attitude.conjugate, (4,)),
+        (attitude.product, (4, 4)),
+        (attitude.from_euler, (3,)),
     ],
 )
 def test_symbols_and_numbers_give_the_same(function: Callable[..., Any], sizes: tuple[int, ...]) -> None:
@@ -146,7 +146,7 @@ def test_r_turns_vectors_as_rodrigues_does(axis: Vector, theta: float, v: Vector
 
 @given(quaternions, quaternions)
 def test_the_product_is_hamilton_s(p: Quaternion, q: Quaternion) -> None:
-    multiplied = number(rotations.product(constant(p), constant(q)))
+    multiplied = number(attitude.product(constant(p), constant(q)))
     np.testing.assert_allclose(multiplied, product(p, q), rtol=0, atol=ROUNDING)
 
 
@@ -157,7 +157,7 @@ def test_rotations_compose_as_quaternions_multiply(p: Quaternion, q: Quaternion)
 
 @given(quaternions)
 def test_the_conjugate_is_the_inverse(q: Quaternion) -> None:
-    w, x, y, z = number(rotations.conjugate(constant(q)))
+    w, x, y, z = number(attitude.conjugate(constant(q)))
     inverse: Quaternion = (float(w), float(x), float(y), float(z))
     np.testing.assert_allclose(product(q, inverse), IDENTITY, rtol=0, atol=ROUNDING)
     np.testing.assert_allclose(R(inverse), R(q).T, rtol=0, atol=ROUNDING)
@@ -186,8 +186,8 @@ def test_a_rotation_moves_as_c_10_says(q: Quaternion, omega: Vector) -> None:
 def test_c_10_follows_from_c_3_without_differences() -> None:
     q, omega = ca.SX.sym("q", 4), ca.SX.sym("omega", 3)
     # Both sides as the paper has them for unit q: dR/dt by the chain rule through T, and R S(ω).
-    chain = ca.reshape(ca.jacobian(ca.vec(rotations.R(q)), q) @ (rotations.T(q) @ omega), 3, 3)
-    difference = ca.Function("difference", [q, omega], [chain - rotations.R(q) @ rotations.S(omega)])
+    chain = ca.reshape(ca.jacobian(ca.vec(attitude.R(q)), q) @ (attitude.T(q) @ omega), 3, 3)
+    difference = ca.Function("difference", [q, omega], [chain - attitude.R(q) @ attitude.S(omega)])
     rng = np.random.default_rng(2)
     for _ in range(100):
         unit = rng.normal(size=4)
@@ -198,7 +198,7 @@ def test_c_10_follows_from_c_3_without_differences() -> None:
 
 def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     """from_euler in numbers."""
-    w, x, y, z = number(rotations.from_euler(constant((roll, pitch, yaw))))
+    w, x, y, z = number(attitude.from_euler(constant((roll, pitch, yaw))))
     return float(w), float(x), float(y), float(z)
 
 

@@ -12,9 +12,14 @@ import casadi as ca
 import pytest
 
 from aeroloop.protocol.wire.expressions import as_written, encode, level, saturates
-from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import CodedQuantizer, Continuous, Quantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import (
+    CodedQuantizer,
+    Continuous,
+    HysteresisQuantizer,
+    LogarithmicQuantizer,
+    Quantizer,
+    UniformQuantizer,
+)
 from aeroloop.protocol.wire.symbolic import Compiled
 
 LIMITS = (1.0, 24.0, 0.3)
@@ -94,7 +99,7 @@ def test_levels_are_the_quantizers() -> None:
         quantizer, function = EVERY[which], compiled(which)
         function.inputs["code"][0] = code
         function()
-        known = quantizer.decode(int(code) if isinstance(quantizer, CodedQuantizer) else code)
+        known = quantizer.level(int(code) if isinstance(quantizer, CodedQuantizer) else code)
         assert same(function.outputs["level"][0], known), (quantizer.__dict__, code)
 
 

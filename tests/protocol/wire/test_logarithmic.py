@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeroloop.protocol.wire.logarithmic import MIN_LOGARITHMIC_BITS, LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import MAX_BITS, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import MAX_BITS, MIN_LOGARITHMIC_BITS, LogarithmicQuantizer, UniformQuantizer
 from tests.protocol.wire.test_quantizer import EPS
 
 DIGITS = 50
@@ -126,7 +125,7 @@ def test_every_code_survives_decoding_and_encoding(bits: int, more: tuple[float,
     quantizer = LogarithmicQuantizer(bits, *more)
     codes = range(-quantizer.top, quantizer.top + 1)
     assert [quantizer.encode(quantizer.level(code)) for code in codes] == list(codes)
-    assert isnan(quantizer.decode(quantizer.invalid))
+    assert isnan(quantizer.level(quantizer.invalid))
     assert quantizer.invalid == -(2 ** (bits - 1))
     assert (quantizer.encode(quantizer.limit), quantizer.saturated) == (quantizer.top, 0)
 
@@ -152,7 +151,7 @@ def test_nan_has_no_code_and_what_is_no_code_is_refused() -> None:
         quantizer.encode(nan)
     for code in (128, -129, 0.5, nan):
         with pytest.raises(ValueError, match="not a code"):
-            quantizer.decode(code)
+            quantizer.level(code)
     assert quantizer.saturated == 0
 
 

@@ -134,7 +134,7 @@ def test_exact_values_get_the_code_and_level_of_exact_arithmetic(
     y = data.draw(st.integers(-reach, reach)) * grid
     code = quantizer.encode(float(y))
     assert code == twin.code(y)
-    assert Fraction(quantizer.decode(code)) == twin.level(code)
+    assert Fraction(quantizer.level(code)) == twin.level(code)
     assert quantizer.saturated == (abs(y) > twin.limit)
 
 
@@ -193,12 +193,12 @@ def test_levels_start_at_the_dead_zone_plus_half_a_step_and_go_up_by_steps(case:
     twin = exact(quantizer, deadzone)
     # Relative to the limit: three terms, each rounded.
     slack = 8 * EPS * quantizer.limit
-    assert quantizer.decode(0) == 0.0
+    assert quantizer.level(0) == 0.0
     for i in {1, 2, quantizer.top // 2, quantizer.top - 1, quantizer.top} - {0}:
         if i <= quantizer.top:
-            assert quantizer.decode(i) == pytest.approx(float(twin.level(i)), rel=0, abs=slack)
-            assert quantizer.decode(-i) == -quantizer.decode(i)
-    levels = [quantizer.decode(code) for code in range(-quantizer.top, quantizer.top + 1)]
+            assert quantizer.level(i) == pytest.approx(float(twin.level(i)), rel=0, abs=slack)
+            assert quantizer.level(-i) == -quantizer.level(i)
+    levels = [quantizer.level(code) for code in range(-quantizer.top, quantizer.top + 1)]
     assert all(low < high for low, high in pairwise(levels))
 
 
@@ -211,7 +211,7 @@ def test_the_default_dead_zone_gives_the_paper_s_step_and_levels_at_its_multiple
     assert quantizer.deadzone == step / 2
     for k in range(-quantizer.top, quantizer.top + 1):
         # A sum of three rounded terms against one rounded product.
-        assert abs(quantizer.decode(k) - k * step) <= 4 * EPS * abs(k * step)
+        assert abs(quantizer.level(k) - k * step) <= 4 * EPS * abs(k * step)
 
 
 @settings(max_examples=80)
@@ -237,7 +237,7 @@ def test_it_is_monotone(case: Case, part: float, other: float) -> None:
 def test_every_code_survives_decoding_and_encoding(bits: int, limit: float, deadzone: float | None) -> None:
     quantizer = UniformQuantizer(bits, limit, deadzone)
     for code in range(-quantizer.top, quantizer.top + 1):
-        level = quantizer.decode(code)
+        level = quantizer.level(code)
         assert quantizer.encode(level) == code
         assert quantizer.level(code) == level
     assert quantizer.saturated == 0
@@ -247,7 +247,7 @@ def test_every_code_survives_decoding_and_encoding(bits: int, limit: float, dead
 def test_the_spare_code_is_the_least_one_and_decodes_to_nan(bits: int) -> None:
     quantizer = UniformQuantizer(bits, 1.0)
     assert quantizer.invalid == -(2 ** (bits - 1))
-    assert isnan(quantizer.decode(quantizer.invalid))
+    assert isnan(quantizer.level(quantizer.invalid))
     assert isnan(quantizer.level(quantizer.invalid))
 
 
@@ -283,7 +283,7 @@ def test_what_is_no_code_is_refused(bits: int) -> None:
     quantizer = UniformQuantizer(bits, 1.0)
     for code in (quantizer.top + 1, quantizer.invalid - 1, 2**70, -(2**70), 0.0, 1.0, 0.5, nan, inf):
         with pytest.raises(ValueError, match="not a code"):
-            quantizer.decode(code)
+            quantizer.level(code)
 
 
 @pytest.mark.parametrize("bits", [-1, 0, 1, 17, 64])
@@ -319,7 +319,7 @@ def test_without_quantization_a_value_is_its_own_code(limit: float, part: float)
     quantizer = Continuous(limit)
     y = part * limit
     assert quantizer.encode(y) == y
-    assert quantizer.decode(y) == y
+    assert quantizer.level(y) == y
     assert quantizer.quantize(y) == y
     assert quantizer.level(y) == y
     assert (quantizer.bound, quantizer.saturated) == (0.0, 0)
@@ -336,5 +336,5 @@ def test_without_quantization_what_lies_beyond_the_limit_is_the_limit_and_is_cou
 def test_without_quantization_nan_means_no_valid_value() -> None:
     quantizer = Continuous(1.0)
     assert isnan(quantizer.invalid)
-    assert isnan(quantizer.decode(quantizer.invalid))
+    assert isnan(quantizer.level(quantizer.invalid))
     assert isnan(quantizer.level(quantizer.invalid))

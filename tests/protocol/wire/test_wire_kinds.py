@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aeroloop.protocol.wire.hysteresis import HysteresisQuantizer
-from aeroloop.protocol.wire.logarithmic import LogarithmicQuantizer
-from aeroloop.protocol.wire.quantizer import CodedQuantizer, UniformQuantizer
+from aeroloop.protocol.wire.quantizer import CodedQuantizer, HysteresisQuantizer, LogarithmicQuantizer, UniformQuantizer
 from aeroloop.protocol.wire.spec import Kind, SignalSpec, WireSpec
 
 

@@ -13,8 +13,7 @@ from aeroloop.protocol.messages.intake import STATUS
 from aeroloop.protocol.messages.models import Grant, SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, Gains, Hold
 from aeroloop.protocol.runtime.role import Role
-from aeroloop.protocol.wire.loop import LoopSettings
-from aeroloop.protocol.wire.spec import WireSpec
+from aeroloop.protocol.wire.spec import LoopSettings, WireSpec
 from aeroloop.service.daemon import claim
 from aeroloop.service.daemon.claim import ClaimClient
 

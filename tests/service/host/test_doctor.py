@@ -14,7 +14,7 @@ from aeroloop.protocol.runtime import tick_grid
 from aeroloop.protocol.transport.network import join
 from aeroloop.protocol.transport.network_settings import NetworkSettings
 from aeroloop.protocol.transport.security import Identity, SecuritySettings
-from aeroloop.protocol.wire.loop import LoopSettings
+from aeroloop.protocol.wire.spec import LoopSettings
 from aeroloop.service.host import doctor
 from aeroloop.service.testing.process_group import free_rendezvous
 from tests.support.certificates import Authority

@@ -62,7 +62,7 @@ def test_an_owner_that_ticks_by_what_has_passed_stays_in_the_boards_time() -> No
         assert frame is not None
         read = wire.measurement.unpack(frame)
         assert read is not None
-        assert not isnan(wire.attitude.quantizer().decode(read[1][0]))
+        assert not isnan(wire.attitude.quantizer().level(read[1][0]))
         assert board.time == k + plant.passed - 1
     assert plant.overrun == (3 - 1) + (1 - 1) + (7 - 1)
 

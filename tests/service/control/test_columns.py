@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.expressions import as_written
-from aeroloop.protocol.wire.symbolic import INTEGER, UNROLLED, Compiled, along_rows, buffer, in_columns, integers, parts
+from aeroloop.protocol.wire.symbolic import INTEGER, Compiled, buffer, integers, parts
+from aeroloop.service.control.columns import UNROLLED, along_rows, in_columns
 
 ROWS = UNROLLED
 
