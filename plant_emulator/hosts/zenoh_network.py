@@ -23,7 +23,7 @@ from zenoh.handlers import RingChannel
 from aeroloop.plant_emulator.endpoint.vehicle_claim import VehicleClaim
 from aeroloop.plant_emulator.hosts.driver import PlantNetwork
 from aeroloop.plant_emulator.hosts.latch_file import KEPT_S, Latch, LatchFile
-from aeroloop.protocol.messages import intake, topics
+from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import (
     Claim,
     FaultStatus,
@@ -32,9 +32,8 @@ from aeroloop.protocol.messages.models import (
     Release,
     SessionRecord,
     Status,
-    Tenure,
 )
-from aeroloop.protocol.messages.operator import Answer, Request
+from aeroloop.protocol.messages.operator import Answer, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
 from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches_per_s, record_json
 from aeroloop.protocol.runtime.role import RecorderWatch, Role
@@ -201,8 +200,8 @@ class ZenohNetwork(PlantNetwork):
         """Another plant end publishes under this one's name, as after a network was cut and healed."""
         self._others_due = time.monotonic_ns() + OTHERS_PERIOD_NS
         if (sample := self._others.try_recv()) is not None:
-            with suppress(intake.IntakeError):
-                self._contest(intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).process)
+            with suppress(MessageError):
+                self._contest(Status.decode(sample.payload.to_bytes(), extra="ignore").process)
                 self.follow_session()
 
     def _contest(self, other: str) -> None:

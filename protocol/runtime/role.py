@@ -21,9 +21,9 @@ from pydantic import ValidationError
 from zenoh.handlers import RingChannel
 
 from aeroloop.protocol.errors import AeroloopError
-from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status, Tenure
-from aeroloop.protocol.messages.operator import Answer, Message
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import PROTOCOL_VERSION, Description, Event, EventKind, Status
+from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, MessageError
 from aeroloop.protocol.messages.states import STOPPED
 from aeroloop.protocol.runtime.event_log import log_event
 from aeroloop.protocol.runtime.host_facts import host_facts, versions
@@ -185,7 +185,6 @@ class Role:
         """
         key = topics.key(topic, self.vehicle)
         name = key.rpartition("/")[2]
-        intake.prepare(model)
 
         def guarded(query: zenoh.Query, act: Callable[[], Message]) -> None:
             try:
@@ -205,7 +204,7 @@ class Role:
                 return
             try:
                 if len(self._inbox) >= WAITING:
-                    raise intake.IntakeError(f"{WAITING} requests wait already; ask again")
+                    raise MessageError(f"{WAITING} requests wait already; ask again")
                 action = prepare(self._read(topic, model, payload))
             except AeroloopError as error:
                 refusal = Answer(done=False, text=str(error))
@@ -216,14 +215,11 @@ class Role:
         self.answer(key, received)
 
     def _read(self, topic: str, model: type[M], payload: bytes) -> M:
-        """Read a request. Raises IntakeError."""
-        if len(payload) <= topics.MESSAGE_BYTES and intake.few(payload):
-            return intake.read(model, payload)
-        if topics.TOPICS[topic].request <= topics.MESSAGE_BYTES:
-            return intake.read(model, payload)  # refuses it
-        if self._long.let_pass(topic) is None:
-            raise intake.IntakeError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
-        return intake.read(model, payload, intake.REFERENCE)
+        """Read a request. Raises MessageError."""
+        long = len(payload) > topics.MESSAGE_BYTES or payload.count(b",") > MAX_VALUES
+        if long and model.max_values > MAX_VALUES and self._long.let_pass(topic) is None:
+            raise MessageError(f"of requests as long as this one, one in {LONG_S:g} s is taken; ask again")
+        return model.decode(payload)
 
     def enqueue(self, action: Action) -> None:
         """Queue an action to run between two ticks; may be called from any thread."""
@@ -336,8 +332,8 @@ class RecorderWatch:
     def gone(self) -> bool:
         """Whether it disappeared and its last status does not say that it stopped."""
         if (sample := self._statuses.try_recv()) is not None:
-            with suppress(intake.IntakeError):
-                self._stopped = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS).state == STOPPED
+            with suppress(MessageError):
+                self._stopped = Status.decode(sample.payload.to_bytes(), extra="ignore").state == STOPPED
         return self._was_there and not self.present and not self._stopped
 
     def _see(self, appeared: bool) -> None:

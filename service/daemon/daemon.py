@@ -15,9 +15,9 @@ from typing import Final, Literal
 
 from zenoh.handlers import RingChannel
 
-from aeroloop.protocol.messages import intake, topics
-from aeroloop.protocol.messages.models import SessionRecord, Status, Tenure
-from aeroloop.protocol.messages.operator import Answer, Request, in_words
+from aeroloop.protocol.messages import topics
+from aeroloop.protocol.messages.models import SessionRecord, Status
+from aeroloop.protocol.messages.operator import Answer, MessageError, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
 from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
@@ -86,7 +86,7 @@ class Daemon:
         )
         self._machine = Machine(State.SEARCHING, CONTROLLER_TABLE)
         self._last_tick = loop.ticks(settings.duration_s) - 1 if settings.duration_s else None
-        self._plant: Tenure | None = None
+        self._plant: Status | None = None
         self._plant_due = 0.0
         self._plants = 0  # how often a plant's token has appeared or disappeared
         self._granted = False  # whether the plant's status has ever named this session
@@ -324,7 +324,7 @@ class Daemon:
                 pass
             self._plant = None
 
-    def _read_plant(self) -> Tenure | None:
+    def _read_plant(self) -> Status | None:
         """The plant's newest status; None before the first, and once the plant is gone. Reads what came, at times."""
         now, plants = time.monotonic(), self._plants
         if now < self._plant_due:
@@ -334,8 +334,8 @@ class Daemon:
             if (sample := self._plant_statuses.try_recv()) is None:
                 break
             try:
-                plant = intake.read(Tenure, sample.payload.to_bytes(), intake.STATUS)
-            except intake.IntakeError:
+                plant = Status.decode(sample.payload.to_bytes(), extra="ignore")
+            except MessageError:
                 self._role.warn("plant's status", "fault", "the plant's status cannot be read: another version?")
                 continue
             if plants == self._plants:

@@ -10,9 +10,8 @@ import pytest
 import zenoh
 
 from aeroloop.protocol.messages import topics
-from aeroloop.protocol.messages.intake import FEW
 from aeroloop.protocol.messages.models import Status
-from aeroloop.protocol.messages.operator import Answer, Message, Points, Request, Track
+from aeroloop.protocol.messages.operator import MAX_VALUES, Answer, Message, Points, Request, Track
 from aeroloop.protocol.runtime.role import AT_ONCE, LONG_S, WAITING, Role
 from aeroloop.protocol.transport.certificate import read_certificate
 from aeroloop.protocol.transport.network_settings import NetworkSettings
@@ -76,7 +75,7 @@ def time(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
     return FakeTime(monkeypatch)
 
 
-LONG = Track(reference=Points(times=[float(n) for n in range(FEW)], attitudes=[(0.0, 0.0, 0.0)] * FEW))
+LONG = Track(reference=Points(times=[float(n) for n in range(MAX_VALUES)], attitudes=[(0.0, 0.0, 0.0)] * MAX_VALUES))
 
 
 def asked(role: Role, loop: Loop, topic: str, payload: bytes) -> Query:
