@@ -35,7 +35,7 @@ from aeroloop.protocol.messages.models import (
 )
 from aeroloop.protocol.messages.operator import Answer, MessageError, Request
 from aeroloop.protocol.messages.states import TripCause
-from aeroloop.protocol.messages.trace import Outcome, Sent, TraceWriter, batches_per_s, record_json
+from aeroloop.protocol.messages.trace import Outcome, PlantRow, Sent, TraceWriter, batches_per_s, record_json
 from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import RollingHistogram, report, summary
 from aeroloop.protocol.transport.link import Arrival, Mailbox, ZenohLink
@@ -354,7 +354,7 @@ class PlantTrace:
                 received_as = 1
             else:
                 received_as, command = (Sent.SILENT if command == UNCHANGED else Sent.MALFORMED), b""
-        writer.plant_row(
+        row = PlantRow(
             end.ticked,
             end.session_tick,
             1 if measurement else 0 if measurement is None else 2,
@@ -368,6 +368,7 @@ class PlantTrace:
             command,
             end.voltages,
         )
+        writer.row(row)
         if writer.due(sent_ns):
             self._publish_batch(final=False)
 

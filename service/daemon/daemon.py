@@ -19,7 +19,7 @@ from aeroloop.protocol.messages import topics
 from aeroloop.protocol.messages.models import SessionRecord, Status
 from aeroloop.protocol.messages.operator import Answer, MessageError, Request, in_words
 from aeroloop.protocol.messages.states import CONTROLLER_TABLE, ControllerState, ControllerTrigger, Machine
-from aeroloop.protocol.messages.trace import Received, Sent, TraceWriter, batches_per_s
+from aeroloop.protocol.messages.trace import ControllerRow, Received, Sent, TraceWriter, batches_per_s
 from aeroloop.protocol.runtime.realtime import collect_garbage, prepare_process
 from aeroloop.protocol.runtime.role import RecorderWatch, Role
 from aeroloop.protocol.runtime.timing import LoopTiming, RollingHistogram, report, summary
@@ -211,7 +211,8 @@ class Daemon:
         if command is None:
             sent_ns = 0
         tick = max(now.tick, 0)
-        self._trace.controller_row(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        row = ControllerRow(tick, now.received_as, sent_as, now.at_ns, sent_ns, now.frame, command or b"")
+        self._trace.row(row)
         self._publish_trace_when_due()
 
     def _publish_trace_when_due(self) -> None:

@@ -193,7 +193,7 @@ def test_a_row_that_was_changed_is_found(row: int, bit: int, column: str) -> Non
     loop, wire, batches = undisturbed()
     at = next(i for i, b in enumerate(batches) if b.header.first_row <= row < b.header.first_row + b.header.rows)
     batch = batches[at]
-    columns = np.frombuffer(bytearray(np.array(batch.columns).tobytes()), batch.columns.dtype)[0]
+    columns = {name: each.copy() for name, each in batch.columns.items()}
     size = columns[column].nbytes // batch.header.rows
     changed = columns[column].view(np.uint8).reshape(batch.header.rows, size)
     changed[row - batch.header.first_row, 0] ^= 1 << bit

@@ -19,8 +19,10 @@ from aeroloop.protocol.messages.trace import (
     HEADER_BYTES,
     MAX_ROWS,
     NEVER,
+    ControllerRow,
     End,
     PlantChange,
+    PlantRow,
     TraceWriter,
     read_batch,
     row_dtype,
@@ -49,7 +51,7 @@ def _value(cell: str) -> Any:
 
 
 def add(writer: TraceWriter, row: Sequence[Any]) -> None:
-    (writer.controller_row if writer.end == "controller" else writer.plant_row)(*row)
+    writer.row((ControllerRow if writer.end == "controller" else PlantRow)(*row))
 
 
 def test_the_golden_batch_of_the_controller_is_what_the_writer_writes() -> None:
@@ -149,12 +151,12 @@ def test_a_batch_reads_back_as_the_rows_that_were_added(rows: list[Any], final: 
 def test_a_batch_is_due_when_it_is_full_or_its_first_row_has_waited_long_enough() -> None:
     writer = TraceWriter("controller", WIRE, 5, S // 10)
     assert not writer.due(10 * S)
-    writer.controller_row(0, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3))
+    writer.row(ControllerRow(0, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3)))
     assert not writer.due(10 * S + S // 10 - 1)
     assert writer.due(10 * S + S // 10)
     for k in range(1, MAX_ROWS):
         assert not writer.due(10 * S)
-        writer.controller_row(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3))
+        writer.row(ControllerRow(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3)))
     assert writer.due(10 * S)
 
 
