@@ -1,4 +1,4 @@
-"""Symbolic functions over columns: bit for bit equal to the function of each row."""
+"""Functions over columns: bit for bit equal to the function of each row."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.expressions import as_written
-from aeroloop.protocol.wire.symbolic import INTEGER, Compiled, buffer, integers, parts
+from aeroloop.protocol.wire.symbolic import Compiled
 from aeroloop.service.control.columns import UNROLLED, along_rows, in_columns
 
 ROWS = UNROLLED
@@ -85,29 +85,3 @@ def test_a_recursion_along_rows_is_that_of_step_after_step(recursion: str) -> No
         single.inputs["state"][:] = single.outputs["next"]
         (after,) = many.outputs.values()
         assert equal_bits(np.asarray(after).reshape(2, rows)[:, row], single.outputs["next"])
-
-
-@given(st.lists(st.integers(-(2**31), 2**31 - 1), max_size=5))
-def test_integers_are_read_from_doubles(values: list[int]) -> None:
-    memory = buffer(len(values))
-    for i, value in enumerate(values):
-        memory[i] = value + INTEGER
-    read = integers(memory).tolist()
-    assert read == values
-    assert all(type(value) is int for value in read)
-
-
-def test_parts_of_a_memory_follow_each_other_and_share_it() -> None:
-    x = ca.SX.sym("x", 2)
-    function = ca.Function("f", [x], [2 * x, ca.sum1(x), x + 1], ["x"], ["twice", "sum", "next"])
-    memory = buffer(5)
-    compiled = Compiled(function, parts(memory, {"twice": 2, "sum": 1, "next": 2}))
-    compiled.inputs["x"][:] = memoryview(array("d", (3.0, 4.0)))
-    compiled()
-    assert memory.tolist() == [6.0, 8.0, 7.0, 4.0, 5.0]
-
-
-def test_shared_memory_of_another_size_is_refused() -> None:
-    x = ca.SX.sym("x", 3)
-    with pytest.raises(ValueError, match="x holds 3 doubles"):
-        Compiled(ca.Function("f", [x], [2 * x], ["x"], ["y"]), {"x": buffer(4)})
