@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from aeroloop.protocol.runtime import tick_grid, timing
 from aeroloop.protocol.runtime.tick_grid import TickGrid
-from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram
+from aeroloop.protocol.runtime.timing import Histogram, LoopTiming, RollingHistogram, summary
 from aeroloop.protocol.wire.spec import LoopSettings
 
 START = 123_456_789_012_345
@@ -261,3 +261,16 @@ def test_a_pause_is_no_period(fake: FakeTime) -> None:
     timing.woke(START + 1000 * PERIOD)
     timing.turn()
     assert timing.period.total.count == 0
+
+
+def test_a_summary_is_that_of_the_histogram_in_tenths_of_a_microsecond() -> None:
+    durations = Histogram()
+    assert summary(durations) is None
+    for us in range(1, 101):
+        durations.add(us * 1000)
+    percentiles = summary(durations)
+    assert percentiles is not None
+    assert (percentiles.count, percentiles.max) == (100, 100.0)
+    assert percentiles.p50 == round(durations.percentile(50), 1)
+    assert percentiles.p99 == round(durations.percentile(99), 1)
+    assert percentiles.p50 < percentiles.p99
