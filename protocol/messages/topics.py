@@ -44,19 +44,15 @@ NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """Pattern of a vehicle's name: one chunk of a Zenoh key, and safe in a file name."""
 
 
-FRAME_BYTES: Final = 256
-"""More than the longest frame: six elements of 64 bits and a counter."""
 QUERIES_PER_S: Final = 50.0
 """Most queries a second on a topic that a process takes from one link; what comes sooner after another is dropped. One
 rate for all topics: Zenoh applies any of the rules that a wildcard query meets."""
-MESSAGE_BYTES: Final = 16_384
-"""Enough for an event of many lines."""
-STATUS_BYTES: Final = 65_536
-"""Enough for a status with all notes and twice as many faults as may act at a time."""
-SAMPLE_BYTES: Final = 2048
-"""Enough for one tick's telemetry or truth."""
-POINTS_BYTES: Final = 2_097_152
-"""Enough for what may hold references of `MAX_POINTS` points: descriptions, requests to track, tails of traces."""
+
+FRAME_BYTES: Final = 256  # more than the longest frame: six elements of 64 bits and a counter
+SAMPLE_BYTES: Final = 2048  # one tick's telemetry or truth
+MESSAGE_BYTES: Final = 16_384  # an event of many lines
+STATUS_BYTES: Final = 65_536  # a status with all notes and twice as many faults as may act at a time
+POINTS_BYTES: Final = 2_097_152  # references of `MAX_POINTS` points: in descriptions, requests to track, traces' tails
 
 
 @dataclass(frozen=True)

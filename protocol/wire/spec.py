@@ -42,6 +42,7 @@ Bits: TypeAlias = Annotated[
     _Number | None, BeforeValidator(bits_or_continuous, json_schema_input_type=_Number | Literal["cont"] | None)
 ]
 
+Positive: TypeAlias = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 Kind: TypeAlias = Literal["uniform", "hysteresis-uniform", "logarithmic-uniform"]
 
@@ -53,24 +54,18 @@ class SignalSpec(BaseModel, frozen=True, extra="forbid"):
     """How one signal is quantized. The range runs from −limit to +limit, in the signal's unit."""
 
     bits: Bits = Field(description="bits R of a code, 2…16; 'cont' sends float64")
-    limit: float = Field(gt=0, allow_inf_nan=False, description="edge of the range [signal's unit]")
-    deadzone: float | None = Field(
+    limit: Positive = Field(description="edge of the range [signal's unit]")
+    deadzone: Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="y0 of (C.14) [signal's unit]; half a step if left out, a quarter of that if logarithmic-uniform",
     )
     kind: Kind = Field(default="uniform", description="which quantizer; SPEC.md, section 2")
-    hysteresis: float | None = Field(
+    hysteresis: Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="h: widens a held level's interval [signal's unit]; half a step if left out; hysteresis-uniform",
     )
-    threshold: float | None = Field(
+    threshold: Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="where steps stop growing [signal's unit]; limit/4 if left out; logarithmic-uniform",
     )
 
