@@ -324,14 +324,22 @@ class TraceWriter:
         if not self._rows:
             first_ns = row.received_ns if isinstance(row, ControllerRow) else row.sent_ns or row.received_ns
             self._base_ns = first_ns - _MARGIN_NS
-        self._rows.append(row)
+        received, sent = self._us(row.received_ns), self._us(row.sent_ns)
+        if isinstance(row, ControllerRow):
+            self._rows.append(row._replace(received_ns=received, sent_ns=sent))
+        else:
+            self._rows.append(row._replace(received_ns=received, sent_ns=sent, answered=row.answered & NEVER))
+
+    def _us(self, ns: int) -> int:
+        """A time as a batch has it: whole microseconds after its base."""
+        return (ns - self._base_ns) // 1000 & NEVER if ns else NEVER
 
     def take(self, now_ns: int, wall_ns: int, *, final: bool = False) -> bytes:
         """Pack all that is buffered into a batch, and clear the buffer. If `final`, the session's rows end here.
 
         `now_ns` is the end's monotonic clock now [ns], `wall_ns` its wall clock now [ns since 1970].
         """
-        rows = [self._packed(row) for row in self._rows]
+        rows = self._rows
         base_ns = self._base_ns if rows else now_ns
         tail = Tail(state=self.state, changes=self.changes, operations=self.operations)
         parts = [tail.model_dump_json(include={name})[1:-1].encode() for name, value in tail if value]
@@ -361,14 +369,6 @@ class TraceWriter:
         self._rows = []
         self.state, self.changes, self.operations = None, [], []
         return b"".join([header, *columns, text])
-
-    def _packed(self, row: ControllerRow | PlantRow) -> ControllerRow | PlantRow:
-        """A row as a batch has it: times in µs after its base, −1 as NEVER."""
-        received, sent = (
-            (ns - self._base_ns) // 1000 & NEVER if ns else NEVER for ns in (row.received_ns, row.sent_ns)
-        )
-        row = row._replace(received_ns=received, sent_ns=sent)
-        return row if isinstance(row, ControllerRow) else row._replace(answered=row.answered & NEVER)
 
     def _due_record(self, now_ns: int) -> bytes:
         """Bring the controller's record up to date, and return the record if it is due."""
