@@ -160,11 +160,12 @@ def test_batches_read_back_as_the_rows_that_were_added_alone_and_joined(
         assert header.wall_ns - header.monotonic_ns == 64 * S
         assert batch.tail.state == {"sign": 1}
         for name, column in batch.columns.items():
-            if name not in ("received", "sent"):
-                assert same(column, [getattr(row, name) for row in rows])
-                continue
-            for row, read_ns in zip(rows, batch.times_ns(name).tolist(), strict=True):
-                added_ns = getattr(row, f"{name}_ns")
+            assert name in ("received", "sent") or same(column, [getattr(row, name) for row in rows])
+        for when, added in (
+            (batch.times_ns("received"), [row.received_ns for row in rows]),
+            (batch.times_ns("sent"), [row.sent_ns for row in rows]),
+        ):
+            for read_ns, added_ns in zip(when.tolist(), added, strict=True):
                 if added_ns == 0:
                     assert read_ns == -1
                 elif added_ns >= header.monotonic_ns:  # what lies before the base wraps; no end sends so early

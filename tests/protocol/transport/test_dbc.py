@@ -152,7 +152,7 @@ def bare(spec: SignalSpec) -> bool:
 
 def assert_signal(signal: Signal, spec: SignalSpec, code: float, decoded: Any) -> None:
     """What cantools decoded is what this code is to the quantizer."""
-    value = quantizer_of(spec).decode(code)
+    value = quantizer_of(spec).level(code)
     if spec.bits is None:
         assert signal.is_float
         assert repr(decoded) == repr(value)  # repr: NaN equals itself, and −0 is not 0
@@ -219,7 +219,7 @@ def test_every_code_of_every_width_decodes(bits: int) -> None:
             if one == -half:
                 assert decoded[name] == "no_valid_value"
             else:
-                value, level = decoded[name], quantizer.decode(one)
+                value, level = decoded[name], quantizer.level(one)
                 assert isinstance(value, (int, float))  # an int where the step is
                 assert abs(value - level) <= ROUNDING * abs(level)
         assert decoded["echo"] == code % layout.counters

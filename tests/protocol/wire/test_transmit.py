@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import nan
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeroloop.protocol.wire.spec import WireSpec
@@ -45,6 +45,7 @@ def test_without_a_change_a_frame_is_sent_exactly_a_heartbeat_after_the_last(
             assert run[k] != run[last]
 
 
+@settings(max_examples=500)
 @given(STEPS, HEARTBEATS)
 def test_where_ticks_are_missed_a_change_still_reaches_a_receiver_that_drops_repeated_counters(
     steps: list[tuple[int, tuple[int, int]]], heartbeat: int
@@ -73,13 +74,15 @@ def test_a_sessions_first_frame_is_sent_whatever_the_last_session_said() -> None
         sender.forget()
 
 
-@given(RUN, HEARTBEATS, st.integers(0, 99))
-def test_a_sender_goes_on_from_the_memory_of_another(run: list[tuple[int, int]], heartbeat: int, at: int) -> None:
+@given(RUN, RUN, HEARTBEATS)
+def test_a_sender_goes_on_from_the_memory_of_another(
+    before: list[tuple[int, int]], after: list[tuple[int, int]], heartbeat: int
+) -> None:
     first, second = Sender("on_change", heartbeat, COUNTERS), Sender("on_change", heartbeat, COUNTERS)
-    for k, codes in enumerate(run[:at]):
+    for k, codes in enumerate(before):
         first.due(k, codes)
     second.resume(*first.memory)
-    for k, codes in enumerate(run[at:], start=at):
+    for k, codes in enumerate([before[-1], *after], start=len(before)):
         assert first.due(k, codes) == second.due(k, codes)
 
 
