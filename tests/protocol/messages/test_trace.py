@@ -200,6 +200,16 @@ def test_what_is_no_batch_is_refused_whole() -> None:
         assert read_batch(batch[:-1] + b"]") is None
 
 
+def test_a_batch_of_more_rows_than_one_may_have_or_with_bytes_after_them_is_refused() -> None:
+    writer = TraceWriter("controller", WIRE, 5, S)
+    for rows in (MAX_ROWS, MAX_ROWS + 1):
+        for k in range(rows):
+            writer.row(ControllerRow(k, 0, 1, 10 * S, 10 * S + 1, bytes(7), bytes(3)))
+        batch = writer.take(11 * S, S)
+        assert (read_batch(batch) is not None) == (rows == MAX_ROWS)
+        assert read_batch(batch + b"\0") is None
+
+
 @given(st.binary(max_size=400))
 def test_random_bytes_are_refused(payload: bytes) -> None:
     assert read_batch(payload) is None
