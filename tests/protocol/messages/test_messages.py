@@ -52,7 +52,7 @@ def test_a_message_survives_json_lacks_nothing_and_cannot_be_changed(message: Me
         with pytest.raises(ValidationError, match="frozen"):
             setattr(message, name, getattr(message, name))
         if field.is_required():
-            with pytest.raises(MessageError, match=f"{name} is missing"):
+            with pytest.raises(MessageError, match=name):
                 model.decode(json.dumps({key: value for key, value in tree.items() if key != name}).encode())
     if model is not Gains:  # the running law refuses those that it does not have
         with pytest.raises(MessageError, match="surprise"):
@@ -105,7 +105,7 @@ def test_an_unknown_kind_is_refused_also_within_what_may_be_absent() -> None:
     """A plant's answer to a claim, with the vehicle's last session."""
     record: dict[str, Any] = {"controller": "c", "session": "s", "gains": {}, "gains_from": "operator"}
     record |= {"reference": {"kind": "x"}, "reference_from": "operator", "within_s": 1.0, "since_tick": 0}
-    with pytest.raises(MessageError, match=r'last\.reference\.kind must be "hold", .* or "stream", not "x"'):
+    with pytest.raises(MessageError, match=r"last\.reference\.kind.*hold.*stream"):
         Grant.decode(json.dumps({"session": "s", "last": record}).encode())
 
 
@@ -143,7 +143,7 @@ def test_a_status_of_another_version_is_read_as_far_as_it_is_known() -> None:
     status = next(message for message in MESSAGES if isinstance(message, Status))
     newer = status.encode()[:-1] + b',"mood":{"good":true}}'
     assert Status.decode(newer, extra="ignore") == status
-    with pytest.raises(MessageError, match="unknown key mood"):
+    with pytest.raises(MessageError, match="mood"):
         Status.decode(newer)
 
 
